@@ -17,11 +17,15 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 from gpuvision.host.errors import GpuVisionError
-from gpuvision.host.reading import FileLimits, check_limit, one_line, reading, reason_of
+from gpuvision.host.reading import FileLimit, one_line, reading, reason_of
 
 Choice = TypeVar("Choice", bound=str)
 _REQUIRED: Any = object()
 # Largest magnitudes by unit. Larger numbers are typing errors, and would overflow float32 in later computations.
+MAX_DESCRIPTION_BYTES = FileLimit("GPUVISION_MAX_DESCRIPTION_BYTES", 1 << 20)
+"""Bytes of a TOML file. Chosen: 1 MiB, four times the largest file of features."""
+MAX_NESTING = FileLimit("GPUVISION_MAX_NESTING", 32)
+"""Depth of tables and arrays in a TOML file, and parts of a dotted key. Chosen: 32; gpuvision writes 4."""
 _LARGEST = {"m": 1e6, "m per profile": 1e3, "pixel": 1e6}
 _LARGEST_NUMBER = 1e20  # for all other units
 _LARGEST_INTEGER = (1 << 31) - 1  # of a 32-bit integer
@@ -272,12 +276,11 @@ def read_toml(path: Path) -> Section:
     DescriptionError
         The file is not valid TOML; the message has line and column.
     """
-    limit = FileLimits.current().max_description_bytes
     with reading(path.name, "TOML file", DescriptionError):
         try:
             with path.open("rb") as file:
-                content = file.read(int(limit) + 1)
-            check_limit("max_description_bytes", len(content), f"{path.name}: {len(content)} bytes", DescriptionError)
+                content = file.read(int(MAX_DESCRIPTION_BYTES.value) + 1)
+            MAX_DESCRIPTION_BYTES.check(len(content), f"{path.name}: {len(content)} bytes", DescriptionError)
             text = content.decode("utf-8")
             _check_nesting(text, path.name)
             return Section(tomllib.loads(text), path.name)
@@ -291,7 +294,7 @@ def _check_nesting(text: str, source: str) -> None:
     Raises
     ------
     DescriptionError
-        Arrays and tables are nested, or a key has parts, beyond `FileLimits.max_nesting`.
+        Arrays and tables are nested, or a key has parts, beyond `MAX_NESTING`.
     """
     depth = deepest = parts = longest = 0
     before = None
@@ -306,8 +309,8 @@ def _check_nesting(text: str, source: str) -> None:
             parts = parts + 1 if before == "dot" else 1
             longest = max(longest, parts)
         before = kind
-    check_limit("max_nesting", deepest, f"{source}: nested {deepest} deep", DescriptionError)
-    check_limit("max_nesting", longest, f"{source}: a key of {longest} parts", DescriptionError)
+    MAX_NESTING.check(deepest, f"{source}: nested {deepest} deep", DescriptionError)
+    MAX_NESTING.check(longest, f"{source}: a key of {longest} parts", DescriptionError)
 
 
 def _shown(text: str) -> str:

@@ -19,7 +19,7 @@ from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Pipeline, PipelineLimits
 from gpuvision.host.planning import Plan, PlanLimits, plan_stream
 from gpuvision.host.program import Define
-from gpuvision.host.reading import FileLimits
+from gpuvision.host.reading import FileLimit
 from gpuvision.host.recordings import open_recording
 from gpuvision.host.report import StreamReport
 from gpuvision.host.ring import Step
@@ -47,7 +47,7 @@ __all__ = [
     "Device",
     "DeviceArray",
     "DeviceUnusableError",
-    "FileLimits",
+    "FileLimit",
     "FloatArray",
     "GpuVisionError",
     "HostArray",

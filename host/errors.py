@@ -28,4 +28,4 @@ class RecordingError(GpuVisionError):
 
 
 class ReadError(GpuVisionError, ValueError):
-    """A file cannot be read: it is damaged, of another format, or larger than a limit of `FileLimits`."""
+    """A file cannot be read: it is damaged, of another format, or larger than a `FileLimit`."""

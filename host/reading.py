@@ -6,9 +6,8 @@ import contextlib
 import os
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from gpuvision.host.errors import GpuVisionError, ReadError
 from gpuvision.host.text import printable
@@ -16,97 +15,72 @@ from gpuvision.host.text import printable
 _LONGEST_REASON = 200  # characters: a reason stays readable in a line
 
 
-@dataclass(frozen=True, kw_only=True)
-class FileLimits:
-    """Largest sizes of files that are read. Larger files are refused before they take memory.
+@dataclass(frozen=True)
+class FileLimit:
+    """Largest size of one kind in a file that is read. A larger file is refused before it takes memory.
 
-    Each limit can be changed by an environment variable: ``max_pixels`` by ``GPUVISION_MAX_PIXELS``, and so on.
+    Each reader defines the limits of its format.
 
     Attributes
     ----------
-    max_pixels : int
-        Pixels of an image or of a frame. Chosen: 16384 x 16384; the largest area sensors of industrial cameras have
-        150 million. With 8 bytes per pixel such an image takes 2 GiB.
-    max_unpacked_bytes : int
-        Bytes that an archive (NPZ, ZIP of Gerber files) unpacks to. An archive that unpacks to at most twice its size
-        is not limited. Chosen: 2 GiB.
-    max_description_bytes : int
-        Bytes of a TOML file. Chosen: 1 MiB, four times the largest file of features.
-    max_nesting : int
-        Depth of tables and arrays in a TOML file, and parts of a dotted key. Chosen: 32; gpuvision writes 4.
-    max_board_files : int
-        Files in the folder or ZIP file of a board. Chosen: 1000; boards have 10 to 60.
-    max_board_bytes : int
-        Bytes of the Gerber and drill files of a board. Chosen: 256 MiB.
-    max_board_objects : int
-        Objects of a layer, repeated ones included. Chosen: a million, which takes about 1 GiB.
-    max_board_size : float
-        Largest coordinate of a board [m]. Chosen: 2 m; production panels have up to 1.5 m.
-    max_triangles : int
-        Triangles of a mesh, instances included. Chosen: 20 million, 1 GB as binary STL.
+    variable : str
+        Environment variable that changes the limit.
+    default : float
+        Limit without this variable.
     """
 
-    max_pixels: int = 1 << 28
-    max_unpacked_bytes: int = 1 << 31
-    max_description_bytes: int = 1 << 20
-    max_nesting: int = 32
-    max_board_files: int = 1000
-    max_board_bytes: int = 1 << 28
-    max_board_objects: int = 1_000_000
-    max_board_size: float = 2.0
-    max_triangles: int = 20_000_000
+    variable: str
+    default: float
 
-    @classmethod
-    def current(cls) -> FileLimits:
-        """Return the limits with the changes that the environment variables ask for.
+    @property
+    def value(self) -> float:
+        """Limit in force.
 
         Raises
         ------
         ReadError
-            The value of a variable is not a positive number.
+            The value of the environment variable is not a number above 0.
         """
-        names = [each.name for each in fields(cls) if _variable(each.name) in os.environ]
-        given: dict[str, Any] = {name: _of_environment(name) for name in names}
-        return cls(**given)
+        text = os.environ.get(self.variable)
+        if text is None:
+            return self.default
+        try:
+            value = float(text)
+        except ValueError:
+            value = 0.0
+        if not value > 0.0:
+            raise ReadError(f"the environment variable {self.variable} is {text!r}, expected a number above 0")
+        return value
+
+    def check(self, size: float, what: str, error: type[Exception] = ReadError) -> None:
+        """Check a size of a file against the limit.
+
+        Parameters
+        ----------
+        size : float
+            Size to check; NaN exceeds every limit.
+        what : str
+            Start of the message: the file, and the object of this size.
+        error : type
+            Class of the exception.
+
+        Raises
+        ------
+        ReadError
+            The size exceeds the limit; or the class of `error`.
+        """
+        limit = self.value
+        if not size <= limit:
+            raise error(f"{what}, expected at most {limit:.10g}; set {self.variable} to change this limit")
 
 
-def _variable(name: str) -> str:
-    return f"GPUVISION_{name.upper()}"
+MAX_PIXELS = FileLimit("GPUVISION_MAX_PIXELS", 1 << 28)
+"""Pixels of an image or of a frame. Chosen: 16384 x 16384, which takes 2 GiB with 8 bytes per pixel. The largest area
+sensors of industrial cameras have 150 million pixels."""
 
-
-def _of_environment(name: str) -> float:
-    text = os.environ[_variable(name)]
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not value > 0.0:
-        raise ReadError(f"the environment variable {_variable(name)} is {text!r}, expected a number above 0")
-    return value
-
-
-def check_limit(name: str, value: float, what: str, error: type[Exception] = ReadError) -> None:
-    """Check a size of a file against a limit.
-
-    Parameters
-    ----------
-    name : str
-        Field of `FileLimits`.
-    value : float
-        Size to check; NaN exceeds every limit.
-    what : str
-        Start of the message: the file, and the object of this size.
-    error : type
-        Class of the exception.
-
-    Raises
-    ------
-    ReadError
-        The size exceeds the limit; or the class of `error`.
-    """
-    limit = getattr(FileLimits.current(), name)
-    if not value <= limit:
-        raise error(f"{what}, expected at most {limit:.10g}; set {_variable(name)} to change this limit")
+MAX_UNPACKED_BYTES = FileLimit("GPUVISION_MAX_UNPACKED_BYTES", 1 << 31)
+"""Bytes that an archive (NPZ, ZIP of Gerber files) unpacks to. An archive that unpacks to at most twice its size is not
+limited. Chosen: 2 GiB."""
 
 
 def check_pixels(shape: tuple[int, ...], what: str, error: type[Exception] = ReadError) -> None:
@@ -115,10 +89,10 @@ def check_pixels(shape: tuple[int, ...], what: str, error: type[Exception] = Rea
     Raises
     ------
     ReadError
-        The image has more than `FileLimits.max_pixels`; or the class of `error`.
+        The image has more pixels than `MAX_PIXELS`; or the class of `error`.
     """
     rows, columns = (*shape, 1)[:2] if shape else (1, 1)
-    check_limit("max_pixels", int(rows) * int(columns), f"{what}: {columns} x {rows} pixels", error)
+    MAX_PIXELS.check(int(rows) * int(columns), f"{what}: {columns} x {rows} pixels", error)
 
 
 def check_archive(path: Path, error: type[Exception] = ReadError) -> None:
@@ -127,14 +101,14 @@ def check_archive(path: Path, error: type[Exception] = ReadError) -> None:
     Raises
     ------
     ReadError
-        The files in it take more than `FileLimits.max_unpacked_bytes` and twice the archive; or the class of `error`.
+        The files in it take more bytes than `MAX_UNPACKED_BYTES` and twice the archive; or the class of `error`.
     zipfile.BadZipFile, OSError
         The file is not a ZIP file, or cannot be read.
     """
     with zipfile.ZipFile(path) as archive:
         unpacked = sum(each.file_size for each in archive.infolist())
     if unpacked > 2 * path.stat().st_size:
-        check_limit("max_unpacked_bytes", unpacked, f"{path}: unpacks to {unpacked} bytes", error)
+        MAX_UNPACKED_BYTES.check(unpacked, f"{path}: unpacks to {unpacked} bytes", error)
 
 
 @contextlib.contextmanager

@@ -277,7 +277,7 @@ def check_tiff_page(page: Any, what: str) -> None:
     Raises
     ------
     RecordingError
-        The page or a tile of it is larger than `FileLimits.max_pixels`, or a segment unpacks to more than its pixels.
+        The page or a tile of it has more pixels than `MAX_PIXELS`, or a segment unpacks to more than its pixels.
     """
     if page.dtype is None:
         raise RecordingError(f"{what}: pixels of an unknown type")

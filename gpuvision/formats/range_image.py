@@ -135,7 +135,7 @@ def read_tiff(path: str | os.PathLike[str]) -> HeightFile:
     Raises
     ------
     ReadError
-        The file is not such a TIFF file, or larger than a limit of `gpuvision.host.reading.FileLimits`.
+        The file is not such a TIFF file, or has more pixels than `gpuvision.host.reading.MAX_PIXELS`.
     """
     with reading(path, "TIFF file of heights"), tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
@@ -227,8 +227,8 @@ def read_png16(path: str | os.PathLike[str]) -> HeightFile:
     Raises
     ------
     ReadError
-        The file is not a 16-bit PNG, or has no Offset or Scale, or is larger than a limit of
-        `gpuvision.host.reading.FileLimits`.
+        The file is not a 16-bit PNG, or has no Offset or Scale, or has more pixels than
+        `gpuvision.host.reading.MAX_PIXELS`.
     """
     with reading(path, "16-bit PNG"):
         codes = read_image(Path(path))
@@ -375,7 +375,8 @@ def read_npz(path: str | os.PathLike[str]) -> tuple[dict[str, Array], dict[str, 
     Raises
     ------
     ReadError
-        The file is not such an NPZ file, or unpacks to more than a limit of `gpuvision.host.reading.FileLimits`.
+        The file is not such an NPZ file, or unpacks to more bytes than
+        `gpuvision.host.reading.MAX_UNPACKED_BYTES`.
     """
     with reading(path, "NPZ file of arrays and units"):
         check_archive(Path(path))

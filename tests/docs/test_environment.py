@@ -5,10 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
-
-from gpuvision.host.reading import FileLimits
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reference" / "environment.md"
@@ -37,7 +34,7 @@ def uses(path: Path) -> Iterator[tuple[str, bool]]:
             return str(node.value)
         if isinstance(node, ast.Name):
             return str(constants[node.id])
-        assert ast.unparse(node).startswith("_variable("), f"{path}: {ast.unparse(node)}"
+        assert ast.unparse(node) == "self.variable", f"{path}: {ast.unparse(node)}"
         return "GPUVISION_MAX_"
 
     for node in ast.walk(tree):
@@ -50,12 +47,30 @@ def uses(path: Path) -> Iterator[tuple[str, bool]]:
             yield name(node.left), False
 
 
+def files() -> Iterator[Path]:
+    """Yield the files of the package."""
+    for room in ("gpuvision", "host", "profiling"):
+        yield from (ROOT / room).rglob("*.py")
+
+
+def limits() -> dict[str, float]:
+    """Return variable and default of each `FileLimit` of the package."""
+    made = re.compile(r"^[A-Z_]+ = FileLimit\((.*)\)$", re.MULTILINE)
+    texts = [found for each in files() for found in made.findall(each.read_text())]
+    return {eval(variable): float(eval(default)) for variable, default in (text.split(",") for text in texts)}
+
+
 def test_the_page_lists_the_variables_of_the_code() -> None:
-    found = {
-        use for room in ("gpuvision", "host", "profiling") for each in (ROOT / room).rglob("*.py") for use in uses(each)
-    }
+    found = {use for each in files() for use in uses(each)}
     assert ("GPUVISION_MAX_", False) in found
-    limits = {f"GPUVISION_{each.name.upper()}" for each in fields(FileLimits)}
     read, written = tables()
     assert written == {name for name, is_set in found if is_set}
-    assert read == limits | {name for name, is_set in found if not is_set and name != "GPUVISION_MAX_"}
+    assert read == set(limits()) | {name for name, is_set in found if not is_set and name != "GPUVISION_MAX_"}
+
+
+def test_the_page_on_file_limits_lists_the_defaults_of_the_code() -> None:
+    page = (ROOT / "docs" / "reference" / "file_limits.md").read_text()
+    listed = re.findall(r"^\|[^|]+\| `(\w+)` \| ([0-9. ]+) \|", page, re.MULTILINE)
+    assert {variable: float(default.replace(" ", "")) for variable, default in listed} == limits()
+    made = sum(each.read_text().count("= FileLimit(") for each in files())
+    assert made == len(listed) == 9

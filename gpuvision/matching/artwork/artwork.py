@@ -118,7 +118,7 @@ def read_artwork(
         There is no such folder or file.
     ReadError
         The layers of the files cannot be determined, the side has no copper, gerbonara cannot read a file of the side,
-        or the board exceeds a limit of `gpuvision.host.reading.FileLimits`.
+        or the board exceeds a `gpuvision.host.FileLimit`.
 
     Notes
     -----

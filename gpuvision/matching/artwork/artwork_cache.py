@@ -22,11 +22,13 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host.cache import cache_folder, is_private, read_private_bytes, write_private_bytes
-from gpuvision.host.reading import FileLimits
+from gpuvision.host.reading import MAX_UNPACKED_BYTES
 from gpuvision.matching.artwork.board_artwork import Artwork, Holes, Pad
+from gpuvision.matching.artwork.board_files import MAX_BOARD_BYTES, MAX_BOARD_FILES, MAX_BOARD_OBJECTS
 from gpuvision.matching.artwork.edges import BoardEdges
-from gpuvision.matching.artwork.shapes import Float64, Shape
+from gpuvision.matching.artwork.shapes import MAX_BOARD_SIZE, Float64, Shape
 
+_LIMITS = (MAX_UNPACKED_BYTES, MAX_BOARD_FILES, MAX_BOARD_BYTES, MAX_BOARD_OBJECTS, MAX_BOARD_SIZE)
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _USES = ("copper", "mask", "silk")
 _PAD_WORDS = ("role", "shape", "function", "net", "part", "pin")
@@ -37,7 +39,8 @@ _MAX_BYTES = 1 << 28
 
 def artwork_key(place: Path, parameters: Sequence[object]) -> str:
     """Return the name of the entry for the files of a folder and parameters of `read_artwork`."""
-    digest = hashlib.sha256(repr([_code_digest(), FileLimits.current(), *parameters]).encode())
+    limits = [each.value for each in _LIMITS]
+    digest = hashlib.sha256(repr([_code_digest(), limits, *parameters]).encode())
     for path in sorted(each for each in place.rglob("*") if each.is_file()):
         content = path.read_bytes()
         digest.update(f"{path.relative_to(place).as_posix()}\0{len(content)}\0".encode(errors="surrogateescape"))

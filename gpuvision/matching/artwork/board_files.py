@@ -29,10 +29,16 @@ from gerbonara.layers import _best_match, _do_autoguess, identify_file
 from gerbonara.rs274x import GerberFile
 
 from gpuvision.host.errors import ReadError
-from gpuvision.host.reading import check_archive, check_limit, reading
+from gpuvision.host.reading import FileLimit, check_archive, reading
 from gpuvision.host.text import printable
 from gpuvision.matching.artwork.gerber_parser import parse_gerber
 
+MAX_BOARD_FILES = FileLimit("GPUVISION_MAX_BOARD_FILES", 1000)
+"""Files in the folder or ZIP file of a board. Chosen: 1000; boards have 10 to 60."""
+MAX_BOARD_BYTES = FileLimit("GPUVISION_MAX_BOARD_BYTES", 1 << 28)
+"""Bytes of a file of a board. Chosen: 256 MiB."""
+MAX_BOARD_OBJECTS = FileLimit("GPUVISION_MAX_BOARD_OBJECTS", 1_000_000)
+"""Objects of a layer, repeated ones included. Chosen: a million, which takes about 1 GiB."""
 # A command, as gerbonara splits a file: a comment, an extended command between %, or text up to an asterisk.
 _COMMAND = re.compile(r"G04[^*]*+\*|%[^%]*+%|[^*%]*+\*")
 _STEP_REPEAT = re.compile(r"SRX0*(\d+)Y0*(\d+)I")
@@ -67,7 +73,7 @@ def board_folder(path: Path) -> Iterator[Path]:
     FileNotFoundError
         There is no such folder or file.
     ReadError
-        The ZIP is damaged, or the board exceeds a limit of `FileLimits`.
+        The ZIP is damaged, or the board exceeds a `FileLimit`.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder or ZIP of Gerber files")
@@ -96,7 +102,7 @@ def open_board(path: Path, layers: Mapping[str, str] | None) -> Iterator[LayerSt
     FileNotFoundError
         There is no such folder or file.
     ReadError
-        The layers cannot be determined, the ZIP is damaged, or the board exceeds a limit of `FileLimits`.
+        The layers cannot be determined, the ZIP is damaged, or the board exceeds a `FileLimit`.
     """
     with board_folder(path) as place:
         yield open_layers(place, path, layers)
@@ -250,7 +256,7 @@ def parsed(layer: Any) -> Any:
     Raises
     ------
     ReadError
-        gerbonara cannot read the file, or it exceeds a limit of `FileLimits`.
+        gerbonara cannot read the file, or it exceeds a `FileLimit`.
     """
     read_as = layer._class if isinstance(layer, LazyCamFile) else type(layer)
     if read_as is not GerberFile and not isinstance(layer, LazyCamFile):
@@ -279,7 +285,7 @@ def _unpacked(path: Path) -> Iterator[Path]:
             check_archive(path)
             with zipfile.ZipFile(path) as archive:
                 count = len(archive.infolist())
-                check_limit("max_board_files", count, f"{path}: {count} files")
+                MAX_BOARD_FILES.check(count, f"{path}: {count} files")
                 archive.extractall(folder)
         yield Path(folder)
 
@@ -294,9 +300,9 @@ def _files(place: Path) -> Iterator[Path]:
 def _check_files(place: Path, path: Path) -> None:
     """Check number and sizes of the files of a board, and stop at the first file too many."""
     for count, each in enumerate(_files(place), 1):
-        check_limit("max_board_files", count, f"{path}: {count} files or more, expected the files of one board")
+        MAX_BOARD_FILES.check(count, f"{path}: {count} files or more, expected the files of one board")
         size = each.stat().st_size if each.is_file() else 0
-        check_limit("max_board_bytes", size, f"{path}: {each.name} has {size} bytes")
+        MAX_BOARD_BYTES.check(size, f"{path}: {each.name} has {size} bytes")
 
 
 def check_gerber(text: str, name: str) -> None:
@@ -312,7 +318,7 @@ def check_gerber(text: str, name: str) -> None:
     Raises
     ------
     ReadError
-        The objects, repeated ones included, exceed `FileLimits.max_board_objects`, or the text is no Gerber.
+        The objects, repeated ones included, exceed `MAX_BOARD_OBJECTS`, or the text is no Gerber.
     """
     _check_runs(text, name)
     objects = in_block = 0
@@ -323,7 +329,7 @@ def check_gerber(text: str, name: str) -> None:
                 found = _STEP_REPEAT.search(command)
                 objects, in_block = objects + in_block * repeats, 0
                 repeats = int(found[1]) * int(found[2]) if found else 1
-                check_limit("max_board_objects", repeats, f"{name}: a step-and-repeat of {repeats} copies")
+                MAX_BOARD_OBJECTS.check(repeats, f"{name}: a step-and-repeat of {repeats} copies")
             if "AM" in command:
                 _check_macro(command, name)
             for vertices in _POLYGON.findall(command):
@@ -332,7 +338,7 @@ def check_gerber(text: str, name: str) -> None:
         else:
             in_block += 1
     objects += in_block * repeats
-    check_limit("max_board_objects", objects, f"{name}: {objects} objects")
+    MAX_BOARD_OBJECTS.check(objects, f"{name}: {objects} objects")
 
 
 def check_drill(text: str, name: str) -> None:
@@ -343,7 +349,7 @@ def check_drill(text: str, name: str) -> None:
     if longest > _LONGEST_LINE:
         raise ReadError(f"{name}: a line of {longest} characters, expected commands of a drill file")
     holes = len(lines) + sum(map(int, _REPEATED_HOLE.findall(text)))
-    check_limit("max_board_objects", holes, f"{name}: {holes} holes")
+    MAX_BOARD_OBJECTS.check(holes, f"{name}: {holes} holes")
 
 
 def _check_runs(text: str, name: str) -> None:

@@ -14,12 +14,14 @@ from gerbonara import graphic_objects, graphic_primitives
 from gerbonara.apertures import ApertureMacroInstance, CircleAperture, ExcellonTool
 from gerbonara.utils import MM
 
-from gpuvision.host.reading import check_limit
+from gpuvision.host.reading import FileLimit
 from gpuvision.matching.artwork.gerber_parser import TransformedAperture
 
 Float64 = npt.NDArray[np.float64]
 Crossings = list[tuple[bool, Float64]]
 
+MAX_BOARD_SIZE = FileLimit("GPUVISION_MAX_BOARD_SIZE", 2.0)
+"""Largest coordinate of a board [m]. Chosen: 2 m; production panels have up to 1.5 m."""
 SAGITTA = 0.5e-6
 """Largest distance [m] between an arc and the chord that stands for it."""
 _METRE = 1e-3  # all calls of gerbonara use millimetres
@@ -176,7 +178,7 @@ def drawn_objects(layer: Any) -> tuple[DrawnObject, ...]:
     ------
     ValueError
         An aperture macro has a moiré, which is obsolete and not supported. Or an object lies or extends beyond
-        `FileLimits.max_board_size`, or the layer has too many corners.
+        `MAX_BOARD_SIZE`, or the layer has too many corners.
     """
     drawn, corners = [], 0
     for item in layer.objects:
@@ -187,7 +189,7 @@ def drawn_objects(layer: Any) -> tuple[DrawnObject, ...]:
         if corners > _MOST_CORNERS:
             raise ValueError(f"a layer of more than {_MOST_CORNERS} corners; are its arcs and apertures too large?")
         farthest = float(np.max(np.abs(each.bounds))) if corners else 0.0
-        check_limit("max_board_size", farthest, f"an object that extends to {farthest:.4g} m", ValueError)
+        MAX_BOARD_SIZE.check(farthest, f"an object that extends to {farthest:.4g} m", ValueError)
         drawn.append(each)
     return tuple(drawn)
 

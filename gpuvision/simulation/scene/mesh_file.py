@@ -10,9 +10,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from gpuvision.host.reading import check_limit
+from gpuvision.host.reading import FileLimit
 
 SUFFIXES = (".stl", ".ply", ".obj", ".glb")
+MAX_TRIANGLES = FileLimit("GPUVISION_MAX_TRIANGLES", 20_000_000)
+"""Triangles of a mesh, instances included. Chosen: 20 million, 1 GB as binary STL."""
 _TRIANGLE_BYTES = 50  # of a triangle in a binary STL file, and fewer than a face and its corners take in other formats
 _LONGEST_HEADER = 1 << 16  # bytes of the header of a PLY file
 _PLY_SIZES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
@@ -26,13 +28,13 @@ def check_mesh(path: Path) -> None:
     Raises
     ------
     ReadError
-        The file has more than `FileLimits.max_triangles`.
+        The file has more triangles than `MAX_TRIANGLES`.
     ValueError
         The size of the file differs from the size that its header claims, or there is no such header.
     """
     size = path.stat().st_size
     count = size // _TRIANGLE_BYTES
-    check_limit("max_triangles", count, f"{path}: {size} bytes, which hold up to {count} triangles")
+    MAX_TRIANGLES.check(count, f"{path}: {size} bytes, which hold up to {count} triangles")
     with path.open("rb") as file:
         if path.suffix.lower() == ".ply":
             _check_ply(file, size)
@@ -86,10 +88,10 @@ def _check_glb(file: BinaryIO, size: int, path: Path) -> None:
             raise ValueError("it refers to another file, expected a GLB file that holds its data")
     accessors = tree.get("accessors", ())
     empty = sum(_count(each) for each in accessors if "bufferView" not in each)
-    check_limit("max_triangles", empty, f"{path}: claims {empty:.0f} numbers that it does not hold")
+    MAX_TRIANGLES.check(empty, f"{path}: claims {empty:.0f} numbers that it does not hold")
     meshes = [sum(_triangles(each, accessors) for each in mesh["primitives"]) for mesh in tree.get("meshes", ())]
     triangles = sum(meshes[each["mesh"]] for each in tree.get("nodes", ()) if "mesh" in each)
-    check_limit("max_triangles", triangles, f"{path}: {triangles:.0f} triangles in all instances")
+    MAX_TRIANGLES.check(triangles, f"{path}: {triangles:.0f} triangles in all instances")
 
 
 def _count(accessor: Mapping[str, Any]) -> float:

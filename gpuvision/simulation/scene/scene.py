@@ -149,8 +149,8 @@ class Scene:
         IsADirectoryError
             The path is a folder.
         ReadError
-            The file has another format, is damaged, contains no triangles, or has more than
-            `gpuvision.host.reading.FileLimits.max_triangles`.
+            The file has another format, is damaged, contains no triangles, or has more triangles
+            than `gpuvision.simulation.scene.mesh_file.MAX_TRIANGLES`.
         """
         import trimesh
 

@@ -222,6 +222,9 @@ from .ranging.psd import (
 from .ranging.psd import (
     PsdReadout as PsdReadout,
 )
+from .ranging.psd import (
+    clipping_bias as clipping_bias,
+)
 from .ranging.range_image import (
     RangeImage as RangeImage,
 )

@@ -19,7 +19,7 @@ class Status(enum.IntFlag):
     SATURATED = 2
     """A channel or pixel is at its upper limit."""
     OUT_OF_RANGE = 4
-    """The position lies outside the measuring range, or the image border cuts its window."""
+    """The position lies outside the measuring range, or the border of the sensor cuts its window or light spot."""
     NOT_FINITE = 8
     """An input of the sample is NaN or infinite, or the result is too large for the number type."""
     AMBIGUOUS = 16

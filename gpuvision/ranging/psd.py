@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
+from scipy.special import log_ndtr
 
 from gpuvision.host import (
     Define,
@@ -34,6 +36,9 @@ from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.validation import finite
 
 ELECTRON = 1.602176634e-19  # elementary charge [C]
+# Margin at the ends of a strip in standard deviations of the light spot. Derived: the end of a strip that cuts a
+# Gaussian spot 3 standard deviations from its centre moves the reading by 0.0044 of them.
+_MARGIN_SPOTS = 3.0
 # Samples of a work-item of the vector variant, multiples of 16: long, unless there are too few to keep every core busy.
 _SHORT_STRIP, _LONG_STRIP, _STRIPS_PER_CORE = 4096, 65536, 4
 _LANES = 16  # of a vector of the vector variant: its kernel's vectors have 16 elements
@@ -51,8 +56,8 @@ class PsdReading(NamedTuple):
         Sum of both currents, after dark level and gain correction [A].
     status
         uint8 `Status` flags: LOW_SIGNAL (total not above the minimum), SATURATED (either channel), OUT_OF_RANGE (beyond
-        the ends of the strip), NOT_FINITE (a current is NaN or infinite). HORIZON and NOT_INVERTIBLE are set by the
-        triangulation.
+        the ends of the strip or within the margin at an end, where the end cuts the light spot), NOT_FINITE (a current
+        is NaN or infinite). HORIZON and NOT_INVERTIBLE are set by the triangulation.
     sigma
         Predicted standard deviation of the position [m].
     g, h
@@ -69,37 +74,61 @@ class PsdReading(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class PsdNoise:
-    """Noise model of a PSD: three components of the noise of the two currents.
+    """Noise model of a PSD: four components of the noise of the two currents.
 
     Parameters
     ----------
     independent : float
-        Standard deviation s of the noise of each channel (amplifiers) [A], default 0. Its effect on the position grows
-        towards the ends of the strip: ``(L s / S) sqrt((1 + xi^2) / 2)``, with ``xi = 2 u / L`` and the total S.
+        Standard deviation s of the noise of each channel as recorded, before the gain correction (amplifiers) [A],
+        default 0. Its effect on the position grows towards the ends of the strip: ``(L s / S) sqrt((1 + xi^2) / 2)``,
+        with ``xi = 2 u / L`` and the total S. Behind a gain g of the right channel the noise of the corrected right
+        current is s / g, and the effect ``(L s / (2 S)) sqrt((1 + xi)^2 + (1 - xi)^2 / g^2)``.
     opposed : float
         Standard deviation s of noise that leaves at one electrode and enters at the other [A], default 0: the Johnson
         current of the strip resistance, ``sqrt(4 k T B / R_ie)``. Its effect is the same everywhere: ``L s / S``.
     spot : float
         Standard deviation of the width of the light spot [m], default 0. The electrons of one spot divide together, so
-        shot noise contributes ``spot / sqrt(N)``, with N electrons within the time constant.
+        shot noise contributes ``spot / sqrt(N)``, with N electrons within the time constant. It is also the default
+        of the margin at the ends of the strip, see `PsdReadout`.
     bandwidth : float
         Bandwidth B [Hz], default 0; ``N = S / (2 q B)``.
+    background : float
+        Mean photocurrent I of background light [A], default 0: uniform over the strip, and absent from the currents on
+        average, because the light is modulated and demodulated or because `PsdReadout.dark` contains it. Its shot noise
+        remains: its electrons spread over the whole strip, so that it contributes
+        ``sqrt(2 q B I (L^2 / 12 + u^2)) / S``.
+    dark_current : float
+        Mean dark current of the strip [A], default 0. Its shot noise acts as the shot noise of background light does.
 
     Raises
     ------
     ValueError
-        A number is negative or not finite.
+        A number is negative or not finite, or there is a background or a dark current without a bandwidth.
+
+    Notes
+    -----
+    The components are independent of each other: their variances add up. The model is linear in the noise; it holds
+    where the noise is far below the total.
+
+    References
+    ----------
+    Hamamatsu Photonics, *PSD (position sensitive detectors)*, technical note: noise currents of a PSD.
     """
 
     independent: float = 0.0
     opposed: float = 0.0
     spot: float = 0.0
     bandwidth: float = 0.0
+    background: float = 0.0
+    dark_current: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("independent", "opposed", "spot", "bandwidth"):
+        for name in ("independent", "opposed", "spot", "bandwidth", "background", "dark_current"):
             if finite(getattr(self, name), f"PsdNoise.{name}") < 0.0:
                 raise ValueError(f"PsdNoise.{name} is {getattr(self, name)}, expected a number >= 0")
+        for name in ("background", "dark_current"):
+            if getattr(self, name) > 0.0 and self.bandwidth == 0.0:
+                raise ValueError(f"PsdNoise.{name} needs bandwidth [Hz] as well: shot noise is proportional to it")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,6 +159,10 @@ class PsdReadout(VisionOperation[PsdReading]):
     linearity : array_like of shape (strips, knots), optional
         Corrections added to the position [m]. The knots divide a strip evenly from -L/2 to L/2; the correction is
         linear between knots.
+    margin : float, optional
+        Distance from the ends of the strip within which a reading is OUT_OF_RANGE [m], 0 or more and below L/2: the
+        end cuts the light spot there, and the reading is biased (`clipping_bias`). Default: 3 ``noise.spot``, where the
+        bias of a Gaussian spot is 0.0044 ``noise.spot``; 0 without a noise model.
     noise : PsdNoise, optional
         Noise model for the output ``sigma``. The quantisation of integer codes is added.
     triangulation, axes : Triangulation, SampleAxes
@@ -156,7 +189,9 @@ class PsdReadout(VisionOperation[PsdReading]):
     Notes
     -----
     Error: the arithmetic adds at most 4 epsilon of L/2 to the position (5e-7 L/2 in single precision), also for 16-bit
-    codes. It adds less near the middle, since the difference of nearly equal currents is exact.
+    codes. It adds less near the middle, since the difference of nearly equal currents is exact. The light of the spot
+    beyond the end of the strip is lost (thesis, section 4.2.5), which moves an accepted reading by at most
+    ``largest_clipping_bias``.
 
     References
     ----------
@@ -183,6 +218,7 @@ class PsdReadout(VisionOperation[PsdReading]):
     minimum_total: float = 0.0
     saturation: float | None = None
     linearity: tuple[tuple[float, ...], ...] | None = None
+    margin: float | None = None
     noise: PsdNoise | None = None
     triangulation: Triangulation | None = None
     axes: SampleAxes = SampleAxes()
@@ -205,6 +241,42 @@ class PsdReadout(VisionOperation[PsdReading]):
             raise ValueError(f"PsdReadout.layout is {self.layout!r}, expected 'pairs' or 'planar'")
         object.__setattr__(self, "outputs", self._chosen())
         self._check_linearity()
+        self._check_margin()
+
+    @property
+    def largest_clipping_bias(self) -> float:
+        """Largest bias of an accepted reading because the end of the strip cuts a Gaussian spot [m].
+
+        It is the bias at the margin of a spot of the standard deviation ``noise.spot``; 0 without a spot width.
+        """
+        spot = self.noise.spot if self.noise is not None else 0.0
+        if spot == 0.0:
+            return 0.0
+        end = 0.5 * self.strip_length - self.applied_margin
+        # The reading increases with the centre of the spot: bisect for the centre that is read at the margin. Hardly
+        # any light of a spot beyond the upper bound is on the strip.
+        low, high = end, 0.5 * self.strip_length + 37.0 * spot
+        for _ in range(60):
+            centre = 0.5 * (low + high)
+            reading = centre + float(clipping_bias(centre, spot=spot, strip_length=self.strip_length))
+            low, high = (centre, high) if reading < end else (low, centre)
+        return high - end
+
+    @property
+    def applied_margin(self) -> float:
+        """Margin at either end of the strip [m]: ``margin``, or its default."""
+        if self.margin is not None:
+            return self.margin
+        return _MARGIN_SPOTS * self.noise.spot if self.noise is not None else 0.0
+
+    def _check_margin(self) -> None:
+        if self.margin is not None:
+            object.__setattr__(self, "margin", finite(self.margin, "PsdReadout.margin"))
+        if not 0.0 <= self.applied_margin < 0.5 * self.strip_length:
+            source = "" if self.margin is not None else f", {_MARGIN_SPOTS:g} times noise.spot"
+            raise ValueError(
+                f"PsdReadout.margin is {self.applied_margin} m{source}; expected 0 or more, and below half a strip"
+            )
 
     def _check_currents(self) -> None:
         try:
@@ -290,9 +362,10 @@ class PsdReadout(VisionOperation[PsdReading]):
         return defines | flags(
             PLANAR=self.layout == "planar",
             DARK_LEVEL=any(self.dark),
-            # A current can be negative or not finite, or the load resistors shrink the range.
-            SIGNED=dtype.kind == "f" or any(self.dark) or self.load_resistance > 0.0,
+            # A current can be negative or not finite, or the range is shorter than the strip.
+            SIGNED=dtype.kind == "f" or any(self.dark) or self.load_resistance > 0.0 or self.applied_margin > 0.0,
             GAIN=self.right_gain != 1.0,
+            BACKGROUND=self.noise is not None and self.noise.background + self.noise.dark_current > 0.0,
             LINEARITY=self.linearity is not None,
         )
 
@@ -308,20 +381,81 @@ class PsdReadout(VisionOperation[PsdReading]):
             # Twice the limit is finite, in amperes too: no sum below the limit overflows.
             ceiling, quantisation = float(np.finfo(real).max) / (4.0 * max(self.ampere, 1.0)), 0.0
         saturation = ceiling if self.saturation is None else min(self.saturation / self.ampere, ceiling)
+        left_variance = (noise.independent / self.ampere) ** 2 + quantisation
+        right_variance = left_variance / self.right_gain**2
+        shot = 2.0 * ELECTRON * noise.bandwidth / self.ampere
         table = PsdTable(
             half_length=0.5 * self.strip_length / limit,
             limit=limit,
+            range=limit * (1.0 - 2.0 * self.applied_margin / self.strip_length),
             minimum=self.minimum_total / self.ampere,
             saturation=saturation,
             ampere=self.ampere,
             dark_left=self.dark[0] / self.ampere,
             dark_right=self.dark[1] / self.ampere,
             right_gain=1.0 / self.right_gain,
-            independent=(noise.independent / self.ampere) ** 2 + quantisation,
+            independent=0.5 * (left_variance + right_variance),
+            asymmetry=0.5 * (left_variance - right_variance),
             opposed=(noise.opposed / self.ampere) ** 2,
+            background=shot * (noise.background + noise.dark_current) / self.ampere,
             common_noise=noise.spot**2 * 2.0 * ELECTRON * noise.bandwidth / self.ampere,
         )
         return np.array(table, real)
+
+
+def clipping_bias(centre: npt.ArrayLike, *, spot: float, strip_length: float) -> npt.NDArray[np.float64]:
+    """Return the bias of a PSD reading because the ends of the strip cut a Gaussian light spot.
+
+    Parameters
+    ----------
+    centre : array_like
+        Centre x of the spot, from the middle of the strip [m], any shape. It may lie beyond the ends.
+    spot : float
+        Standard deviation s of the spot [m], > 0.
+    strip_length : float
+        Length L between the electrodes [m], > 0.
+
+    Returns
+    -------
+    numpy.ndarray
+        float64, the shape of ``centre``: reading minus centre [m]. It points away from the nearer end. The reading is
+        always on the strip.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter is out of its range.
+
+    Notes
+    -----
+    Only light within the strip counts. With a = (-L/2 - x) / s and b = (L/2 - x) / s the bias is
+    ``s (phi(a) - phi(b)) / (Phi(b) - Phi(a))``, phi and Phi the density and the distribution of the standard normal.
+    Near one end, c standard deviations inside the strip, it is ``-s phi(c) / Phi(c)``, of a signal reduced by the
+    factor Phi(c): c = 3: -0.0044 s; 2: -0.055 s; 1: -0.29 s; 0: -0.80 s; -1 (centre beyond the end): -1.5 s.
+
+    References
+    ----------
+    F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 4.2.5.
+
+    Examples
+    --------
+    >>> import gpuvision as gv
+    >>> gv.clipping_bias([0.0, 2.9e-3, 3.0e-3], spot=50e-6, strip_length=6e-3).round(7).tolist()
+    [0.0, -2.8e-06, -3.99e-05]
+    """
+    for name, value in (("spot", spot), ("strip_length", strip_length)):
+        if finite(value, f"clipping_bias: {name}") <= 0.0:
+            raise ValueError(f"clipping_bias: {name} is {value}, expected a length > 0")
+    x = np.asarray(centre, np.float64)
+    away = np.abs(x)
+    # By symmetry the nearer end is the upper one: |a| >= |b|. Quotients of densities and distributions by their
+    # logarithms have no underflow.
+    a, b = (-0.5 * strip_length - away) / spot, (0.5 * strip_length - away) / spot
+    log_share = log_ndtr(b)
+    density = np.exp(-0.5 * b**2 - log_share) / math.sqrt(math.tau)  # phi(b) / Phi(b)
+    beyond = np.expm1(0.5 * (b - a) * (b + a)) / np.expm1(log_ndtr(a) - log_share)
+    # -0.0 becomes 0.0.
+    return np.asarray(-np.sign(x) * spot * density * beyond + 0.0)
 
 
 class PsdTable(NamedTuple):
@@ -329,6 +463,7 @@ class PsdTable(NamedTuple):
 
     half_length: float
     limit: float
+    range: float
     minimum: float
     saturation: float
     ampere: float
@@ -336,5 +471,7 @@ class PsdTable(NamedTuple):
     dark_right: float
     right_gain: float
     independent: float
+    asymmetry: float
     opposed: float
+    background: float
     common_noise: float

@@ -18,7 +18,7 @@ Electronics:
 
 ==================  ==================================================================================================
 ``responsivity``    A/W
-``ambient``         ambient light on every strip or pixel [W]
+``ambient``         ambient light on every strip or pixel [W]; for a PSD also the default of ``psd.noise.background``
 ``modulated``       PSD: the light is modulated, so that ambient light adds only noise
 ``exposure``        camera: exposure time of a frame [s]
 ``full_well``       camera: electrons at the highest grey level

@@ -6,7 +6,8 @@ Tables of the file (the files in ``gpuvision/presets/sensors`` are commented exa
 ``kind``, ``name``    ``"camera"`` or ``"psd"``; a name for the report
 ``[recording]``       see `Recording`
 ``[line]``            camera: fields of `LineReadout`
-``[psd]``             PSD: number of strips, fields of `PsdReadout`; ``[psd.noise]``: fields of `PsdNoise`
+``[psd]``             PSD: number of strips, fields of `PsdReadout`; ``[psd.noise]``: fields of `PsdNoise`, where the
+                      default of ``background`` is the photocurrent of the ambient light in ``[light]``
 ``[frame]``           camera: columns and rows of a frame; needed for a triangulation
 ``[axes]``            map from positions and samples to the coordinates of the triangulation, see `SampleAxes`
 ``[lens]``            radial distortion, see `Lens`
@@ -184,7 +185,7 @@ class Sensor:
         top.finish()
         return cls(
             name=name,
-            readout=_line(readout, along, sheet, axes) if kind == "camera" else _psd(readout, sheet, axes),
+            readout=_line(readout, along, sheet, axes) if kind == "camera" else _psd(readout, sheet, axes, light),
             transport=transport,
             output=output,
             recording=recording,
@@ -343,7 +344,7 @@ def _line(table: Section, along: Along, sheet: Triangulation | None, axes: Sampl
     return readout
 
 
-def _psd(table: Section, sheet: Triangulation | None, axes: SampleAxes) -> PsdReadout:
+def _psd(table: Section, sheet: Triangulation | None, axes: SampleAxes, light: Light | None) -> PsdReadout:
     left, right = table.numbers("dark", "A", (2,), (0.0, 0.0))
     readout = PsdReadout(
         strip_length=table.number("strip_length", "m", above=0.0),
@@ -355,7 +356,8 @@ def _psd(table: Section, sheet: Triangulation | None, axes: SampleAxes) -> PsdRe
         minimum_total=table.number("minimum_total", "A", 0.0, at_least=0.0),
         saturation=table.number("saturation", "A", None, above=0.0),
         linearity=table.rows("linearity", "m", default=None),
-        noise=_noise(table.optional_section("noise")),
+        margin=table.number("margin", "m", None, at_least=0.0),
+        noise=_noise(table.optional_section("noise"), 0.0 if light is None else light.responsivity * light.ambient),
         triangulation=sheet,
         axes=axes,
     )
@@ -363,11 +365,14 @@ def _psd(table: Section, sheet: Triangulation | None, axes: SampleAxes) -> PsdRe
     return readout
 
 
-def _noise(table: Section | None) -> PsdNoise | None:
+def _noise(table: Section | None, ambient: float) -> PsdNoise | None:
+    """Read the noise of a PSD; without a background it is the photocurrent of the light's ambient light [A]."""
     if table is None:
         return None
-    units = {"independent": "A", "opposed": "A", "spot": "m", "bandwidth": "Hz"}
-    noise = PsdNoise(**{name: table.number(name, unit, 0.0, at_least=0.0) for name, unit in units.items()})
+    units = {"independent": "A", "opposed": "A", "spot": "m", "bandwidth": "Hz", "dark_current": "A"}
+    values = {name: table.number(name, unit, 0.0, at_least=0.0) for name, unit in units.items()}
+    background = table.number("background", "A", ambient if values["bandwidth"] > 0.0 else 0.0, at_least=0.0)
+    noise = PsdNoise(**values, background=background)
     table.finish()
     return noise
 

@@ -12,9 +12,10 @@
 //          position real [m], total real [A], status uchar, sigma real [m] (standard deviation of the position),
 //          g, h real [m] (point in the sheet of light)
 // Build options: INPUT, INPUT16 (float, double or ushort), REAL_IS_DOUBLE, PLANAR, DARK_LEVEL (subtract dark currents),
-//          GAIN (equalise the channels), LINEARITY, SIGNED (a current can be negative or not finite, or the load
-//          resistors shrink the range), WITH_POSITION/TOTAL/STATUS/SIGMA/SHEET/G/H, LENS, LENS_K2, LENS_K3,
-//          LENS_K4, PAST_CACHES, VECTOR_VARIANT.
+//          GAIN (equalise the channels), LINEARITY, SIGNED (a current can be negative or not finite, or the range is
+//          shorter than the strip), BACKGROUND (shot noise of light and dark current all over the strip),
+//          WITH_POSITION/TOTAL/STATUS/SIGMA/SHEET/G/H, LENS, LENS_K2, LENS_K3, LENS_K4,
+//          PAST_CACHES, VECTOR_VARIANT.
 // Work:    vector variant: a work-item processes `each` consecutive samples, the last one up to 2 `each` - 1.
 //          Otherwise: one work-item per sample.
 #include "common/load.h"
@@ -25,13 +26,16 @@
 typedef struct {
     real half_length;  // L/2, divided by `limit` [m]
     real limit;        // |right - left| / sum at the ends of the strip: below 1 with load resistors
+    real range;        // largest |right - left| / sum of a trusted position: `limit` less the margin at the ends
     real minimum;      // smallest sum of a trusted position (exclusive)
     real saturation;   // of a channel, dark level included
     real ampere;       // amperes per unit of the input
     real dark_left, dark_right;
     real right_gain;   // factor that brings the right channel to the gain of the left one
-    real independent;  // variance of the noise of each channel
+    real independent;  // mean variance of the noise of the two channels, after the gain correction
+    real asymmetry;    // half of the left channel's variance less the right channel's, after the gain correction
     real opposed;      // variance of noise that leaves one electrode and enters the other
+    real background;   // variance of the sum: shot noise of background light and dark current
     real common_noise;  // variance of the position times the sum: shot noise of a spot of finite width [m^2]
 } PsdTable;
 
@@ -84,11 +88,20 @@ static inline reals corrected(reals u, int sample, const Readout *io) {
 #endif
 
 #ifdef WITH_SIGMA
-// Standard deviation of the position. The effect of independent noise increases towards the ends of the strip. Opposed
-// noise is the same everywhere. Common noise (the electrons of one light spot divide together) leaves the width of the
-// spot.
+// Standard deviation of the position, from variances of the currents: u has the derivatives -L right / sum^2 with
+// respect to left and L left / sum^2 with respect to right, so that variances l, r of independent noise give
+//     L^2 / sum^2 ((l + r)/4 (1 + balance^2) + (l - r)/2 balance).
+// Opposed noise is the same everywhere. Common noise (the electrons of one light spot divide together) leaves the width
+// of the spot. An electron of the background moves the position by its distance from it, of variance L^2/12 + u^2; here
+// in units of L^2 with L/2 = half_length limit, u = half_length balance.
 static inline reals sigma_of(reals balance, reals sum, constant PsdTable *table) {
-    const reals spread = table->independent * (1 + balance * balance) / 2 + table->opposed;
+    reals spread = table->independent * (1 + balance * balance) / 2 + table->opposed;
+#ifdef GAIN
+    spread += table->asymmetry * balance;
+#endif
+#ifdef BACKGROUND
+    spread += table->background * (table->limit * table->limit / 3 + balance * balance) / 4;
+#endif
     const real length = 4 * table->half_length * table->half_length;
     return sqrt(length * spread / (sum * sum) + table->common_noise / sum);
 }
@@ -100,7 +113,7 @@ static inline masks flags_of(reals left, reals right, masks saturated, reals sum
                              constant PsdTable *table) {
     masks flags = STATUS_OK;
 #ifdef SIGNED
-    flags = fabs(difference) > table->limit * sum ? (masks)STATUS_OUT_OF_RANGE : flags;
+    flags = fabs(difference) > table->range * sum ? (masks)STATUS_OUT_OF_RANGE : flags;
 #endif
     flags = sum <= table->minimum ? (masks)STATUS_LOW_SIGNAL : flags;
     flags |= saturated & STATUS_SATURATED;
@@ -153,7 +166,7 @@ static inline void read_samples(const int careful, int sample, const Readout *io
     // These comparisons are false for NaN. The saturation limit excludes infinity and sums that overflow.
     good &= mask_of(sum > table->minimum);
 #ifdef SIGNED
-    good &= mask_of(fabs(difference) <= table->limit * sum);
+    good &= mask_of(fabs(difference) <= table->range * sum);
     *verdict |= ~good;
 #else
     verdict->least_sum = sum < verdict->least_sum ? sum : verdict->least_sum;

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.special import ndtr
 
 import gpuvision as gv
 from canary import Guarded
@@ -222,10 +223,159 @@ def test_noise_models_predict_what_draws_scatter(device, rng, model, xi):
         electrons = total / (2 * reference.ELECTRON * 1e9)
         place = xi / 2 + rng.normal(0, 100e-6 / LENGTH / np.sqrt(electrons), draws)
         pairs = total * np.stack([0.5 - place, 0.5 + place], axis=-1)
-    reading = PsdReadout(strip_length=LENGTH, noise=noise)(pairs, device=device)
+    # The spots of the draws lie beside each other within a range that a margin would cut.
+    reading = PsdReadout(strip_length=LENGTH, noise=noise, margin=0.0)(pairs, device=device)
     good = reading.status == 0
     # 40 000 draws determine a standard deviation to 0.35 %; three times this margin.
     assert np.std(reading.position[good]) == pytest.approx(np.mean(reading.sigma[good]), rel=0.0125)
+
+
+def electrons_as_currents(rng, draws, signal, background, place, spot, bandwidth):
+    """Return currents (draws, 2) of a strip on which every electron is a Poisson event at its position.
+
+    The electrons of a Gaussian spot and of a uniform background arrive in cells of the strip during 1 / (2 bandwidth);
+    an electron at y divides in the ratio of its distances from the electrodes.
+    """
+    window, cells = 0.5 / bandwidth, 250
+    edges = np.linspace(-0.5 * LENGTH, 0.5 * LENGTH, cells + 1)
+    rate = signal * np.diff(ndtr((edges - place) / spot)) + background / cells
+    counts = rng.poisson(rate * window / reference.ELECTRON, (draws, cells))
+    y = 0.5 * (edges[1:] + edges[:-1]) / LENGTH
+    return counts @ np.stack([0.5 - y, 0.5 + y], axis=-1) * reference.ELECTRON / window
+
+
+@pytest.mark.parametrize("ambient", [0.0, 2e-6, 20e-6, 200e-6])
+def test_sigma_with_background_light(device, rng, ambient):
+    """The predicted sigma is the scatter of drawn electrons, also under ambient light of 100 times the signal."""
+    draws, spot, bandwidth, amplifier, responsivity = 10_000, 50e-6, 1e6, 0.2e-9, 0.4
+    signal, background, dark_current = 2e-6 * responsivity, ambient * responsivity, 50e-9
+    removed = 0.5 * (background + dark_current)
+    noise = PsdNoise(
+        independent=amplifier, spot=spot, bandwidth=bandwidth, background=background, dark_current=dark_current
+    )
+    for place in (-2.5e-3, -0.8e-3, 0.0, 1.7e-3, 2.7e-3):
+        pairs = electrons_as_currents(rng, draws, signal, background + dark_current, place, spot, bandwidth)
+        for gain in (1.0, 0.25, 3.0):
+            recorded = pairs * (1.0, gain) + rng.normal(0.0, amplifier, pairs.shape)
+            readout = PsdReadout(
+                strip_length=LENGTH, right_gain=gain, dark=(removed, gain * removed), noise=noise, margin=0.0
+            )
+            # Single precision rounds the difference of currents of 40 uA to a tenth of the noise.
+            reading = readout(recorded if device.has_double else recorded.astype(np.float32), device=device)
+            assert (reading.status == 0).all()
+            # 10 000 draws determine a standard deviation to 0.7 %; four times this margin.
+            assert np.std(reading.position) == pytest.approx(np.mean(reading.sigma), rel=0.03), (place, gain)
+            mean = np.mean(reading.position)
+            assert mean == pytest.approx(place, abs=4 * np.mean(reading.sigma) / np.sqrt(draws)), (place, gain)
+
+
+def test_shot_noise_needs_a_bandwidth():
+    for name in ("background", "dark_current"):
+        with pytest.raises(ValueError, match=rf"{name} needs bandwidth \[Hz\]"):
+            PsdNoise(**{name: 1e-6})
+        with pytest.raises(ValueError, match=rf"{name} is -1"):
+            PsdNoise(**{name: -1.0}, bandwidth=1e6)
+
+
+def clipped_spot(centre, spot, length=LENGTH, nodes=40):
+    """Return the signal and the mean of the part of a Gaussian spot on a strip, by Gauss-Legendre quadrature."""
+    half = 0.5 * length
+    edges = np.linspace(max(-half, centre - 40 * spot), min(half, centre + 40 * spot), 41)
+    x, weight = np.polynomial.legendre.leggauss(nodes)
+    width = np.diff(edges)[:, None] / 2
+    y = (edges[:-1, None] + width * (x + 1)).ravel()
+    # Relative to the largest density on the strip: no underflow for spots beyond the end.
+    exponent = -0.5 * ((y - centre) / spot) ** 2
+    density = np.exp(exponent - exponent.max()) * (width * weight).ravel()
+    total = density.sum() * np.exp(exponent.max()) / (np.sqrt(2 * np.pi) * spot)
+    return total, (density @ (y - centre)) / density.sum()
+
+
+def test_bias_of_a_clipped_spot():
+    """The closed form is the mean of the light on the strip, inside, at, and beyond either end, for any width."""
+    spot = 50e-6
+    inside = np.array([3.0, 2.0, 1.0, 0.0, -1.0, -2.0, -10.0, -30.0])
+    table = [-0.0044, -0.0553, -0.2876, -0.7979, -1.5251, -2.3732]  # domain reference, to one unit of the last digit
+    centre = 0.5 * LENGTH - inside * spot
+    bias = gv.clipping_bias(centre, spot=spot, strip_length=LENGTH)
+    np.testing.assert_allclose(bias[:6] / spot, table, atol=1e-4)
+    np.testing.assert_allclose(gv.clipping_bias(-centre, spot=spot, strip_length=LENGTH), -bias, rtol=1e-15)
+    for spot in (10e-6, 0.5e-3, 2e-3, 10e-3, 1.0):
+        centre = np.concatenate([[0.0, 1e-9], 0.5 * LENGTH - inside * min(spot, LENGTH), 0.5 * LENGTH + spot * inside])
+        bias = gv.clipping_bias(centre, spot=spot, strip_length=LENGTH)
+        expected = [clipped_spot(each, spot)[1] for each in centre]
+        np.testing.assert_allclose(bias, expected, rtol=1e-8, atol=1e-11 * LENGTH)
+    assert gv.clipping_bias(0.0, spot=spot, strip_length=LENGTH).shape == ()
+
+
+def test_what_the_bias_of_a_clipped_spot_refuses():
+    for name in ("spot", "strip_length"):
+        with pytest.raises(ValueError, match=f"{name} is 0"):
+            gv.clipping_bias(0.0, **{"spot": 1e-4, "strip_length": LENGTH, name: 0.0})
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("dtype", ["float32", "float64", "uint16"])
+def test_a_spot_cut_by_the_end_of_the_strip_is_flagged(device, rng, variant, dtype):
+    """A spot that the end cuts is OUT_OF_RANGE if its bias exceeds the largest bias that the readout states."""
+    spot, total = 50e-6, 0.8e-6
+    unit = 2e-11 if dtype == "uint16" else 1.0
+    inside = np.array([6.0, 4.0, 3.2, 2.8, 2.0, 1.0, 0.0, -1.0, -2.0])
+    for end in (-1.0, 1.0):
+        signal, bias = np.transpose([clipped_spot(0.5 * LENGTH - c * spot, spot) for c in inside])
+        place = end * (0.5 * LENGTH - inside * spot + bias)
+        pairs = total * signal[:, None] * np.stack([0.5 - place / LENGTH, 0.5 + place / LENGTH], axis=-1)
+        # Many samples of each: in blocks of good samples, in blocks of bad ones, and beside each other.
+        pairs = np.concatenate([np.repeat(pairs, 700, axis=0), np.tile(pairs, (50, 1))])
+        recorded = np.rint(pairs / unit).astype(dtype) if dtype == "uint16" else pairs.astype(dtype)
+        readout = PsdReadout(
+            strip_length=LENGTH, ampere=unit, noise=PsdNoise(spot=spot, bandwidth=20e3), variant=variant
+        )
+        reading = readout(recorded, device=device)
+        cut = np.concatenate([np.repeat(inside, 700), np.tile(inside, 50)]) < 3.0
+        np.testing.assert_array_equal(reading.status, np.where(cut, Status.OUT_OF_RANGE, 0))
+        np.testing.assert_array_equal(np.isnan(reading.position), cut)
+        np.testing.assert_array_equal(np.isnan(reading.sigma), cut)
+        assert np.isfinite(reading.total).all()
+        assert np.abs(bias[inside >= 3.0]).max() <= readout.largest_clipping_bias < 0.0045 * spot
+        # Without a margin the biased positions are read; their errors are the closed form.
+        read = replace(readout, margin=0.0)(recorded, device=device)
+        assert (read.status == 0).all()
+        error = read.position[-len(inside) :] - end * (0.5 * LENGTH - inside * spot)
+        rounding = {
+            "float32": tolerance(np.float32),
+            "float64": 1e-15,
+            "uint16": LENGTH * unit / (total * signal.min()),
+        }
+        np.testing.assert_allclose(error, end * bias, rtol=0, atol=rounding[dtype])
+
+
+def test_the_margin_is_a_parameter(device):
+    """The limit is inclusive, and does not depend on load resistors; the default is three widths of the spot."""
+    inner = 0.8
+    for resistance, load in ((None, 0.0), (50e3, 1e3)):
+        shrink = 1.0 if resistance is None else 1.0 + 2.0 * load / resistance
+        xi = np.array([-0.81, -0.799, 0.0, 0.799, 0.81, 0.95]) / shrink
+        readout = PsdReadout(
+            strip_length=2.0, margin=1.0 - inner, interelectrode_resistance=resistance, load_resistance=load
+        )
+        status = readout(np.stack([1.0 - xi, 1.0 + xi], axis=-1), device=device).status
+        assert (status == Status.OUT_OF_RANGE).tolist() == [True, False, False, False, True, True]
+    codes = np.array([[1000, 9000], [1000, 8999], [9001, 1000]], np.uint16)
+    readout = PsdReadout(strip_length=2.0, margin=0.2)
+    assert readout(codes, device=device).status.tolist() == [0, 0, Status.OUT_OF_RANGE]
+    assert PsdReadout(strip_length=1.0).applied_margin == 0.0
+    assert PsdReadout(strip_length=1.0).largest_clipping_bias == 0.0
+    spread = PsdReadout(strip_length=1.0, noise=PsdNoise(spot=0.1))
+    assert spread.applied_margin == pytest.approx(0.3)
+    assert replace(spread, noise=PsdNoise(spot=0.05)).applied_margin == pytest.approx(0.15)
+    assert replace(spread, margin=0.0).applied_margin == 0.0
+    # Without a margin a spot far beyond the end is read near the end.
+    assert replace(spread, margin=0.0).largest_clipping_bias > 3.0
+    with pytest.raises(ValueError, match=r"margin is 0.5 m;"):
+        PsdReadout(strip_length=1.0, margin=0.5)
+    with pytest.raises(ValueError, match=r"3 times noise\.spot"):
+        PsdReadout(strip_length=1.0, noise=PsdNoise(spot=0.2))
 
 
 def test_ambient_light_pulls_to_the_electrical_centre_and_the_dark_level_undoes_it(device):

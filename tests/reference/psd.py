@@ -68,7 +68,7 @@ def read_out(readout: Any, left: NDArray[Any], right: NDArray[Any]) -> Reference
             load = 1.0 + 2.0 * readout.load_resistance / readout.interelectrode_resistance
         balance = (b - a) / total
         position = 0.5 * readout.strip_length * load * balance
-        sigma = _sigma(readout, balance, total, load, codes)
+        sigma = _sigma(readout, a, b, load, codes)
     status = _status(readout, raw_left, raw_right, a, b, saturation, load)
     if readout.linearity is not None:
         position = position + _correction(readout, position)
@@ -83,7 +83,10 @@ def _status(
     with np.errstate(all="ignore"):
         total = a + b
         dark = total <= readout.minimum_total
-        outside = (np.abs(b - a) * load > total) & ~dark
+        noise = readout.noise
+        margin = readout.margin if readout.margin is not None else 3.0 * noise.spot if noise else 0.0
+        inner = (readout.strip_length - 2.0 * margin) / readout.strip_length
+        outside = (np.abs(b - a) * load > inner * total) & ~dark
         status[outside] = OUT_OF_RANGE
         status[dark] = LOW_SIGNAL
         status[(raw_left >= saturation) | (raw_right >= saturation)] |= np.uint8(SATURATED)
@@ -91,16 +94,24 @@ def _status(
     return status
 
 
-def _sigma(readout: Any, balance: Float64, total: Float64, load: float, codes: bool) -> Float64:
+def _sigma(readout: Any, a: Float64, b: Float64, load: float, codes: bool) -> Float64:
+    """Propagate the noise of the corrected currents a (left) and b (right) to the position."""
     noise = readout.noise
-    independent, opposed, spot, bandwidth = (
-        (noise.independent, noise.opposed, noise.spot, noise.bandwidth) if noise else (0.0, 0.0, 0.0, 0.0)
-    )
-    each = independent**2 + (readout.ampere**2 / 12.0 if codes else 0.0)
-    length = readout.strip_length * load
-    variance = (length / total) ** 2 * (each * (1.0 + balance**2) / 2.0 + opposed**2)
-    electrons = total / (2.0 * ELECTRON * bandwidth) if bandwidth else np.inf
-    return np.asarray(np.sqrt(variance + spot**2 / electrons))
+    total, length = a + b, readout.strip_length * load
+    quantisation = readout.ampere**2 / 12.0 if codes else 0.0
+    left = quantisation + (noise.independent**2 if noise else 0.0)
+    right = left / readout.right_gain**2
+    # Derivatives of length / 2 (b - a) / (a + b).
+    by_left, by_right = -length * b / total**2, length * a / total**2
+    variance = by_left**2 * left + by_right**2 * right
+    if noise:
+        variance = variance + (by_right - by_left) ** 2 * noise.opposed**2
+        per_ampere = 2.0 * ELECTRON * noise.bandwidth
+        position = length / 2.0 * (b - a) / total
+        spread = readout.strip_length**2 / 12.0 + position**2
+        variance = variance + per_ampere * noise.spot**2 / total
+        variance = variance + per_ampere * (noise.background + noise.dark_current) * spread / total**2
+    return np.asarray(np.sqrt(variance))
 
 
 def _correction(readout: Any, position: Float64) -> Float64:

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpuvision.ranging.line import LineReadout
-from gpuvision.ranging.psd import PsdReadout
+from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.range_image import RotatingSheet, StraightTransport
 from gpuvision.schema import DescriptionError, Section
 from gpuvision.sensor.sensor import Sensor
@@ -70,13 +70,33 @@ def test_values_reach_the_operations() -> None:
     assert camera.readout.triangulation.region == ((-15.0, 48.0), (-239.5, 239.5))
     assert isinstance(psd.readout, PsdReadout)
     assert (psd.readout.ampere, psd.readout.dark, psd.frame) == (50e-12, (2e-9, 2e-9), (96, 2))
-    assert psd.readout.noise is not None
+    assert psd.readout.noise == PsdNoise(independent=0.2e-9, bandwidth=20e3, spot=25e-6, dark_current=4e-9)
+    assert psd.readout.applied_margin == pytest.approx(75e-6)
     assert isinstance(psd.transport, StraightTransport)
     assert psd.transport.step == 0.25e-3
     assert isinstance(corner.transport, RotatingSheet)
     assert corner.transport.along == corner.readout.along == "rows"
     assert math.degrees(corner.transport.transport(128)[-1]) == pytest.approx(13.0, abs=1e-9)
     assert corner.output.limits[2] == (-0.1, 3.0)
+
+
+def test_background_of_a_psd_is_its_ambient_light() -> None:
+    """The photocurrent of the ambient light is the default of the background; margin and background can be stated."""
+
+    def readout(**values: Any) -> PsdReadout:
+        made = sensor_of(changed("psd_line", **values)).readout
+        assert isinstance(made, PsdReadout)
+        assert made.noise is not None
+        return made
+
+    ambient = {"light__ambient": 20e-6, "light__responsivity": 0.3}
+    assert readout(**ambient).noise.background == pytest.approx(6e-6)
+    assert readout(**ambient, psd__noise__background=1e-6).noise.background == 1e-6
+    assert readout(**ambient, psd__noise__background=0.0).noise.background == 0.0
+    assert readout(**ambient, psd__noise__bandwidth=0.0, psd__noise__dark_current=0.0).noise.background == 0.0
+    assert readout(light=None).noise.background == 0.0
+    assert readout(psd__margin=0.0).applied_margin == 0.0
+    assert readout(psd__margin=0.2e-3).applied_margin == 0.2e-3
 
 
 def test_ways_to_say_the_same_triangulation_agree() -> None:
@@ -181,6 +201,9 @@ WRONG = [
     ("psd_line", {"psd__strips": 0}, r"psd.strips is 0, expected a whole number of at least 1"),
     ("psd_line", {"psd__strip_length": None}, r"'psd.strip_length' is missing, expected a number \[m\] above 0"),
     ("psd_line", {"psd__noise__indepedent": 1e-9}, r"'psd.noise.indepedent'; did you mean 'psd.noise.independent'"),
+    ("psd_line", {"psd__noise__bandwidth": 0.0}, r"PsdNoise.dark_current needs bandwidth \[Hz\]"),
+    ("psd_line", {"psd__margin": 3.1e-3}, r"PsdReadout.margin is 0.0031 m; expected 0 or more, and below half a strip"),
+    ("psd_line", {"psd__margin": -1e-3}, r"psd.margin is -0.001 m, expected a number \[m\] of at least 0"),
     ("psd_line", {"psd__load_resistance": 50.0}, r"load_resistance needs interelectrode_resistance"),
     ("psd_line", {"transport__kind": "rotating"}, r'transport.kind is \'rotating\', expected one of "straight"'),
     ("corner_scene", {"transport__angle_step": 4.0}, r"transport.angle_step is 4.0 rad per profile, expected"),

@@ -51,7 +51,8 @@ class PsdSimulator:
     responsivity
         Responsivity of the strips [A/W], 0 or more.
     ambient
-        Power of the ambient light on every strip, uniform along u [W], 0 or more.
+        Power of the ambient light on every strip, uniform along u [W], 0 or more. Above 0 it replaces the background
+        photocurrent of the readout's noise model; that one is simulated as shot noise that no mask stops.
     modulated
         True: the light is modulated and demodulated, so that ambient light adds its shot noise only.
     mask
@@ -82,6 +83,8 @@ class PsdSimulator:
             raise ValueError("PsdSimulator.readout has layout 'planar', expected 'pairs'")
         sheet = self.readout.triangulation or self.view.triangulation
         noise = self.readout.noise or PsdNoise()
+        if self.ambient > 0.0:
+            noise = replace(noise, background=0.0)
         limits = [self.readout.saturation, _MAX_CODE * self.readout.ampere if self.quantised else None]
         saturation = min((each for each in limits if each is not None), default=None)
         readout = replace(self.readout, triangulation=sheet, noise=noise, saturation=saturation, outputs=None)
@@ -130,7 +133,8 @@ class PsdSimulator:
         model = self.readout.noise or PsdNoise()
         incident = self._in_order(total_exposure(self._incident(exposures)))
         pair = self._divide(*self._with_shot_noise(incident, total, centroid, draws))
-        pair += model.independent * draws[..., 2:4, :].swapaxes(-1, -2)
+        # Noise of the channels as recorded, behind the gain.
+        pair += model.independent * draws[..., 2:4, :].swapaxes(-1, -2) / (1.0, self.readout.right_gain)
         pair += model.opposed * draws[..., 4, :, None] * (1.0, -1.0)
         recorded = self._record(pair)
         if not self.quantised:
@@ -157,12 +161,14 @@ class PsdSimulator:
         Returns
         -------
         Reading
-            (..., samples), in the order of the view. A strip without light has the status LOW_SIGNAL.
+            (..., samples), in the order of the view. A strip without light has the status LOW_SIGNAL. ``sigma`` is the
+            readout's, with the shot noise of the ambient light that passes the mask.
         """
         reading = self._read(self.currents(exposures, seed=seed, first_profile=first_profile), device)
         axes = self.readout.axes
         u = axes.position_origin + axes.position_pitch * np.asarray(reading.position, np.float64)
         sigma = abs(axes.position_pitch) * np.asarray(reading.sigma, np.float64)
+        sigma = np.sqrt(np.maximum(sigma**2 + self._ambient_variance(exposures), 0.0))
         return make_reading(self.view, reading, u, sigma, backward=axes.sample_pitch < 0.0)
 
     def signal(self, light: Exposure) -> Float64:
@@ -208,14 +214,39 @@ class PsdSimulator:
         The number of electrons and the mean of their positions both fluctuate. Ambient light adds to both variances
         even where demodulation removes its mean.
         """
-        bandwidth = (self.readout.noise or PsdNoise()).bandwidth
-        about = _second_moment(light, self.view.u_edges, centroid)
-        variance = 2.0 * ELECTRON * bandwidth * self.responsivity * light.total()
-        spread = np.sqrt(2.0 * ELECTRON * bandwidth * self.responsivity * about)
+        model = self.readout.noise or PsdNoise()
+        bandwidth, edges = model.bandwidth, self.view.u_edges
+        # Electrons without light behind the mask, uniform over the strip.
+        uniform = model.background + model.dark_current
+        from_middle = centroid - 0.5 * (edges[0] + edges[-1])
+        about = self.responsivity * _second_moment(light, edges, centroid)
+        about += uniform * ((edges[-1] - edges[0]) ** 2 / 12.0 + from_middle**2)
+        variance = 2.0 * ELECTRON * bandwidth * (self.responsivity * light.total() + uniform)
+        spread = np.sqrt(2.0 * ELECTRON * bandwidth * about)
         noisy = total + np.sqrt(variance) * noise[..., 0, :]
         with np.errstate(invalid="ignore", divide="ignore"):
             shift = np.where(total > 0.0, spread * noise[..., 1, :] / total, 0.0)
         return noisy, centroid + shift
+
+    def _ambient_variance(self, exposures: Mapping[str, Exposure]) -> Float64:
+        """Return the variance of u by ambient light, beyond the variance that the readout predicts, (..., strips).
+
+        Every electron moves the reading by its distance from it, over the number of detected electrons. Ambient light
+        that is not demodulated pulls the reading away from the spot, whose electrons then move it by more than the
+        width of the spot; and it adds to the total, to which the readout attributes the width of the spot.
+        """
+        ambient = self._incident(exposures).get(AMBIENT)
+        if ambient is None:
+            return np.zeros(())
+        model, axes = self.readout.noise or PsdNoise(), self.readout.axes
+        light = self.detected_light(exposures)
+        signal = self.signal(total_exposure({name: each for name, each in light.items() if name != AMBIENT}))
+        total, reading = self._total_and_centroid(self.signal(total_exposure(light)))
+        spot_total, spot = self._total_and_centroid(signal)
+        about = self.responsivity * _second_moment(self._in_order(ambient), self.view.u_edges, reading)
+        about += spot_total * (spot - reading) ** 2 - (total - spot_total) * (axes.position_pitch * model.spot) ** 2
+        shot = 2.0 * ELECTRON * model.bandwidth
+        return np.divide(shot * about, total**2, out=np.zeros_like(total), where=total > 0.0)
 
     def _divide(self, total: Float64, u: Float64) -> Float64:
         """Return the currents at the electrodes, (..., 2) [A], without dark level and gain."""

@@ -184,6 +184,44 @@ def test_covariance_of_the_two_currents(independent: float, opposed: float, shot
     np.testing.assert_allclose(pairs.mean(axis=0), 0.5 * current, atol=4 * np.sqrt(expected[0, 0] / len(pairs)))
 
 
+@pytest.mark.parametrize("modulated", [True, False])
+@pytest.mark.parametrize("ambient", [0.0, 2e-6, 20e-6, 200e-6])
+@pytest.mark.parametrize("windows", [None, (-3e-3, 0.5e-3)])
+def test_sigma_with_ambient_light(
+    ambient: float, modulated: bool, windows: tuple[float, float] | None, device: Device
+) -> None:
+    """Readings scatter by their sigma under ambient light: demodulated or not, with a mask or without, any gain."""
+    view, spot = psd_view(120), 60e-6
+    places = np.linspace(-2.2e-3, 0.2e-3, view.samples)
+    one = {"direct": gaussian(view, places, 2e-6, spot)}
+    mask = None if windows is None else Mask(windows=[windows] * view.samples)
+    noise = PsdNoise(independent=0.2e-9, spot=spot, bandwidth=1e6, dark_current=50e-9)
+    simulator = psd(
+        view,
+        ambient=ambient,
+        modulated=modulated,
+        mask=mask,
+        readout={"noise": noise, "right_gain": 0.5, "dark": (25e-9, 25e-9)},
+    )
+    reading = simulator.read(stack_profiles([one] * 3000), seed=5, device=device)
+    sigma = simulator.read(one, device=device).sigma
+    # 3000 readings determine a standard deviation to 1.3 %; three times this margin.
+    np.testing.assert_allclose(reading.h.std(axis=0), sigma, rtol=0.039)
+    # The background of a readout is the ambient light of a strip without a mask.
+    if modulated and mask is None:
+        stated = PsdNoise(
+            independent=0.2e-9,
+            spot=spot,
+            bandwidth=1e6,
+            dark_current=50e-9,
+            background=simulator.responsivity * ambient,
+        )
+        readout = {"noise": stated, "right_gain": 0.5, "dark": (25e-9, 25e-9)}
+        np.testing.assert_allclose(psd(view, readout=readout).read(one, device=device).sigma, sigma, rtol=1e-3)
+        scatter = psd(view, readout=readout).read(stack_profiles([one] * 3000), seed=6, device=device).h.std(axis=0)
+        np.testing.assert_allclose(scatter, sigma, rtol=0.039)
+
+
 def test_noise_belongs_to_the_profile() -> None:
     """A profile's noise follows from its number, not from blocks; other profiles and strips are independent."""
     view = psd_view()

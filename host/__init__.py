@@ -33,6 +33,7 @@ from gpuvision.host.work_size import (
     fitted_groups,
     group_per_element,
     padded_groups,
+    padded_rows,
     round_up,
     vector_work,
 )
@@ -83,6 +84,7 @@ __all__ = [
     "open_recording",
     "opencl_type",
     "padded_groups",
+    "padded_rows",
     "plan_stream",
     "real_defines",
     "real_of",

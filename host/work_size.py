@@ -40,13 +40,20 @@ def padded_groups(count: int, group: int) -> WorkSize:
     return WorkSize((round_up(count, group),), (group,))
 
 
+def padded_rows(rows: int, columns: int, group: int = 64) -> WorkSize:
+    """Return the work size of one work-item per cell of a grid; the kernel skips items beyond the last column.
+
+    PoCL compiles a kernel anew for each group size, and without a given size it chooses one by the grid's size.
+    """
+    return WorkSize((round_up(columns, group), rows), (group, 1))
+
+
 def fitted_groups(count: int, group: int) -> WorkSize:
     """Return the work size of groups that overlap: the last group moves back to end with the last element.
 
-    Where `count` is below `group`, the group size is the largest power of two up to `count`. PoCL compiles a kernel
-    anew for each group size, so that powers of two keep the number of compilations small.
+    Where `count` is below `group`, the group size is 16 or 1: PoCL compiles a kernel anew for each group size.
     """
-    each = group if count >= group else 1 << max(count.bit_length() - 1, 0)
+    each = next(size for size in (group, 16, 1) if size <= min(group, max(count, 1)))
     return WorkSize((round_up(count, each),), (each,), each)
 
 

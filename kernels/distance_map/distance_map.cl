@@ -10,13 +10,15 @@
 //          be nearest to a point of the cell; level (rows, columns) uint16, the cost in COST_LEVELS steps.
 // Options: COST_LEVELS: the cost 1.
 //
-// One work-item computes one cell.
+// One work-item computes one cell; rows of work-items are padded to whole work-groups.
 #include "distance_map/field.h"
 
 kernel void distance_map(global const float *restrict at_x, global float *restrict cell_distance,
                          global uchar *restrict nearest, global ushort *restrict level, const float first_y,
-                         const float cell, constant float *shapes, const int count, const float scale_squared) {
-    const size_t column = get_global_id(0), row = get_global_id(1), i = row * get_global_size(0) + column;
+                         const float cell, constant float *shapes, const int count, const float scale_squared,
+                         const uint columns) {
+    const size_t column = get_global_id(0), row = get_global_id(1), i = row * columns + column;
+    if (column >= columns) return;
     const float x = at_x[column], y = first_y + (float)row * cell;
     // The NEAREST smallest distances and their shapes, by insertion.
     float distance[NEAREST];

@@ -3,11 +3,11 @@
 //
 // cell_means:  mean of each cell of cell x cell pixels.
 //   Inputs: image (rows, columns), type CODE. Outputs: means (cell rows, cell columns) float32 [grey levels].
-//   One work-item per cell.
+//   One work-item per cell; rows of work-items are padded to whole work-groups.
 // edge_levels: cost 1 - (max g_k^2 / (g^2 + t^2))^2 of an edge, for 8 directions k of its normal, pi / 8 apart.
 //   Inputs: means (rows, columns); threshold_squared: t^2, t a quarter of the threshold; directions (CHANNELS, 2)
 //   cosine and sine of the normals. Outputs: level (CHANNELS, rows + 2 border, columns + 2 border) uint16 in COST_LEVELS
-//   steps. One work-item per cell.
+//   steps. One work-item per cell; rows of work-items are padded to whole work-groups.
 // edge_search: mean cost of the edges at every shift and heading of the grid (shift_sums.h).
 //   Inputs: level; shifts (headings, count) int32: index into level of the cell of each edge at the first position.
 //   Outputs: scores, least, column (shift_sums.h); seen (headings,) number of edges used.
@@ -27,12 +27,13 @@
 #ifdef CODE
 kernel void cell_means(global const CODE *restrict image, global float *restrict means, const int columns,
                        const int cell) {
-    const size_t x = get_global_id(0), y = get_global_id(1);
+    const size_t x = get_global_id(0), y = get_global_id(1), cells = columns / cell;
+    if (x >= cells) return;
     global const CODE *from = image + (y * columns + x) * cell;
     float sum = 0;
     for (int row = 0; row < cell; row++)
         for (int column = 0; column < cell; column++) sum += (float)from[(size_t)row * columns + column];
-    means[y * get_global_size(0) + x] = sum / (float)(cell * cell);
+    means[y * cells + x] = sum / (float)(cell * cell);
 }
 #endif
 
@@ -46,7 +47,8 @@ kernel void edge_levels(global const float *restrict means, global ushort *restr
                         const int columns, const int border, const float threshold_squared,
                         constant float *directions) {
     const int x = (int)get_global_id(0) - border, y = (int)get_global_id(1) - border;
-    const size_t stride = get_global_size(0), plane = stride * get_global_size(1);
+    const size_t stride = columns + 2 * border, plane = stride * get_global_size(1);
+    if (get_global_id(0) >= stride) return;
     const size_t at = get_global_id(1) * stride + get_global_id(0);
     float best[CHANNELS];
     for (int k = 0; k < CHANNELS; k++) best[k] = 0;

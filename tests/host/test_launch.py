@@ -20,6 +20,7 @@ from gpuvision.host import (
     group_per_element,
     opencl_type,
     padded_groups,
+    padded_rows,
     real_of,
     round_up,
     table_offsets,
@@ -107,10 +108,14 @@ def test_work_sizes() -> None:
     assert padded_groups(33, 64) == WorkSize((64,), (64,), 1)
     assert padded_groups(65, 64) == WorkSize((128,), (64,), 1)
     assert padded_groups(0, 64) == WorkSize((0,), (64,), 1)
+    assert padded_rows(5, 64) == WorkSize((64, 5), (64, 1), 1)
+    assert padded_rows(5, 65) == WorkSize((128, 5), (64, 1), 1)
     assert fitted_groups(64, 64) == WorkSize((64,), (64,), 64)
-    assert fitted_groups(63, 64) == WorkSize((64,), (32,), 32)
-    assert fitted_groups(33, 64) == WorkSize((64,), (32,), 32)
-    assert fitted_groups(3, 64) == WorkSize((4,), (2,), 2)
+    assert fitted_groups(63, 64) == WorkSize((64,), (16,), 16)
+    assert fitted_groups(33, 64) == WorkSize((48,), (16,), 16)
+    assert fitted_groups(16, 64) == WorkSize((16,), (16,), 16)
+    assert fitted_groups(15, 64) == WorkSize((15,), (1,), 1)
+    assert fitted_groups(7, 8) == WorkSize((7,), (1,), 1)
     assert fitted_groups(1, 64) == WorkSize((1,), (1,), 1)
     assert fitted_groups(301, 300) == WorkSize((600,), (300,), 300)
     assert fitted_groups(65, 64) == WorkSize((128,), (64,), 64)
@@ -129,7 +134,7 @@ def test_variant_follows_the_device_unless_it_is_named() -> None:
         build = builder((100,), machine=machine, variant=variant)
         assert build.uses_vectors is expected
         assert build.work(100, each=16, group=64) == (vector_work(100, 16) if expected else padded_groups(100, 64))
-    assert builder((15,)).work(15, each=16, group=64, least=16, grouping="fitted") == WorkSize((16,), (8,), 8)
+    assert builder((15,)).work(15, each=16, group=64, least=16, grouping="fitted") == WorkSize((15,), (1,), 1)
     one_each = builder((15,), variant="work_item").work(15, each=16, group=64, grouping="per_element")
     assert one_each == group_per_element(15, 64)
     with pytest.raises(ValueError, match="variant must be"):

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Array, Device, FloatArray, Launch, LaunchBuilder, StatusArray, WorkSize
+from gpuvision.host import Array, Device, FloatArray, Launch, LaunchBuilder, StatusArray, padded_rows
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite, numbers
 
@@ -178,7 +178,7 @@ class DistanceMapBuilder(VisionOperation[DistanceMapCells]):
         return build.launch(
             "distance_map/distance_map.cl",
             "distance_map",
-            work=WorkSize((shape[0], self.rows), None),
+            work=padded_rows(self.rows, shape[0]),
             outputs=build.outputs(
                 {"distance": cells, "nearest": (*cells, _NEAREST), "level": cells}, nearest=np.uint8, level=np.uint16
             ),
@@ -189,6 +189,7 @@ class DistanceMapBuilder(VisionOperation[DistanceMapCells]):
                 shapes.ravel(),
                 np.int32(len(shapes)),
                 np.float32(self.scale**2),
+                np.uint32(shape[0]),
             ],
         )
 

@@ -28,9 +28,9 @@ from gpuvision.host import (
     Launch,
     LaunchBuilder,
     Variant,
-    WorkSize,
     capacity,
     flags,
+    padded_rows,
     to_numpy,
     type_defines,
 )
@@ -91,7 +91,7 @@ class CellMeans(VisionOperation[Means]):
         return build.launch(
             "edge_search/edge_search.cl",
             "cell_means",
-            work=WorkSize(cells[::-1], None),
+            work=padded_rows(*cells),
             outputs=build.outputs({"means": cells}),
             defines=type_defines("CODE", dtype),
             arguments=[np.int32(shape[1]), np.int32(self.cell_px)],
@@ -146,7 +146,7 @@ class EdgeCostMap(VisionOperation[EdgeCosts]):
         return build.launch(
             "edge_search/edge_search.cl",
             "edge_levels",
-            work=WorkSize((columns, rows), None),
+            work=padded_rows(rows, columns),
             outputs=build.outputs({"level": (CHANNELS, rows, columns)}, level=np.uint16),
             defines={"COST_LEVELS": COST_LEVELS, **flags(FROM_MEANS=True)},
             arguments=[

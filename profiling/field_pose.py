@@ -10,6 +10,7 @@ Cases:
   form for any set of poses.
 - ``turns``: a field of 22 m with 72 headings; Numba as in ``global``.
 - ``local``: refinement of one pose; SciPy uses exact distances and their gradients as we do, in double.
+- ``map``: the distance map of a field (`gpuvision.profiling.distance_map`).
 """
 
 from __future__ import annotations
@@ -26,19 +27,22 @@ from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.field.distance_map import COST_LEVELS, DistanceMap
 from gpuvision.matching.field.field_pose import FieldPoseRefinement, FieldPoseSearch
+from gpuvision.profiling import distance_map
+from gpuvision.profiling.edge_search import least_in_blocks
 from gpuvision.profiling.harness import Case
 
 _BLOCK, _RAYS = 64, 64
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield the global search, with one heading and with 72 headings, and the local refinement."""
+    """Yield the global search, with one heading and with 72 headings, the local refinement, and the distance map."""
     junior = DistanceMap(field=read_field("robocup_junior"), cell=0.01, scale=0.05, max_range=1.5, device=device)
     large = DistanceMap(field=read_field("robocup_msl"), cell=0.1, scale=0.25, max_range=6.0, device=device)
     pose = (0.213, -0.177, 0.4)
     yield from _global(device, junior, pose)
     yield _turns(device, large, (3.1, -2.2, 0.7))
     yield _local(device, large, (3.1, -2.2, 0.7))
+    yield from distance_map.cases(device)
 
 
 def _points(field_map: DistanceMap, pose: tuple[float, ...], sigma: float) -> NDArray[np.float32]:
@@ -88,15 +92,7 @@ def _numba_shifts(level, columns, rows, scores, sums, least, where):
                 total[x] += source[x]
         for x in range(width):
             out[x] = np.float32(total[x]) * scale
-        for block in range(least.shape[2]):
-            at = min(block * 64, width - 64)
-            low = total[at]
-            for x in range(at, at + 64):
-                low = min(low, total[x])
-            while total[at] != low:
-                at += 1
-            least[turn, row, block] = np.float32(low) * scale
-            where[turn, row, block] = at
+        least_in_blocks(total, width, scale, least[turn, row], where[turn, row])
 
 
 @numba.njit(parallel=True, error_model="numpy")

@@ -24,8 +24,8 @@ from gpuvision.host import Device
 from gpuvision.host.outputs import Outputs
 from gpuvision.profiling import ceiling
 
-# Benchmarked operations: name in the rows, and module of this package that measures it. The names stay stable when
-# modules are renamed, because results are compared over time.
+# Benchmarked operations: name in the rows, and module of this package that measures it. Some modules also yield cases
+# of related operations. The names stay stable when modules are renamed, because results are compared over time.
 OPERATIONS = {
     "psd": "psd",
     "line": "line",
@@ -37,7 +37,7 @@ OPERATIONS = {
     "reflections": "line_irradiance",
     "reflectance": "reflectance",
     "mirrors": "mirrors",
-    "bvh": "bvh",
+    "bvh": "rays",
     "visible_intervals": "visible_intervals",
     "simulate": "light_paths",
     "light_clustering": "light_clustering",
@@ -45,7 +45,7 @@ OPERATIONS = {
     "ruler": "ruler",
     "blob": "blob",
     "line_fit": "line_fit",
-    "pose": "pose",
+    "pose": "board_pose",
     "registration": "registration",
     "mitsuba": "mitsuba",
     "launch": "launch",

@@ -17,13 +17,16 @@ from numpy.typing import NDArray
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.line_fit import FitLines
-from gpuvision.matching.robust import sample_subsets
+from gpuvision.matching.robust import efficiency, sample_subsets
 from gpuvision.profiling.harness import Case
-from gpuvision.profiling.pose import STEPS, TRIALS, fit_line
 
 _LINES, _SIGMA = 10_000, 0.05  # px
 _FEW = 100  # lines that OpenCV fits; its time is extrapolated to all lines (equal numbers of points)
-_ONE = np.float32(1.0)
+TRIALS, STEPS = 64, 12
+TUNING_CONSTANT = 4.685
+EFFICIENCY = np.float32(efficiency("tukey", TUNING_CONSTANT))
+_PER = np.float32(1.0 / TUNING_CONSTANT**2)
+_ZERO, _HALF, _ONE, _TWO = (np.float32(each) for each in (0.0, 0.5, 1.0, 2.0))
 
 
 def scene(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -35,6 +38,54 @@ def scene(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     v[:, : 3 * count // 10] += rng.uniform(1.0, 20.0, (_LINES, 3 * count // 10, 1))
     points = middle + u * along + v * along[..., ::-1] * (-1.0, 1.0)
     return points.astype(np.float32), np.full((_LINES, count), _SIGMA, np.float32)
+
+
+@numba.njit(error_model="numpy", fastmath={"contract", "reassoc"})
+def fit_line(u, v, w, pairs):
+    """Return centre, direction and variances of the robust line through points with inverse standard deviations."""
+    best_x, best_y, best_c, best_s, least = _ZERO, _ZERO, _ONE, _ZERO, np.float32(np.inf)
+    for t in range(pairs.shape[0]):
+        i, j = pairs[t, 0], pairs[t, 1]
+        x, y = u[j] - u[i], v[j] - v[i]
+        per = _ONE / np.sqrt(x * x + y * y)
+        c, s = x * per, y * per
+        loss = _ZERO
+        for k in range(u.shape[0]):
+            z = (c * (v[k] - v[i]) - s * (u[k] - u[i])) * w[k]
+            left = max(_ONE - z * z * _PER, _ZERO)
+            loss += _ONE - left * left * left
+        if (loss < least) & (w[i] * w[j] > _ZERO):
+            least, best_x, best_y, best_c, best_s = loss, u[i], v[i], c, s
+    x, y, c, s = best_x, best_y, best_c, best_s
+    for _ in range(STEPS):
+        sw, su, sv, suu, suv, svv = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+        for k in range(u.shape[0]):
+            dx, dy = u[k] - x, v[k] - y
+            a, b = c * dx + s * dy, c * dy - s * dx
+            z = b * w[k]
+            left = max(_ONE - z * z * _PER, _ZERO)
+            weight = w[k] * w[k] * left * left
+            sw += weight
+            su += weight * a
+            sv += weight * b
+            suu += weight * a * a
+            suv += weight * a * b
+            svv += weight * b * b
+        a, b = su / sw, sv / sw
+        across, along = _TWO * (suv - su * b), suu - su * a - (svv - sv * b)
+        length = np.sqrt(across * across + along * along)
+        part = np.sqrt(_HALF + _HALF * along / length)
+        turn = _HALF * across / (length * part)
+        x, y = x + c * a - s * b, y + s * a + c * b
+        c, s = c * part - s * turn, s * part + c * turn
+    sw, suu = _ZERO, _ZERO
+    for k in range(u.shape[0]):
+        dx, dy = u[k] - x, v[k] - y
+        a, z = c * dx + s * dy, (c * dy - s * dx) * w[k]
+        weight = w[k] * w[k] if z * z * _PER < _ONE else _ZERO
+        sw += weight
+        suu += weight * a * a
+    return x, y, c, s, _ONE / (EFFICIENCY * sw), _ONE / (EFFICIENCY * suu)
 
 
 @numba.njit(parallel=True, error_model="numpy")

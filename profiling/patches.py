@@ -20,8 +20,8 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from gpuvision.host import Device, to_numpy
-from gpuvision.profiling.bvh import board
 from gpuvision.profiling.harness import Case
+from gpuvision.profiling.rays import board
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.patches import FormFactors, Patches, PatchLight
 

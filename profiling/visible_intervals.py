@@ -16,8 +16,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from gpuvision.host import Device, to_numpy
-from gpuvision.profiling.bvh import board, embree_scene
 from gpuvision.profiling.harness import Case
+from gpuvision.profiling.rays import board, embree_scene
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.scene.visible_intervals import VisibleIntervals
 

@@ -153,6 +153,15 @@ def test_kernel_includes_are_not_circular() -> None:
     assert list(TopologicalSorter(graph).static_order())
 
 
+def test_every_kernel_has_a_module_a_test_and_a_benchmark_of_its_name() -> None:
+    """The folder ``kernels/line`` belongs to ``line.py``, ``test_line.py`` and the benchmark ``profiling/line.py``."""
+    operations = {path.parent.name for path in _files("kernels") if path.suffix == ".cl"} - {"ceiling"}  # a benchmark
+    assert len(operations) > 20
+    assert operations - {path.stem for path in _files("gpuvision")} == set()
+    assert {f"test_{name}" for name in operations} - {path.stem for path in _files("tests")} == set()
+    assert operations - {path.stem for path in _files("profiling")} == set()
+
+
 # Floors of the packages, bottom to top. A name with a dot is a sub-package, or a module on a higher floor than the
 # sub-packages of its package. A module imports only from lower floors and from its package.
 FLOORS = (

@@ -1,0 +1,69 @@
+"""Distance map of a field: distances, nearest lines and costs by definition; refused fields."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from field_maps import large, small
+from gpuvision.formats.field_file import read_field
+from gpuvision.host import Device
+from gpuvision.matching.field.distance_map import Arc, DistanceMap, Field
+from gpuvision.reference import field as reference
+
+
+def test_distances_are_those_to_the_nearest_line(device: Device) -> None:
+    for field_map in (large(device), small(device)):
+        rows, columns = field_map.cells.distance.shape
+        x0, y0 = field_map.first
+        x, y = np.meshgrid(x0 + field_map.cell * np.arange(columns), y0 + field_map.cell * np.arange(rows))
+        exact = reference.distance(field_map.field, np.stack([x, y], axis=-1))
+        # A few roundings of coordinates up to 20 m.
+        np.testing.assert_allclose(field_map.cells.distance, exact, atol=8e-6)
+        every = [reference.distance_to_line(line, np.stack([x, y], axis=-1)) for line in field_map.field.lines]
+        every += [reference.distance_to_arc(arc, np.stack([x, y], axis=-1)) for arc in field_map.field.arcs]
+        of_nearest = np.take_along_axis(np.array(every), field_map.cells.nearest[None, ..., 0].astype(int), axis=0)[0]
+        np.testing.assert_allclose(of_nearest, exact, atol=8e-6)
+        level = 1023.0 * exact**2 / (field_map.scale**2 + exact**2)
+        np.testing.assert_allclose(field_map.cells.level, level, atol=0.51)
+
+
+def test_a_field_may_be_symmetric() -> None:
+    msl = read_field("robocup_msl")
+    assert msl.is_symmetric
+    assert read_field("robocup_junior").is_symmetric
+    one_more = Field(length=22.0, width=14.0, lines=(*msl.lines, (1.0, 1.0, 2.0, 1.0)), arcs=msl.arcs)
+    assert not one_more.is_symmetric
+    without_an_arc = Field(length=22.0, width=14.0, lines=msl.lines, arcs=msl.arcs[:-1])
+    assert not without_an_arc.is_symmetric
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"lines": ((0.0, 0.0, 1.0, 0.0),) * 257}, "256 at most"),
+        ({"length": 0.0}, "length"),
+        ({"lines": ()}, "neither"),
+        ({"lines": ((1.0, 1.0, 1.0, 1.0),)}, "begins where it ends"),
+        ({"arcs": (Arc(0.0, 0.0, -1.0),)}, "radius"),
+        ({"arcs": (Arc(0.0, 0.0, 1.0, 2.0, 1.0),)}, "start < end"),
+    ],
+)
+def test_wrong_fields_are_refused(change: dict[str, Any], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        Field(**{"length": 2.0, "width": 1.0, "lines": ((0.0, 0.0, 1.0, 0.0),), **change})
+
+
+def test_wrong_maps_are_refused() -> None:
+    field = read_field("robocup_msl")
+    for change, match in (
+        ({"cell": 0.0}, "cell"),
+        ({"margin": -1.0}, "margin"),
+        ({"max_range": math.inf}, "max_range"),
+        ({"cell": 1e-3}, "or more for this field"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            DistanceMap(field=field, **change)

@@ -52,8 +52,7 @@ RoomPolicy = Annotated[
     QueuePolicy | None,
     typer.Option(
         help="If the frame queue is full: block the recording (default), drop the oldest frame (default with "
-        "--rate), or "
-        "raise an error."
+        "--rate), or raise an error."
     ),
 ]
 TraceFile = Annotated[

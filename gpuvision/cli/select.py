@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,6 +13,7 @@ from gpuvision.cli.arguments import LayerNames, Overwrite, echo, layers_of, name
 
 if TYPE_CHECKING:
     from gpuvision.matching.features.feature_set import BudgetUnit
+    from gpuvision.matching.features.imaging import Imaging
 
 
 class Side(StrEnum):
@@ -37,8 +38,7 @@ Budget = Annotated[
     typer.Option(
         metavar="NUMBER[UNIT]",
         help="Budget of the measurement: number of calipers (60 or 60rulers; a fiducial counts as 16), pixels that "
-        "they "
-        "read (20000px), or time on the device (150us).",
+        "they read (20000px), or time on the device (150us).",
     ),
 ]
 Results = Annotated[
@@ -104,25 +104,13 @@ def select(
     from gpuvision.host.outputs import Outputs
     from gpuvision.matching.artwork.artwork import read_artwork
     from gpuvision.matching.features.feature_set import choose_features, edge_clearance
-    from gpuvision.matching.features.imaging import Imaging
     from gpuvision.plots.board import draw_features
 
     box = _box(region)
     amount, unit = _budget(budget)
     if unit != "us":
         reject_unused("without a --budget in us, the only one that is measured on a device", device=device)
-    shift, angle = quantities(search_range, "--search-range", "m,rad")
-    bare, masked = _contrasts(contrast)
-    imaging = Imaging(
-        pixel=quantities(scale, "--scale", "m")[0],
-        blur_px=blur,
-        contrast_bare=bare,
-        contrast_masked=masked,
-        width_px=width,
-        etch_bias_sigma=quantities(etch_bias, "--etch-bias", "m")[0],
-        shift=shift,
-        angle=angle,
-    )
+    imaging = _imaging(scale, search_range, contrast, etch_bias, blur_px=blur, width_px=width)
     at = None if placement is None else quantities(placement, "--placement", "m,m")
     outputs = Outputs("select", inputs=[gerbers], overwrite=overwrite)
     outputs.claim_folder(out, ("features.toml", "features.png"))
@@ -153,6 +141,23 @@ def _box(region: str) -> tuple[tuple[float, float], tuple[float, float]]:
     if not (left < right and bottom < top):
         raise ValueError(f"--region is {region!r}, expected X0 < X1 and Y0 < Y1")
     return (left, bottom), (right, top)
+
+
+def _imaging(scale: str, search_range: str, contrast: str, etch_bias: str, **settings: Any) -> Imaging:
+    """Return the imaging model of the options."""
+    from gpuvision.matching.features.imaging import Imaging
+
+    shift, angle = quantities(search_range, "--search-range", "m,rad")
+    bare, masked = _contrasts(contrast)
+    return Imaging(
+        pixel=quantities(scale, "--scale", "m")[0],
+        contrast_bare=bare,
+        contrast_masked=masked,
+        etch_bias_sigma=quantities(etch_bias, "--etch-bias", "m")[0],
+        shift=shift,
+        angle=angle,
+        **settings,
+    )
 
 
 def _budget(text: str) -> tuple[float, BudgetUnit]:

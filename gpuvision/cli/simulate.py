@@ -21,6 +21,9 @@ from gpuvision.cli.arguments import (
 from gpuvision.cli.scan import progress_bar
 
 if TYPE_CHECKING:
+    from gpuvision.sensor.sensor import Sensor
+    from gpuvision.simulation.scene.material import Material
+    from gpuvision.simulation.scene.scene import Scene
     from gpuvision.simulation.sensors.masks import Mask
     from gpuvision.workflows.light_cache import SimulationTask
 
@@ -139,21 +142,16 @@ def simulate(
     The light of each profile is stored in DIR. A stopped run continues there; a run with another --mask, --seed or
     --noise reuses the stored light.
     """
-    from gpuvision.formats.materials_file import read_materials
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
-    from gpuvision.workflows.part_unit import doubt_unit
     from gpuvision.workflows.sensor_pair import pair_files
-    from gpuvision.workflows.simulating import load_part, prepare_simulation
+    from gpuvision.workflows.simulating import prepare_simulation
     from gpuvision.workflows.simulation_result import simulation_files
 
-    if materials is not None:
-        reject_unused("with --materials", albedo=albedo)
-    if second is None:
-        reject_unused("without --second", rule=rule)
-    if not noise:
-        reject_unused("with --no-noise", seed=seed)
+    reject_unused("with --materials", albedo=None if materials is None else albedo)
+    reject_unused("without --second", rule=rule if second is None else None)
+    reject_unused("with --no-noise", seed=None if noise else seed)
     names = _names(paths)
     if not {"diffuse-diffuse", "multi-bounce"} & set(names):
         reject_unused("without diffuse-diffuse or multi-bounce in --paths", tolerance=tolerance or None)
@@ -166,12 +164,7 @@ def simulate(
     outputs.claim_folder(out, names_out)
     outputs.claim(as_json)
     before = _mask(mask)
-    given = None if materials is None else read_materials(materials)
-    scene, made_of = load_part(part, _METRES[unit], given, 0.5 if albedo is None else albedo)
-    if str(scene.defects) != "no defects":
-        echo(f"{part.name}: {'; '.join(str(scene.defects).splitlines())}", err=True)
-    if doubt := doubt_unit(scene, described, unit.value, {each.value: metres for each, metres in _METRES.items()}):
-        echo(f"{part.name}: {doubt}", err=True)
+    scene, made_of = _load_part(part, unit, materials, albedo, described)
     task = prepare_simulation(scene, made_of, described, paths=names, tolerance=tolerance, profiles=profiles)
     other = None
     if second_sensor is not None:
@@ -200,6 +193,23 @@ def _names(paths: str) -> tuple[str, ...]:
     if paths.strip() == "all":
         return PATHS
     return tuple(each.strip() for each in paths.split(",") if each.strip())
+
+
+def _load_part(
+    part: Path, unit: Unit, materials: Path | None, albedo: float | None, sensor: Sensor
+) -> tuple[Scene, tuple[Material, ...]]:
+    """Read the part with its materials; warn of defects of the mesh and of a doubtful unit."""
+    from gpuvision.formats.materials_file import read_materials
+    from gpuvision.workflows.part_unit import doubt_unit
+    from gpuvision.workflows.simulating import load_part
+
+    given = None if materials is None else read_materials(materials)
+    scene, made_of = load_part(part, _METRES[unit], given, 0.5 if albedo is None else albedo)
+    if str(scene.defects) != "no defects":
+        echo(f"{part.name}: {'; '.join(str(scene.defects).splitlines())}", err=True)
+    if doubt := doubt_unit(scene, sensor, unit.value, {each.value: metres for each, metres in _METRES.items()}):
+        echo(f"{part.name}: {doubt}", err=True)
+    return scene, made_of
 
 
 def _mask(choice: str) -> Mask | str | None:

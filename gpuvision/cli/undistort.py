@@ -29,37 +29,45 @@ class Border(StrEnum):
     reflect = "reflect"
 
 
+Inputs = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="INPUTS", parser=named_path, help="Images, and NPY arrays (..., 2) of points (column, row) [px]."
+    ),
+]
+CameraFile = Annotated[
+    Path, typer.Option(metavar="FILE.toml", parser=named_path, help="Camera file of `gpuvision calibrate`.")
+]
+Results = Annotated[
+    Path, typer.Option(metavar="DIR", parser=named_path, help="Output folder; files keep the names of the inputs.")
+]
+InterpolationChoice = Annotated[
+    Interpolation | None, typer.Option(help="Interpolation between pixels. Default: bilinear.")
+]
+BorderChoice = Annotated[
+    Border | None,
+    typer.Option(
+        help="Values outside the image: mask (default; 0 or NaN), constant (--border-value), or replicate or reflect "
+        "the border pixels."
+    ),
+]
+BorderValue = Annotated[
+    float | None, typer.Option(help="Grey level outside the image with --border constant. Default: 0.")
+]
+Region = Annotated[
+    str | None,
+    typer.Option(metavar="COLUMN,ROW,COLUMNS,ROWS", help="Part of the corrected images to compute. Default: all."),
+]
+
+
 def undistort(
-    inputs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="INPUTS", parser=named_path, help="Images, and NPY arrays (..., 2) of points (column, row) [px]."
-        ),
-    ],
-    lens: Annotated[
-        Path, typer.Option(metavar="FILE.toml", parser=named_path, help="Camera file of `gpuvision calibrate`.")
-    ],
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", parser=named_path, help="Output folder; files keep the names of the inputs.")
-    ],
-    interpolation: Annotated[
-        Interpolation | None, typer.Option(help="Interpolation between pixels. Default: bilinear.")
-    ] = None,
-    border: Annotated[
-        Border | None,
-        typer.Option(
-            help="Values outside the image: mask (default; 0 or NaN), constant (--border-value), or replicate or "
-            "reflect the "
-            "border pixels."
-        ),
-    ] = None,
-    border_value: Annotated[
-        float | None, typer.Option(help="Grey level outside the image with --border constant. Default: 0.")
-    ] = None,
-    region: Annotated[
-        str | None,
-        typer.Option(metavar="COLUMN,ROW,COLUMNS,ROWS", help="Part of the corrected images to compute. Default: all."),
-    ] = None,
+    inputs: Inputs,
+    lens: CameraFile,
+    out: Results,
+    interpolation: InterpolationChoice = None,
+    border: BorderChoice = None,
+    border_value: BorderValue = None,
+    region: Region = None,
     device: DeviceLabel = None,
     overwrite: Overwrite = False,
 ) -> None:

@@ -17,6 +17,7 @@ import coverage
 from mutants.faults import ROOT, Fault
 
 OUT = ROOT / "build" / "mutants"
+_MAX_FILES, _MAX_FILES_OF_MODULE = 6, 3
 _DATA, _TIMES = OUT / "coverage", OUT / "times.xml"
 
 
@@ -37,28 +38,59 @@ def is_recorded() -> bool:
 
 def environment(tree: Path) -> dict[str, str]:
     """Return the environment of tests in a copy of the repository: its package comes before an installed one."""
-    return {**os.environ, "PYTHONPATH": str(tree), "GPUVISION_DEBUG": ""}
+    return {**os.environ, "PYTHONPATH": str(tree), "GPUVISION_DEBUG": "", "PYTHONDONTWRITEBYTECODE": ""}
 
 
 def tests_of(fault: Fault, budget: float) -> list[str]:
-    """Return tests that run the lines of a fault, up to `budget` seconds: tests of the same file first, then by time.
+    """Return the test files of a file, and recorded tests that run the lines of the fault, up to `budget` seconds.
 
-    Lines that run only at import have no tests; for them, take all tests that run any line of the file.
+    Lines that run only at import have no recorded tests; for them, take all tests that run any line of the file. The
+    test files of a kernel are those of the operations that launch it, at most `_MAX_FILES` of a header of many.
     """
     path = ROOT / fault.file
-    places = [(path, fault.lines(path.read_text()))] if path.suffix == ".py" else list(_launches(fault.file))
+    is_code = path.suffix == ".py"
+    places = [(path, fault.lines(path.read_text()))] if is_code else list(_launches(fault.file))
+    chosen = [file for files in dict.fromkeys(_test_files(file) for file, _ in places) for file in files][:_MAX_FILES]
+    if not budget:
+        return chosen
     names = {name for file, lines in places for name in _contexts(file, lines)}
     names = names or {name for file, _ in places for name in _contexts(file, None)}
-    stems = {f"test_{file.stem}" for file, _ in places} | {f"test_{path.parent.name}", f"test_{path.stem}"}
-    times = _seconds()
-    order = sorted(names, key=lambda name: (Path(name.partition("::")[0]).stem not in stems, times[_key(name)], name))
-    chosen, total = [], 0.0
-    for name in order:
+    times, total = _seconds(), 0.0
+    for name in sorted(names, key=lambda name: (times[_key(name)], name)):
         total += times[_key(name)]
-        if chosen and total > budget:
-            break
-        chosen.append(name)
+        if name.partition("::")[0] not in chosen and total <= budget:
+            chosen.append(name)
     return chosen
+
+
+@cache
+def _test_files(path: Path, *, direct: bool = True) -> tuple[str, ...]:
+    """Return the test files of a Python file: the one of the same name, then those that mention most of its names.
+
+    A module whose names no test mentions is tested through the modules that import it.
+    """
+    names = "|".join({path.stem, *_public_names(path.read_text())})
+    found = {file: len(set(re.findall(rf"\b(?:{names})\b", text))) for file, text in _tests().items()}
+    own = [file for file in found if file.name == f"test_{path.stem}.py" and file.parent.name == path.parent.name]
+    others = sorted((file for file in found if found[file]), key=lambda file: (-found[file], len(_tests()[file])))
+    chosen = list(dict.fromkeys([*own, *others]))[:_MAX_FILES_OF_MODULE]
+    files = [str(each.relative_to(ROOT)) for each in chosen]
+    if direct and not own and not any(found[file] > 1 for file in chosen):
+        for user in sorted((ROOT / "gpuvision").rglob("*.py")):
+            if f".{path.stem} import" in user.read_text():
+                files += _test_files(user, direct=False)
+    return tuple(files)
+
+
+def _public_names(text: str) -> list[str]:
+    """Return the public functions and classes of a module."""
+    return re.findall(r"^(?:def|class) ([A-Za-z]\w+)", text, re.MULTILINE)
+
+
+@cache
+def _tests() -> dict[Path, str]:
+    """Return the texts of the test files."""
+    return {file: file.read_text() for file in sorted((ROOT / "tests").rglob("test_*.py"))}
 
 
 def _contexts(path: Path, lines: range | None) -> set[str]:

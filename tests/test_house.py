@@ -280,6 +280,21 @@ def test_no_module_imports_private_names_of_another() -> None:
     assert wrong == []
 
 
+# Objects with a state: a batch on its way through the stream, and the queue and kernel of a bound operation.
+MUTABLE_DATACLASSES = {"Batch", "_Site"}
+
+
+def test_dataclasses_are_frozen() -> None:
+    """Operations and results are keys of caches and are shared between threads: nobody may change their fields."""
+    mutable = set()
+    for _, path in _modules():
+        for node in ast.walk(ast.parse(path.read_text())):
+            for each in node.decorator_list if isinstance(node, ast.ClassDef) else ():
+                if ast.unparse(each).startswith("dataclass") and "frozen=True" not in ast.unparse(each):
+                    mutable.add(node.name)
+    assert mutable == MUTABLE_DATACLASSES
+
+
 @pytest.mark.parametrize("top", ["numba", "pytest", "hypothesis", "mpmath"])
 def test_the_library_needs_no_extra(top: str) -> None:
     """Library and command do not import packages of the extras `test`, `profile` and `reference`."""

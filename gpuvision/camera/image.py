@@ -28,7 +28,7 @@ def grey_image(
         (height, width) or (height, width, channels). Three channels are blue, green, red, as OpenCV reads them. A
         fourth channel (alpha) is ignored.
     channels : collection of int
-        Accepted numbers of channels of a three-dimensional array. Default 1, 3 and 4.
+        Accepted numbers of channels of a three-dimensional array. Default ``(1, 3, 4)``.
     min_size : int
         Smallest accepted height and width [px]. Default 16.
     convert_float64 : bool

@@ -111,7 +111,7 @@ def _run_some(
         tree = free.get()
         fault = faults[number]
         try:
-            row = {**fault.row((ROOT / fault.file).read_text()), **tree.test(fault, budget)}
+            row = {**fault.row((tree.folder / fault.file).read_text()), **tree.test(fault, budget)}
         finally:
             free.put(tree)
         rows[number] = row
@@ -127,7 +127,7 @@ class _Tree:
     """Copy of the files that git knows. Compiled kernels are shared: their cache has the kernels' text as key."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self.folder = folder
         self.omitted: list[str] = []  # tests that fail without a fault
         shutil.rmtree(folder, ignore_errors=True)
         names = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
@@ -145,7 +145,7 @@ class _Tree:
         tests = list(fault.tests) or record.tests_of(fault, budget)
         if not tests:
             return {"state": "survived", "by": "no test runs this line"}
-        place = self._folder / fault.file
+        place = self.folder / fault.file
         text = place.read_text()
         place.write_text(fault.planted(text))
         try:
@@ -171,11 +171,11 @@ class _Tree:
     def _pytest(self, tests: list[str], *more: str) -> tuple[int, list[str], str]:
         """Return the exit status, the tests that failed, and the output."""
         omitted = [f"--deselect={name}" for name in self.omitted]
-        (self._folder / "build" / "tests.txt").write_text("\n".join([*tests, *omitted]))
+        (self.folder / "build" / "tests.txt").write_text("\n".join([*tests, *omitted]))
         done = subprocess.run(
             [sys.executable, "-m", "pytest", *_OPTIONS, f"--timeout={_TEST_TIMEOUT}", *more, "@build/tests.txt"],
-            cwd=self._folder,
-            env=record.environment(self._folder),
+            cwd=self.folder,
+            env=record.environment(self.folder),
             capture_output=True,
             text=True,
             timeout=_TIMEOUT,

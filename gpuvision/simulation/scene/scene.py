@@ -117,7 +117,7 @@ class Scene:
         meshes
             Meshes of trimesh.
         metres
-            Length unit of the meshes [m]: 1e-3 for millimetres.
+            Length unit of the meshes [m]: 1e-3 for millimetres. Default 1.
 
         Raises
         ------
@@ -140,7 +140,7 @@ class Scene:
         path
             The file.
         metres
-            Length unit of the file [m]: 1e-3 for millimetres.
+            Length unit of the file [m]: 1e-3 for millimetres. Default 1.
 
         Raises
         ------

@@ -10,7 +10,7 @@
 // Outputs: poses (starts, 3); covariance, information (starts, 3, 3) [m2, m rad, rad2, and inverse]; score (starts,)
 //          mean cost, 0 to 1; scale (starts,) standard deviation of an inlier's distance [m]; share (starts,) fraction
 //          of the points within c of a line; status (starts,).
-// Options: MIN_EIGENVALUE_RATIO: least ratio of eigenvalues of a determined pose.
+// Options: MIN_EIGENVALUE_RATIO: least ratio of eigenvalues of a determined pose; PRIOR_POINTS: see the covariance.
 //
 // One work-item refines one start.
 #include "distance_map/field.h"
@@ -126,6 +126,23 @@ static inline void store_symmetric(global float *to, normal_equations of, float 
     to[8] = of.tt * scale;
 }
 
+// Return a b a for symmetric matrices, times `scale`.
+static inline normal_equations sandwich(normal_equations a, normal_equations b, float scale) {
+    const float3 a0 = (float3)(a.xx, a.xy, a.xt), a1 = (float3)(a.xy, a.yy, a.yt), a2 = (float3)(a.xt, a.yt, a.tt);
+    const float3 b0 = (float3)(b.xx, b.xy, b.xt), b1 = (float3)(b.xy, b.yy, b.yt), b2 = (float3)(b.xt, b.yt, b.tt);
+    const float3 c0 = (float3)(dot(b0, a0), dot(b1, a0), dot(b2, a0));
+    const float3 c1 = (float3)(dot(b0, a1), dot(b1, a1), dot(b2, a1));
+    const float3 c2 = (float3)(dot(b0, a2), dot(b1, a2), dot(b2, a2));
+    normal_equations result = {0};
+    result.xx = scale * dot(a0, c0);
+    result.xy = scale * dot(a0, c1);
+    result.yy = scale * dot(a1, c1);
+    result.xt = scale * dot(a0, c2);
+    result.yt = scale * dot(a1, c2);
+    result.tt = scale * dot(a2, c2);
+    return result;
+}
+
 kernel void field_pose_refinement(global const float *restrict points, global const float *restrict starts,
                                   global float *restrict poses, global float *restrict covariance,
                                   global float *restrict information, global float *restrict score,
@@ -162,11 +179,14 @@ kernel void field_pose_refinement(global const float *restrict points, global co
         here = better ? there : here;
         if (fabs(by.x) + fabs(by.y) + fabs(by.z) / lever < 3e-6f) break;
     }
-    // Covariance of an M-estimator (Huber, 1981), variance * H^-1: H = sum psi'(r) h h^T with psi(r) = r share^2 and
-    // psi'(r) = share^2 (4 share - 3), clipped at 0, and variance = sum psi^2 / (sum psi' - 3). The heading is scaled
-    // by lever.
+    // Covariance of an M-estimator for residuals of unequal variance (Huber, 1981, section 6.3): H^-1 S H^-1 with
+    // H = sum psi'(r) h h^T, S = sum psi(r)^2 h h^T, psi(r) = r share^2 and psi'(r) = share^2 (4 share - 3), clipped at
+    // 0. Points near ends and crossings of lines, and far points on oblique lines, err more than others, and have more
+    // weight in the heading. For equal variances S is variance H, with variance = sum psi^2 / (sum psi' - 3); as many
+    // points as PRIOR_POINTS are taken to have it, so that few points do not give too small a covariance by chance.
+    // The heading is scaled by lever.
     const float2 turn = (float2)(cos(pose.z), sin(pose.z));
-    normal_equations hessian = {0};
+    normal_equations hessian = {0}, scatter = {0};
     float sum_curvature = 0, sum_psi_squared = 0, inliers = 0;
     for (int k = 0; finite && k < count; k++) {
         const float2 point = (float2)(points[2 * k], points[2 * k + 1]);
@@ -183,6 +203,13 @@ kernel void field_pose_refinement(global const float *restrict points, global co
         hessian.xt += curvature * at.x * at.t * lever;
         hessian.yt += curvature * at.y * at.t * lever;
         hessian.tt += curvature * at.t * at.t * lever * lever;
+        const float square = weight * weight * at.r * at.r;
+        scatter.xx += square * at.x * at.x;
+        scatter.xy += square * at.x * at.y;
+        scatter.yy += square * at.y * at.y;
+        scatter.xt += square * at.x * at.t * lever;
+        scatter.yt += square * at.y * at.t * lever;
+        scatter.tt += square * at.t * at.t * lever * lever;
     }
     normal_equations inverse = cofactors(hessian);
     const float determinant = hessian.xx * inverse.xx + hessian.xy * inverse.xy + hessian.xt * inverse.xt;
@@ -203,12 +230,27 @@ kernel void field_pose_refinement(global const float *restrict points, global co
     score[i] = bad ? NAN : here.cost / used;
     scale[i] = bad ? NAN : sqrt(variance);
     share[i] = bad ? NAN : inliers / used;
-    hessian.xt /= lever;
-    hessian.yt /= lever;
-    hessian.tt /= lever * lever;
-    inverse.xt *= lever;
-    inverse.yt *= lever;
-    inverse.tt *= lever * lever;
-    store_symmetric(information + 9 * i, hessian, bad ? NAN : 1.0f / variance);
-    store_symmetric(covariance + 9 * i, inverse, bad || weak ? NAN : variance / determinant);
+    // S / variance, of about the size of H: no product below underflows. Rounding adds 1e-6 m to a residual.
+    const float own = (used / (used + PRIOR_POINTS)) * sum_curvature / fmax(sum_curvature - 3.0f, 1.0f) / variance;
+    const float prior = PRIOR_POINTS / (used + PRIOR_POINTS) + 1e-12f / variance;
+    scatter.xx = own * scatter.xx + prior * hessian.xx;
+    scatter.xy = own * scatter.xy + prior * hessian.xy;
+    scatter.yy = own * scatter.yy + prior * hessian.yy;
+    scatter.xt = own * scatter.xt + prior * hessian.xt;
+    scatter.yt = own * scatter.yt + prior * hessian.yt;
+    scatter.tt = own * scatter.tt + prior * hessian.tt;
+    normal_equations known = hessian, spread = sandwich(inverse, scatter, 1.0f / (determinant * determinant));
+    if (!weak) {
+        const normal_equations cofactor = cofactors(scatter);
+        const float size = scatter.xx * cofactor.xx + scatter.xy * cofactor.xy + scatter.xt * cofactor.xt;
+        known = sandwich(hessian, cofactor, 1.0f / size);
+    }
+    known.xt /= lever;
+    known.yt /= lever;
+    known.tt /= lever * lever;
+    spread.xt *= lever;
+    spread.yt *= lever;
+    spread.tt *= lever * lever;
+    store_symmetric(information + 9 * i, known, bad ? NAN : 1.0f / variance);
+    store_symmetric(covariance + 9 * i, spread, bad || weak ? NAN : variance);
 }

@@ -50,6 +50,8 @@ MIN_SHIFTS = 1024
 _SHARES_PER_CORE, _FEWEST_ROWS = 4, 4
 # Ratio of eigenvalues of the information below which the points do not determine the pose (chosen).
 _MIN_EIGENVALUE_RATIO = 1e-3
+# Number of points with the mean variance that the covariance counts in addition (chosen: one more than unknowns).
+_PRIOR_POINTS = 4.0
 # Differences up to which two refined poses are the same [m], [rad] (chosen: refinements of one minimum end nearer).
 _SAME_PLACE, _SAME_HEADING = 0.03, 0.02
 
@@ -278,9 +280,10 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
     -----
     Error: distances to lines are exact; the map only gives the lines to consider (four for each cell: where five lines
     meet in one cell, the wrong one may be taken). The pose minimises the cost to 3e-5 m and rad, the rounding in a
-    field of 20 m. The covariance is the covariance of an M-estimator, from the curvature of the cost and the residuals
-    of the points: over random poses on the middle-size field, with 128 points of 1 to 3 cm noise, its standard
-    deviations are right to 5 %. It does not contain errors that the points have in common, such as a wrong scale of the
+    field of 20 m. The covariance is the covariance of an M-estimator for residuals of unequal variance, from the
+    curvature of the cost and the residuals of the points: over random poses on the middle-size field, with 128 points
+    of 1 to 3 cm noise, equal or increasing with the distance, its standard deviations are right to 10 %. It does not
+    contain errors that the points have in common, such as a wrong scale of the
     camera.
     """
 
@@ -318,7 +321,7 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
             outputs=build.outputs(
                 shapes | dict.fromkeys(("score", "residual_std", "inlier_fraction", "status"), starts)
             ),
-            defines={"MIN_EIGENVALUE_RATIO": f"{_MIN_EIGENVALUE_RATIO}f"},
+            defines={"MIN_EIGENVALUE_RATIO": f"{_MIN_EIGENVALUE_RATIO}f", "PRIOR_POINTS": f"{_PRIOR_POINTS}f"},
             arguments=[
                 self.map.field.shapes.astype(np.float32).ravel(),
                 cells,

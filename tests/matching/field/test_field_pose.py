@@ -275,6 +275,20 @@ def test_covariance_is_the_scatter(device: Device, rng: np.random.Generator) -> 
     assert 2.3 < np.mean(distances) < 3.7
 
 
+def test_sigmas_hold_for_noise_that_grows_with_the_distance(device: Device, rng: np.random.Generator) -> None:
+    """Far points err more and have more weight in the heading: 400 views, each ratio known to 3.5 %."""
+    field_map = large(device)
+    refine = FieldPoseRefinement(map=field_map)
+    ratios = []
+    for _ in range(400):
+        exact = view(field_map, POSE, rng, 128, sigma=0.0)
+        away = np.hypot(*exact.T)[:, None]
+        points = (exact + rng.normal(0.0, 0.002 + 0.03 * (away / away.max()) ** 3, exact.shape)).astype(np.float32)
+        fit = refine(points, POSE[None].astype(np.float32), device=device)
+        ratios.append(pose_errors(fit.poses[0], POSE) / np.sqrt(np.diag(fit.covariance[0])))
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(ratios), axis=0)), 1.0, atol=0.1)
+
+
 @pytest.mark.parametrize(
     ("lines", "arcs"),
     [

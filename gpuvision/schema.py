@@ -56,10 +56,12 @@ class Section:
         File name for messages.
     name : str
         Dotted name of this table; empty for the whole file.
+    folder : Path, optional
+        Folder that relative file names in the table refer to; default: the current folder.
     """
 
-    def __init__(self, table: Mapping[str, Any], source: str, name: str = "") -> None:
-        self._table, self._source, self._name = table, source, name
+    def __init__(self, table: Mapping[str, Any], source: str, name: str = "", *, folder: Path | None = None) -> None:
+        self._table, self._source, self._name, self._folder = table, source, name, folder or Path()
         self._queried: list[str] = []
 
     def __contains__(self, key: str) -> bool:
@@ -99,7 +101,7 @@ class Section:
         value = self._value(key, "a table", _REQUIRED)
         if not isinstance(value, dict):
             raise self._value_error(key, value, "", f"a table [{self.dotted(key)}]")
-        return Section(value, self._source, self.dotted(key))
+        return Section(value, self._source, self.dotted(key), folder=self._folder)
 
     def optional_section(self, key: str) -> Section | None:
         """Return a sub-table, or None if the key is missing."""
@@ -119,7 +121,10 @@ class Section:
         tables = self._value(key, "tables", [])
         if not isinstance(tables, list) or not all(isinstance(each, dict) for each in tables):
             raise self._value_error(key, tables, "", f"tables [[{self.dotted(key)}]]")
-        return tuple(Section(each, self._source, f"{self.dotted(key)}[{n}]") for n, each in enumerate(tables))
+        return tuple(
+            Section(each, self._source, f"{self.dotted(key)}[{n}]", folder=self._folder)
+            for n, each in enumerate(tables)
+        )
 
     @overload
     def number(self, key: str, unit: str, default: float = ..., **limits: float) -> float: ...
@@ -215,6 +220,22 @@ class Section:
         found: str | None = value
         return found
 
+    def word(self, key: str, words: Sequence[Choice]) -> Choice | None:
+        """Return the value if it is one of ``words``; None for another value, or where the key is missing.
+
+        For a key that takes a word or another kind of value: call the method for that kind where this one returns None.
+        """
+        self._queried.append(key)
+        value = self._table.get(key)
+        return next((each for each in words if each == value), None)
+
+    def file(self, key: str) -> Path:
+        """Return a file name; a relative name refers to the folder of the description. Errors as for `number`."""
+        name = self.text(key)
+        if not name or "\0" in name:
+            raise self._value_error(key, name, "", "the name of a file")
+        return self._folder / name
+
     def finish(self) -> None:
         """Check that every key of the table was queried.
 
@@ -283,7 +304,7 @@ def read_toml(path: Path) -> Section:
             MAX_DESCRIPTION_BYTES.check(len(content), f"{path.name}: {len(content)} bytes", DescriptionError)
             text = content.decode("utf-8")
             _check_nesting(text, path.name)
-            return Section(tomllib.loads(text), path.name)
+            return Section(tomllib.loads(text), path.name, folder=path.parent)
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise DescriptionError(f"{path.name}: not valid TOML: {reason_of(error)}") from None
 

@@ -24,9 +24,19 @@ from gpuvision.host.image_header import image_size, is_tiff
 from gpuvision.host.reading import check_archive, check_pixels, reading
 from gpuvision.host.sources import ArraySource, FrameSource, Source, check_frame
 
-Channel = Literal["grey", "red", "green", "blue", "max"]
+Channel = Literal["grey", "red", "green", "blue", "max", "red_difference", "green_difference", "blue_difference"]
 
-CHANNELS: tuple[Channel, ...] = ("grey", "red", "green", "blue", "max")
+CHANNELS: tuple[Channel, ...] = (
+    "grey",
+    "red",
+    "green",
+    "blue",
+    "max",
+    "red_difference",
+    "green_difference",
+    "blue_difference",
+)
+_DIFFERENCE = "_difference"
 _TIFF = (".tif", ".tiff")
 _IMAGES = (".png", ".bmp", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".webp", *_TIFF)
 _VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv", ".ts")
@@ -52,8 +62,9 @@ def open_recording(path: str | Path, *, channel: Channel = "grey", key: str | No
     path : path
         ``.npy`` or ``.npz`` (frames along the first axis), ``.tif``, a video, or a folder of images of one size, taken
         in natural order (``img2`` before ``img10``).
-    channel : {"grey", "red", "green", "blue", "max"}
-        Channel of colour frames: ``"grey"`` is the luminance, ``"max"`` the brightest channel of each pixel.
+    channel : {"grey", "red", "green", "blue", "max", "red_difference", "green_difference", "blue_difference"}
+        Channel of colour frames: ``"grey"`` is the luma (ITU-R BT.601), ``"max"`` the brightest channel of each pixel,
+        ``"red_difference"`` the colour difference red minus luma, 0 where it is negative: white light has none.
     key : str, optional
         Name of the array in an ``.npz`` file that holds more than one.
 
@@ -412,6 +423,25 @@ def read_image(path: Path) -> HostArray:
     return image
 
 
+def read_frame(path: Path, channel: Channel = "grey") -> HostArray:
+    """Read an image file as a frame: the channel that `open_recording` gives of the frames of a recording.
+
+    Returns
+    -------
+    numpy.ndarray
+        (rows, columns).
+
+    Raises
+    ------
+    RecordingError
+        As `read_image`; or the image is grey and the channel is a colour.
+    """
+    image = read_image(path)
+    frame = np.empty(image.shape[:2], image.dtype)
+    _picker(channel, image.shape, str(path))(image, frame)
+    return frame
+
+
 def _check_image(path: Path) -> None:
     """Check the size of an image before it is decoded, by its content: OpenCV ignores the suffix, too."""
     with path.open("rb") as file:
@@ -443,7 +473,7 @@ def _silent_opencv() -> Iterator[None]:
 def _picker(channel: Channel, shape: tuple[int, ...], what: str) -> Callable[[HostArray, HostArray], object]:
     """Return the function that copies one channel of a frame (blue, green, red, ...) to an array."""
     if len(shape) == 2:
-        if channel in _PLACES:
+        if channel not in ("grey", "max"):
             raise RecordingError(f"{what}: has no {channel} channel, the frames are grey; use channel 'grey'")
         return lambda frame, out: np.copyto(out, frame)
     if len(shape) != 3 or shape[2] not in (3, 4):
@@ -453,4 +483,14 @@ def _picker(channel: Channel, shape: tuple[int, ...], what: str) -> Callable[[Ho
         return lambda frame, out: cv2.cvtColor(frame, code, out)
     if channel == "max":
         return lambda frame, out: np.max(frame[:, :, :3], axis=2, out=out)
+    if channel.endswith(_DIFFERENCE):
+        return lambda frame, out: _colour_difference(frame, _PLACES[channel.removesuffix(_DIFFERENCE)], out)
     return lambda frame, out: cv2.extractChannel(frame, _PLACES[channel], out)
+
+
+def _colour_difference(frame: HostArray, place: int, out: HostArray) -> None:
+    """Write one of blue, green, red minus the luma, 0 where it is negative."""
+    luma = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY if frame.shape[2] == 3 else cv2.COLOR_BGRA2GRAY)
+    cv2.extractChannel(frame, place, out)
+    np.maximum(out, luma, out=out)
+    np.subtract(out, luma, out=out)

@@ -93,7 +93,10 @@ def scan(
     from gpuvision.workflows.scanning import scan as run
 
     described = Sensor.load(sensor)
-    outputs = Outputs("scan", inputs=(recording, sensor), overwrite=overwrite)
+    inputs: list[str | Path] = [recording, sensor]
+    if isinstance(described.recording.background, Path):
+        inputs.append(described.recording.background)
+    outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
     outputs.claim_folder(out, SCAN_FILES)
     outputs.claim(as_json)
     if trace is not None:
@@ -115,6 +118,8 @@ def scan(
         )
     done.write(out, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
+    for advice in done.advice():
+        typer.echo(f"gpuvision: {advice}", err=True)
     echo(f"{done.summary()}\nlook at {out / 'picture.png'} and {out / 'report.json'}", err=prints_report(as_json))
 
 

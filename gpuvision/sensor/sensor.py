@@ -43,6 +43,8 @@ from gpuvision.ranging.triangulation import Along, Triangulation
 from gpuvision.schema import DescriptionError, Section, read_toml
 from gpuvision.sensor.light_source import Light, read_light
 
+Background = Literal["none", "median", "previous", "dark_after", "dark_before"]
+BACKGROUNDS: tuple[Background, ...] = ("none", "median", "previous", "dark_after", "dark_before")
 Folded = Literal["drop", "top"]
 Ambiguous = Literal["drop", "keep"]
 
@@ -59,11 +61,20 @@ class Recording:
         Name of the array in an NPZ file, if the file holds more than one.
     rate
         Frame rate of the sensor [frames/s]; a scan reports its measured rate relative to it.
+    background
+        Ambient light to subtract from the frames of a camera, default ``"none"``:
+
+        - ``"median"``: the median of each pixel over the recording; for a line that moves through the image.
+        - ``"previous"``: the previous frame; for a line that moves by more than its width from frame to frame.
+        - ``"dark_after"``, ``"dark_before"``: after, or before, each frame with light comes a frame without light. A
+          pair of frames gives one profile.
+        - a path: an image without the light.
     """
 
     channel: Channel = "grey"
     key: str | None = None
     rate: float | None = None
+    background: Background | Path = "none"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +118,8 @@ class Sensor:
         Shape of a frame if the file gives it: (rows, columns), or (strips, 2).
     recording, output
         See `Recording` and `Output`.
+    auto_threshold
+        Whether a scan estimates the threshold of the readout from the recording (``threshold = "auto"``).
     light
         Light source and electronics for a simulation, if the file has them.
     """
@@ -117,6 +130,7 @@ class Sensor:
     output: Output
     recording: Recording = Recording()
     frame: tuple[int, int] | None = None
+    auto_threshold: bool = False
     light: Light | None = None
 
     @classmethod
@@ -164,7 +178,7 @@ class Sensor:
     def _read(cls, top: Section) -> Sensor:
         kind = top.choice("kind", ("camera", "psd"))
         name = top.text("name", "")
-        recording = _recording(top.optional_section("recording"))
+        recording = _recording(kind, top.optional_section("recording"))
         radial = top.optional_section("lens")
         lens = None if radial is None else radial_lens(radial)
         readout = top.section("line" if kind == "camera" else "psd")
@@ -190,6 +204,7 @@ class Sensor:
             output=output,
             recording=recording,
             frame=frame,
+            auto_threshold=kind == "camera" and readout.word("threshold", ("auto",)) is not None,
             light=light,
         )
 
@@ -212,14 +227,17 @@ class Sensor:
             raise ValueError(f"{what}: frames have shape {shape}, the sensor file expects {expected}")
 
 
-def _recording(table: Section | None) -> Recording:
+def _recording(kind: str, table: Section | None) -> Recording:
     if table is None:
         return Recording()
     channel = table.choice("channel", CHANNELS, "grey")
     rate = table.number("rate", "frames/s", None, above=0.0)
     key = table.text("key", None)
+    background: Background | Path = "none"
+    if kind == "camera" and "background" in table:
+        background = table.word("background", BACKGROUNDS) or table.file("background")
     table.finish()
-    return Recording(channel=channel, key=key, rate=rate)
+    return Recording(channel=channel, key=key, rate=rate, background=background)
 
 
 def _frame(kind: str, top: Section, readout: Section) -> tuple[int, int] | None:
@@ -322,10 +340,13 @@ _WAYS = {
 
 def _line(table: Section, along: Along, sheet: Triangulation | None, axes: SampleAxes) -> LineReadout:
     default = LineReadout()
+    threshold = default.threshold
+    if table.word("threshold", ("auto",)) is None:
+        threshold = table.number("threshold", "grey levels", default.threshold, at_least=0.0)
     readout = LineReadout(
         along=along,
         method=table.choice("method", cast(tuple[Method, ...], METHODS), default.method),
-        threshold=table.number("threshold", "grey levels", default.threshold, at_least=0.0),
+        threshold=threshold,
         window=table.integer("window", default.window, at_least=1, at_most=WIDEST_WINDOW),
         # "nearest" needs the reading before: a recording is read in batches, of which all frames run at once.
         peak_selection=table.choice("peak_selection", ("strongest", "first", "last"), default.peak_selection),

@@ -37,11 +37,14 @@ def require_light(sensor: Sensor) -> Light:
     Raises
     ------
     ValueError
-        The sensor file has no table ``[light]`` or no pinhole position, or the transport is not straight.
+        The sensor file has no table ``[light]`` or no pinhole position, the transport is not straight, or the
+        threshold is to be estimated from a recording.
     """
     name = sensor.name or "the sensor"
     if not isinstance(sensor.transport, StraightTransport):
         raise ValueError(f"{name}: a simulation needs a straight transport, this one has a sheet that turns")
+    if sensor.auto_threshold:
+        raise ValueError(f'{name}: [line] threshold = "auto" needs a recording; give a number for a simulation')
     if sensor.light is None:
         raise ValueError(
             f"{name}: its file has no table [light], which a simulation needs; see gpuvision.sensor.light_source"

@@ -20,7 +20,7 @@ from gpuvision.host.outputs import Outputs
 from gpuvision.host.report import StreamReport
 from gpuvision.plots.range_image import draw_height_map, draw_scan, height_span
 from gpuvision.ranging.line import LineReadout
-from gpuvision.ranging.range_image import RangePoints
+from gpuvision.ranging.range_image import RangePoints, RotatingSheet
 from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
@@ -107,6 +107,10 @@ class Scan:
         status = to_numpy(self.points.status)
         flags = {str(flag.name): int(np.count_nonzero(status & flag)) for flag in Status if flag}
         return {"OK": int(np.count_nonzero(status == 0))} | flags
+
+    def advice(self) -> tuple[str, ...]:
+        """Return what to try where most samples have no point; empty for a good scan. See `scan_advice`."""
+        return scan_advice(to_numpy(self.points.status), self.sensor) if self.valid_fraction < 0.5 else ()
 
     def summary(self) -> str:
         """Return one line: frames, throughput, fraction of valid samples, size of the height map.
@@ -212,3 +216,36 @@ class Scan:
             "map_intensity": (self.heights.intensity, light),
         }
         return {name: array for name, (array, _) in held.items()}, {name: unit for name, (_, unit) in held.items()}
+
+
+def scan_advice(status: npt.NDArray[np.uint8], sensor: Sensor) -> tuple[str, ...]:
+    """Return what to try in the sensor file, one sentence for each flag that at least a third of the samples have.
+
+    Parameters
+    ----------
+    status : numpy.ndarray
+        `Status` flags of the samples, (profiles, samples), uint8.
+    sensor : Sensor
+        Sensor of the scan.
+    """
+    camera = isinstance(sensor.readout, LineReadout)
+    turning = isinstance(sensor.transport, RotatingSheet)
+    frequent = {flag for flag in Status if flag and np.mean((status & flag) != 0) >= 1 / 3}
+    sentences = []
+    if Status.LOW_SIGNAL in frequent and isinstance(sensor.readout, LineReadout):
+        threshold = "a lower [line] threshold" if sensor.auto_threshold else '[line] threshold = "auto"'
+        sentences.append(
+            f"most samples are dark at a threshold of {sensor.readout.threshold:g} grey levels: try {threshold}, "
+            "[recording] background in ambient light, another [recording] channel, or a longer exposure"
+        )
+    elif Status.LOW_SIGNAL in frequent:
+        sentences.append("most samples are dark: try a lower [psd] minimum_total, or more light")
+    if Status.AMBIGUOUS in frequent and camera:
+        sentences.append(
+            "most samples have several candidates for the line: try [recording] background, which removes ambient "
+            "light, or a higher [line] threshold"
+        )
+    if frequent & {Status.HORIZON, Status.OUT_OF_RANGE}:
+        step = "the sign of [transport] angle_step and axis_direction" if turning else "the sign of [axes] and baseline"
+        sentences.append(f"most samples miss the scene: check {step}, and the limits x, y, z of [output]")
+    return tuple(sentences)

@@ -19,8 +19,7 @@ from gpuvision.host import Device, Operation, Precision, to_numpy
 from gpuvision.host.outputs import Outputs
 from gpuvision.host.pipeline import Pipeline, Policy
 from gpuvision.host.planning import plan_stream
-from gpuvision.host.recordings import open_recording
-from gpuvision.host.sources import ArraySource, PacedSource, Source
+from gpuvision.host.sources import PacedSource, Source
 from gpuvision.host.trace import Trace
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
@@ -28,7 +27,8 @@ from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet
 from gpuvision.ranging.regrid import Direction, Grid, HeightMap, Regrid
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
-from gpuvision.workflows.scan_result import Scan, ScanLimits
+from gpuvision.workflows.opened_recording import open_for_scan
+from gpuvision.workflows.scan_result import Scan, ScanLimits, scan_advice
 
 Array = npt.NDArray[Any]
 Progress = Callable[[int, int | None], object]
@@ -90,8 +90,8 @@ def scan(
         The timeline cannot be written.
     """
     timeline = None if trace is None else _DeferredTrace(trace, overwrite)
-    source, name = _open_source(recording, sensor)
-    sensor.check_frame(source.shape, name)
+    opened = open_for_scan(recording, sensor)
+    source, name, sensor = opened.source, opened.name, opened.sensor
     readout = _with_range_outputs(sensor, precision)
     device = Device.best() if device is None else device
     paced, stream = _pipeline(source, readout, device, rate, policy, timeline)
@@ -137,21 +137,14 @@ class _DeferredTrace(Trace):
         super().write()
 
 
-def _open_source(recording: str | Path | Source | Array, sensor: Sensor) -> tuple[Source, str]:
-    """Return the source of the frames, and its name for messages and the report."""
-    if isinstance(recording, Source):
-        return recording, type(recording).__name__
-    if isinstance(recording, np.ndarray):
-        return ArraySource(recording), "array"
-    return open_recording(recording, channel=sensor.recording.channel, key=sensor.recording.key), str(recording)
-
-
 def _metadata(name: str, sensor: Sensor, rate: float | None, source: Source) -> dict[str, Any]:
     """Return the entries of the report about the recording and the replay: rates [frames/s], delay ``late`` [s]."""
     return {
         "recording": name,
         "sensor": sensor.name,
         "kind": sensor.kind,
+        "background": str(sensor.recording.background),
+        "threshold": sensor.readout.threshold if isinstance(sensor.readout, LineReadout) else None,
         "sensor_rate": sensor.recording.rate,
         "rate": rate,
         "late": source.late * 1e-9 if isinstance(source, PacedSource) else None,
@@ -274,7 +267,8 @@ def resample_heights(
     x, y, z, status = to_numpy(points.x), to_numpy(points.y), to_numpy(points.z), to_numpy(points.status)
     if not np.any(np.isfinite(z)):
         flags = ", ".join(flag.name or "" for flag in Status if flag and np.any(status & flag))
-        raise ValueError(f"no valid sample in {len(z)} frames ({flags}); check thresholds and [output] limits")
+        advice = "; ".join(scan_advice(status, sensor)) or "check thresholds and [output] limits"
+        raise ValueError(f"no valid sample in {len(z)} frames ({flags}); {advice}")
     output = sensor.output
     grid = Grid.covering(x, y, output.cell)
     if grid.rows * grid.columns > max_cells:

@@ -280,11 +280,15 @@ def test_channels_of_colour_images_and_stacks(tmp_path: Path, rng: np.random.Gen
         "blue": colour[..., 2],
         "max": colour.max(axis=-1),
         "grey": luminance(colour),
+        "red_difference": (colour[..., 0] - luminance(colour)).clip(0),
+        "green_difference": (colour[..., 1] - luminance(colour)).clip(0),
+        "blue_difference": (colour[..., 2] - luminance(colour)).clip(0),
     }[channel]
     for name in ("a.tif", "folder"):
         read = read_all(open_recording(tmp_path / name, channel=channel))
         # Luminance is rounded to whole levels.
-        assert np.abs(read.astype(float) - expected).max() <= (0.51 if channel == "grey" else 0.0)
+        is_rounded = channel == "grey" or channel.endswith("_difference")
+        assert np.abs(read.astype(float) - expected).max() <= (0.51 if is_rounded else 0.0)
 
 
 def test_a_folder_is_read_in_natural_order(tmp_path: Path) -> None:

@@ -325,3 +325,34 @@ def test_what_a_light_cannot_be(tmp_path, text, words):
     path.write_text(brought.split("[light]")[0] + text)
     with pytest.raises(DescriptionError, match=words):
         Sensor.load(path)
+
+
+@pytest.mark.parametrize("background", ["none", "median", "previous", "dark_after", "dark_before"])
+def test_backgrounds_by_name(background: str) -> None:
+    sensor = sensor_of(changed("camera_line", recording__background=background))
+    assert sensor.recording.background == background
+
+
+def test_a_background_image_lies_beside_the_sensor_file(tmp_path: Path) -> None:
+    table = changed("camera_line", recording__background="dark/scene.png")
+    sensor = Sensor.from_section(Section(table, "sensor.toml", folder=tmp_path))
+    assert sensor.recording.background == tmp_path / "dark" / "scene.png"
+
+
+@pytest.mark.parametrize("background", [3, "", True, ["median"]])
+def test_other_backgrounds_are_refused(background: Any) -> None:
+    with pytest.raises(DescriptionError, match=r"sensor\.toml: recording\.background is .*, expected "):
+        sensor_of(changed("camera_line", recording__background=background))
+
+
+def test_strips_have_no_background_of_frames() -> None:
+    with pytest.raises(DescriptionError, match=r"unknown key 'recording\.background'"):
+        sensor_of(changed("psd_line", recording__background="median"))
+
+
+def test_an_automatic_threshold() -> None:
+    sensor = sensor_of(changed("camera_line", line__threshold="auto"))
+    assert sensor.auto_threshold
+    assert not Sensor.load("camera_line").auto_threshold
+    with pytest.raises(DescriptionError, match=r"line\.threshold is 'automatic', expected a number"):
+        sensor_of(changed("camera_line", line__threshold="automatic"))

@@ -439,3 +439,16 @@ def test_a_colour_channel_of_grey_frames(tmp_path: Path, frames: np.ndarray) -> 
     cv2.imwrite(str(tmp_path / "1.png"), np.zeros((4, 5), np.uint8))
     with pytest.raises(RecordingError, match="has no red channel, the frames are grey"):
         read_all(open_recording(tmp_path, channel="red"))
+
+
+def test_a_truncated_tiff_names_its_last_page(tmp_path: Path) -> None:
+    """Pages are numbered from 0; the file ends before the third page."""
+    path = tmp_path / "cut.tif"
+    with tifffile.TiffWriter(path) as writer:
+        for number in range(4):
+            writer.write(np.full((16, 16), number, np.uint8), contiguous=False, metadata=None)
+    with tifffile.TiffFile(path) as file:
+        place = file.pages[2].offset
+    path.write_bytes(path.read_bytes()[:place])
+    with pytest.raises(RecordingError, match=r"truncated TIFF: no page after number 1$"):
+        open_recording(path)

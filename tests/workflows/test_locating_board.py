@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -28,7 +29,7 @@ from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.board.located_board import LocatedBoard
-from gpuvision.workflows.locating_board import locate_board
+from gpuvision.workflows.locating_board import _reason_of_ambiguity, locate_board
 from gpuvision.workflows.locating_robot import floor_points
 
 PIXEL, SHAPE, NOISE = 40e-6, (300, 400), 2.0
@@ -202,6 +203,16 @@ def test_a_wrong_parameter_is_told(artwork: Artwork, change: dict[str, Any], wor
     usual: dict[str, Any] = {"scale": PIXEL, "initial_pose": (*BOARD_MIDDLE, 0.0)}
     with pytest.raises(ValueError, match=words):
         locate_board(np.zeros(SHAPE, np.uint8), artwork, **{**usual, **change})
+
+
+def test_an_ambiguous_place_names_both_places_in_millimetres() -> None:
+    first, second = (BoardView(scale=PIXEL, shape=SHAPE, pose=pose) for pose in ((0.0123, 0.0345, 0), (-0.002, 1.5, 0)))
+    expected = SimpleNamespace(view=first)
+    best, other = SimpleNamespace(agreeing=20), SimpleNamespace(agreeing=15, reason="", view=second)
+    words = _reason_of_ambiguity(expected, best, other, 0.7)
+    assert words.startswith("the board may be at x 12.30 mm, y 34.50 mm or x -2.00 mm, y 1500.00 mm: 20 and 15 rulers")
+    assert _reason_of_ambiguity(expected, best, other, 0.75) == ""
+    assert _reason_of_ambiguity(expected, best, SimpleNamespace(agreeing=15, reason="few"), 0.7) == ""
 
 
 def test_images_are_made_grey_or_refused() -> None:

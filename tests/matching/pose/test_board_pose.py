@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import numpy as np
@@ -175,6 +176,16 @@ def test_writes_within_its_outputs(device: Device, rng: np.random.Generator) -> 
     guarded = Guarded(result)
     operation()(image, rulers, lines, device=device, out=guarded.out)
     guarded.assert_intact()
+
+
+@pytest.mark.parametrize(
+    ("lines", "each", "refused"),
+    [(3, 1, False), (512, 4, False), (8, 256, False), (1, 1, True), (513, 1, True), (2, 0, True), (2, 257, True)],
+)
+def test_counts_of_lines_and_rulers_have_inclusive_limits(lines: int, each: int, refused: bool) -> None:
+    """2 to 512 lines, 1 to 256 rulers on each."""
+    with pytest.raises(ValueError, match="expected") if refused else contextlib.nullcontext():
+        BoardPoseEstimator(ruler=RulerEdges(threshold=20.0), lines=lines, rulers_per_line=each)
 
 
 @pytest.mark.parametrize(

@@ -219,6 +219,8 @@ def test_categories(device: Device) -> None:
     secondary = list(found.causes).index("secondary")
     assert found.dominant_cause(1e-9).tolist() == [-1, -1, secondary, -1, -1]
     assert found.failed_fraction(1e-6) == 0.5
+    # An error equal to the limit is within it.
+    assert found.failed_fraction(abs(float(found.error[0]))) == 0.5
     summary = found.summary(1e-6)
     assert (summary["surface"], summary["valid"], summary["missing"], summary["spurious"], summary["ambiguous"]) == (
         2,

@@ -10,10 +10,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import median_filter
 
 from gpuvision.host import Device, RecordingError, to_numpy
+from gpuvision.host.recordings import read_frame
 from gpuvision.host.sources import ArraySource
-from gpuvision.sensor.sensor import Background, Sensor
+from gpuvision.ranging.line import LineReadout
+from gpuvision.sensor.sensor import Background, Recording, Sensor
 from gpuvision.workflows.opened_recording import open_for_scan
 from gpuvision.workflows.scanning import scan
 from scanning import Ran, check_refused, line_frames
@@ -115,3 +118,27 @@ def test_the_command_reads_the_background_beside_the_sensor_file_and_keeps_it(
     # The scan would write its own picture.png here, over an input.
     check_refused(Ran(capsys, monkeypatch, *arguments, "--out", tmp_path, "--overwrite"), r"picture\.png")
     assert image.read_bytes() == before
+
+
+@pytest.mark.realdata
+def test_a_real_line_on_a_textured_board(device: Device, data: Path) -> None:
+    """A red line on a chequered board in a lit room, with an image of the board without the line."""
+    image = read_frame(data / "ciclop" / "laser.png", "red")
+    shipped = Sensor.load("camera_line")
+    with_background = dataclasses.replace(
+        shipped,
+        readout=LineReadout(along="rows"),
+        recording=Recording(channel="red", background=data / "ciclop" / "laser_background.png"),
+        frame=image.shape,
+        auto_threshold=True,
+    )
+    opened = open_for_scan(image[None], with_background)
+    frames = np.empty((1, *image.shape), np.uint8)
+    opened.source.read_into(frames, np.zeros(1, np.int64))
+    position = to_numpy(opened.sensor.readout(frames, device=device).position)[0]
+    found = np.isfinite(position)
+    # The line leaves the board at the lower end of the image.
+    assert np.mean(found) > 0.85
+    # The board is flat and hand-held: the line is smooth over its width of some pixels.
+    smooth = median_filter(position[found], 31)
+    assert np.mean(np.abs(position[found] - smooth) < 3.0) > 0.9

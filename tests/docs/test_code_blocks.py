@@ -42,6 +42,18 @@ def test_python_on_pages_runs(page: str, tmp_path: Path, monkeypatch: pytest.Mon
         exec(compile(padded, os.fspath(ROOT / page), "exec"), names)
 
 
+def test_each_directive_begins_its_line() -> None:
+    """A line wrapper that joins ``:::`` lines or options such as ``:link:`` would show a directive as text."""
+    wrong = [
+        f"{page}:{number}: {line}"
+        for page in _pages()
+        for number, line in enumerate((ROOT / page).read_text().splitlines(), 1)
+        if (":::" in line and not re.fullmatch(r":{3,}(\{[\w-]+\}.*)?", line))
+        or re.search(r"\S +:(link|width|alt):", line)
+    ]
+    assert wrong == []
+
+
 def _commands(page: str) -> Iterator[list[str]]:
     """Yield the words of each command line of ``gpuvision`` on a page."""
     text = (ROOT / page).read_text().replace("\\\n", " ")

@@ -62,6 +62,8 @@ class Bound(Generic[R]):
         self._wait: Callable[[Any], object] = device.wait if device.kind == "pocl" else cl.Event.wait
         self._empty = not all(launch.global_size)
         self.inputs = tuple(device.empty(shape, dtype, self.queue) for shape, dtype in launch.inputs)
+        count, kind = len(self.inputs), type(operation).__name__
+        self._input_names = [f"{kind}: input {number} of {count}" for number in range(1, count + 1)]
         self.outputs = self.allocate()
         self._tables = [self._upload(each) for each in launch.arguments if isinstance(each, np.ndarray)]
         self._in_flight: collections.deque[tuple[Any, Any]] = collections.deque()
@@ -170,9 +172,9 @@ class Bound(Generic[R]):
     def on_host(self, frames: Sequence[HostArray], out: R | None = None) -> R:
         """Run on NumPy arrays and wait; where memory is shared, the kernel reads and writes them in place."""
         if len(frames) != len(self.inputs):
-            raise TypeError(f"expected {len(self.inputs)} input arrays, got {len(frames)}")
-        for number, (frame, (shape, dtype)) in enumerate(zip(frames, self._launch.inputs, strict=True)):
-            check_host(frame, shape, dtype, f"input {number}")
+            raise self._wrong_count(len(frames))
+        for name, frame, (shape, dtype) in zip(self._input_names, frames, self._launch.inputs, strict=True):
+            check_host(frame, shape, dtype, name)
         if out is None:
             out = self._result({k: np.empty(shape, dtype) for k, (shape, dtype) in self._computed_specs.items()})
         targets = self._computed(out)
@@ -225,9 +227,7 @@ class Bound(Generic[R]):
     def _set_arrays(self, site: _Site, given: tuple[Any, ...]) -> None:
         specs = (*self._launch.inputs, *self._computed_specs.values())
         if len(given) != len(specs):
-            raise TypeError(
-                f"expected {len(self.inputs)} input arrays, got {len(given) - len(specs) + len(self.inputs)}"
-            )
+            raise self._wrong_count(len(given) - len(specs) + len(self.inputs))
         for array, before, spec in zip(given, site.given, specs, strict=True):
             if array is not before:
                 self._check(array, *spec)
@@ -237,6 +237,9 @@ class Bound(Generic[R]):
             if array is not before:
                 site.kernel.set_arg(place, self._known.get(id(array)) or memory_of(array))
         site.given = given
+
+    def _wrong_count(self, given: int) -> TypeError:
+        return TypeError(f"{type(self.operation).__name__}: expected {len(self.inputs)} input arrays, got {given}")
 
     def _check_fields(self, out: R) -> None:
         for name, array in zip(self.operation.Result._fields, out, strict=True):

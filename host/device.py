@@ -138,12 +138,12 @@ class Device:
             return _open(healthy[0])
         if len(healthy) > 1:
             labels = ", ".join(each.label for each in healthy)
-            raise NoDeviceError(f"{len(healthy)} devices answer to {name!r}: {labels}; ask for one of these")
+            raise NoDeviceError(f"{len(healthy)} devices match {name!r}: {labels}; ask for one of these")
         if matching:
             broken = matching[0]
             raise DeviceUnusableError(f"device {broken.label} does not work: {broken.reason}; {broken.advice}")
-        labels = ", ".join(each.label for each in listed) or "none"
-        raise NoDeviceError(f"no device answers to {name!r}; there are: {labels}; {discovery.INSTALL_HINT}")
+        choice = f"choose one of {', '.join(each.label for each in listed)}, or " if listed else ""
+        raise NoDeviceError(f"no device matches {name!r}; {choice}{discovery.INSTALL_HINT}")
 
     @staticmethod
     def of(handle: Any) -> Device:

@@ -135,7 +135,8 @@ class Operation(Generic[R]):
         if inputs and all(isinstance(each, np.ndarray) for each in inputs):
             return self._bound(_device(device), None, inputs[0]).on_host(inputs, out)
         kinds = ", ".join(type(each).__name__ for each in inputs) or "none"
-        raise TypeError(f"expected NumPy arrays or pyopencl arrays, all of one kind, got {kinds}")
+        name = type(self).__name__
+        raise TypeError(f"{name}: expected NumPy arrays or pyopencl arrays, all of one kind, got {kinds}")
 
     def _on_device(self, inputs: Sequence[DeviceArray], device: Device | None, out: R | None) -> R:
         home = Device.of(inputs[0])

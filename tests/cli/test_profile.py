@@ -102,7 +102,7 @@ def test_without_names_everything_is_measured_everywhere(asked: dict[str, Any]) 
     ("args", "kind", "message"),
     [
         (["psd", "abacus"], ValueError, "no operation 'abacus' to profile; expected some of psd, line"),
-        (["psd", "--device", "abacus"], NoDeviceError, "no device answers to 'abacus'"),
+        (["psd", "--device", "abacus"], NoDeviceError, "no device matches 'abacus'"),
     ],
 )
 def test_what_is_not_there(asked: dict[str, Any], args: list[str], kind: type[Exception], message: str) -> None:

@@ -354,5 +354,6 @@ def test_the_memory_of_a_caller_without_contiguity_is_refused(device, pairs):
 def test_masked_arrays_are_refused(device: Device) -> None:
     """A kernel does not see the mask: it would read the values under it."""
     masked = np.ma.masked_invalid(np.ones((4, 4), np.float32))
-    with pytest.raises(TypeError, match=r"input 0: expected a plain array, got a masked array; fill it with \.filled"):
+    expected = r"LineReadout: input 1 of 1: expected a plain array, got a masked array; fill it with \.filled"
+    with pytest.raises(TypeError, match=expected):
         LineReadout()(masked, device=device)

@@ -358,7 +358,7 @@ def test_bad_arguments_are_a_line_and_leave_nothing(tmp_path: Path, run: Any) ->
         (("--sensor", tmp_path / "none.toml", "--out", out), r"no sensor file"),
         (("--sensor", "psd_line", "--out", tmp_path / "file"), r"file is a file, expected a folder"),
         (("--sensor", "psd_line", "--out", tmp_path / "file" / "below"), r"file is a file, expected a folder"),
-        (("--sensor", "psd_line", "--out", out, "--device", "abacus"), r"no device answers to 'abacus'"),
+        (("--sensor", "psd_line", "--out", out, "--device", "abacus"), r"no device matches 'abacus'"),
         (("--sensor", "psd_line", "--out", out, "--rate", "-1"), r"rate is -1"),
     ):
         check_refused(run("scan", plane, *args), message)

@@ -255,7 +255,9 @@ class FindBlobs(VisionOperation[Blobs]):
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if self.count is None:
-            raise ValueError("FindBlobs.count is None; to bind it say how many blobs there will be")
+            raise ValueError(
+                "FindBlobs takes an image and nominal blobs; to bind it, set FindBlobs.count to the number of blobs"
+            )
         edges = self._ruler().launch(device, shape, dtype)
         build = LaunchBuilder(self, device, shape, dtype, variant=self.variant)
         build.check_shape(shape[1] >= _LANES, f"images of {_LANES} columns or more")

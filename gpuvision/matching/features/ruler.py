@@ -328,7 +328,9 @@ class RulerEdges(VisionOperation[Edges]):
         is_valid = len(shape) == 2 and min(shape) >= 2 and max(shape) < 2**15
         build.check_shape(is_valid, f"images (rows, columns) of 2 to {2**15 - 1} each")
         if self.count is None:
-            raise ValueError("RulerEdges.count is None; to bind it say how many rulers there will be")
+            raise ValueError(
+                "RulerEdges takes an image and rulers; to bind it, set RulerEdges.count to the number of rulers"
+            )
         each = max(build.share(self.count, per_core=_SHARES_PER_CORE, multiple=_LANES), _LANES)
         work = build.work(self.count, each=each, group=_GROUP, grouping="per_element")
         found = (self.count, self.max_edges) if self.edge_selection == "all" else (self.count,)

@@ -310,7 +310,9 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
         build = LaunchBuilder(self, device, shape, dtype)
         points = _checked_points(build)
         if self.count is None:
-            raise ValueError("FieldPoseRefinement.count is None; to bind it say how many starts there will be")
+            raise ValueError(
+                "FieldPoseRefinement takes points and start poses; to bind it, set its count to the number of poses"
+            )
         cells, starts = self.map.cells.nearest, (self.count,)
         shapes = {"poses": (*starts, 3), "covariance": (*starts, 3, 3), "information": (*starts, 3, 3)}
         return build.launch(

@@ -351,7 +351,7 @@ def test_wrong_input(device: Device) -> None:
         PLAIN(np.zeros(SHAPE), place(), device=device)
     with pytest.raises(ValueError, match="16 columns or more"):
         PLAIN(np.zeros((80, 15), np.uint8), place(), device=device)
-    with pytest.raises(ValueError, match="say how many blobs"):
+    with pytest.raises(ValueError, match="to the number of blobs"):
         PLAIN.bind(device, SHAPE, np.uint8)
     with pytest.raises(ValueError, match="shape"):
         replace(PLAIN, shape="square")(np.zeros(SHAPE, np.uint8), place(), device=device)

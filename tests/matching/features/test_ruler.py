@@ -416,7 +416,7 @@ def test_wrong_input(device: Device) -> None:
         STRONGEST(np.zeros(SHAPE), rulers, device=device)
     with pytest.raises(ValueError, match=r"images \(rows, columns\)"):
         STRONGEST(np.zeros((3, 4, 5), np.uint8), rulers, device=device)
-    with pytest.raises(ValueError, match="say how many rulers"):
+    with pytest.raises(ValueError, match="to the number of rulers"):
         STRONGEST.bind(device, SHAPE, np.uint8)
     with pytest.raises(TypeError, match="float32"):
         STRONGEST(np.zeros(SHAPE, np.uint8), rulers.astype(np.float64), device=device)

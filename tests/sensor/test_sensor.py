@@ -80,6 +80,43 @@ def test_values_reach_the_operations() -> None:
     assert corner.output.limits[2] == (-0.1, 3.0)
 
 
+@pytest.mark.parametrize(
+    ("name", "key", "value"),
+    [
+        ("psd_line", "psd__strips", 1),
+        ("psd_line", "psd__ampere", 1.0),
+        ("psd_line", "psd__dark", [0.0, 0.0]),
+        ("psd_line", "psd__right_gain", 1.0),
+        ("psd_line", "psd__load_resistance", 0.0),
+        ("psd_line", "psd__minimum_total", 0.0),
+        ("psd_line", "triangulation__horizon", 1e-3),
+        ("psd_line", "transport__start", 0.0),
+        ("psd_line", "output__max_gap", 0.75e-3),  # three cells
+        ("psd_line", "output__max_step", math.inf),
+        ("psd_line", "output__fold_tolerance", 0.0),
+        ("psd_line", "output__folded", "drop"),
+        ("psd_line", "output__ambiguous", "drop"),
+        ("psd_line", "light__blur", 0.0),
+        ("psd_line", "light__bins", 64),
+        ("psd_line", "light__responsivity", 0.4),
+        ("psd_line", "light__ambient", 0.0),
+        ("psd_line", "light__modulated", "no"),
+        ("camera_line", "recording__channel", "grey"),
+        ("camera_line", "line__along", "columns"),
+        ("camera_line", "light__exposure", 1e-3),
+        ("camera_line", "light__full_well", 20_000.0),
+        ("camera_line", "light__read_noise", 0.0),
+        ("corner_scene", "transport__sheet_offset", 0.0),
+        ("corner_scene", "transport__horizon", 1e-4),
+    ],
+)
+def test_a_key_that_is_left_out_has_its_default(name: str, key: str, value: Any) -> None:
+    without = changed(name, **{key: value})
+    table, _, last = key.rpartition("__")
+    del without[table][last]
+    assert sensor_of(without) == sensor_of(changed(name, **{key: value}))
+
+
 def test_background_of_a_psd_is_its_ambient_light() -> None:
     """The photocurrent of the ambient light is the default of the background; margin and background can be stated."""
 

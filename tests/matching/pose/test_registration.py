@@ -19,7 +19,12 @@ from board_images import View, board_image
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.features.ruler import RulerEdges
-from gpuvision.matching.pose.registration import CoarseRegistration, prepare_board_registration, register_images
+from gpuvision.matching.pose.registration import (
+    CoarseRegistration,
+    find_template_edges,
+    prepare_board_registration,
+    register_images,
+)
 from gpuvision.status import Status
 
 PIXEL, NOISE = 25e-6, 3.0
@@ -160,6 +165,26 @@ def pictured(
     """Return a registration and an image."""
     view, fix = prepared(artwork, shape)
     return fix, board_image(artwork, view, pose, MIDDLE, rng=np.random.default_rng(5))
+
+
+@pytest.mark.parametrize("shape", [(100, 180), (180, 100)])
+def test_edges_of_a_template_lie_on_its_outline(device: Device, shape: tuple[int, int]) -> None:
+    """A disk: edges on its circle, normals along its radii, one edge in most 8 px squares that the circle crosses."""
+    column, row, radius = shape[1] / 2 + 3.3, shape[0] / 2 - 2.6, 38.4
+    y, x = np.indices(shape)
+    distance = np.hypot(x - column, y - row) - radius
+    image = (40.0 + 150.0 * ndimage.gaussian_filter(np.clip(0.5 - distance, 0.0, 1.0), 0.8)).astype(np.float32)
+    edges = find_template_edges(image, RulerEdges(threshold=20.0), device=device)
+    arms = edges.point - (column, row)
+    lengths = np.hypot(*arms.T)
+    np.testing.assert_allclose(lengths, radius, atol=0.1)
+    assert np.min(np.abs(np.sum(arms * edges.normal, axis=1)) / lengths) > math.cos(math.radians(10.0))
+    angle = np.linspace(0.0, 2.0 * np.pi, 20_000)
+    circle = np.stack([column + radius * np.cos(angle), row + radius * np.sin(angle)], axis=-1)
+    squares, lengths_inside = np.unique(np.floor((circle + 0.5) / 8.0), axis=0, return_counts=True)
+    crossed = {tuple(each) for each in squares[lengths_inside > 20_000 * 4.0 / (2.0 * np.pi * radius)]}
+    found = {tuple(each) for each in np.floor((edges.point + 0.5) / 8.0)}
+    assert len(crossed & found) > 0.8 * len(crossed)
 
 
 @pytest.mark.parametrize("shape", [(257, 333), (480, 222)])

@@ -35,16 +35,25 @@ def started(code: str, *args: object) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+def wait_for_line(ran: subprocess.Popen[str], line: str) -> None:
+    assert ran.stdout is not None
+    assert ran.stdout.readline() == f"{line}\n"
+
+
+def end(ran: subprocess.Popen[str], number: int) -> tuple[int, str]:
+    """Send a signal; return the exit code and standard error."""
+    ran.send_signal(number)
+    _, stderr = ran.communicate(timeout=30)
+    return ran.returncode, stderr
+
+
 @posix
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize("module", ["typer", "gpuvision.host", "pyopencl"])
 def test_an_interrupt_while_it_loads_is_an_exit_code(module: str, number: int, code: int) -> None:
     ran = started(SLOW.format(name=module) + MAIN, "devices")
-    assert ran.stdout is not None
-    assert ran.stdout.readline() == "loading\n"
-    ran.send_signal(number)
-    _, stderr = ran.communicate(timeout=30)
-    assert (ran.returncode, stderr) == (code, "")
+    wait_for_line(ran, "loading")
+    assert end(ran, number) == (code, "")
 
 
 @posix
@@ -56,12 +65,9 @@ def test_a_command_that_is_ended_leaves_nothing(number: int, code: int, tmp_path
     np.save(tmp_path / "plane.npy", currents(4))
     out = tmp_path / "deep" / "out"
     ran = started(slow + MAIN, "scan", tmp_path / "plane.npy", "--sensor", "psd_line", "--out", out)
-    assert ran.stdout is not None
-    assert ran.stdout.readline() == "writing\n"
+    wait_for_line(ran, "writing")
     assert list((tmp_path / "deep").glob(".*.part"))
-    ran.send_signal(number)
-    _, stderr = ran.communicate(timeout=30)
-    assert (ran.returncode, stderr) == (code, "")
+    assert end(ran, number) == (code, "")
     assert [each.name for each in tmp_path.iterdir()] == ["plane.npy"]
 
 
@@ -95,11 +101,8 @@ gpuvision.cli.main._GRACE = 0.5
 )
 def test_code_that_swallows_the_interrupt_is_cut_off(swallow: str, number: int, code: int, tmp_path: Path) -> None:
     ran = started(SWALLOWING.format(swallow=swallow) + MAIN, "devices")
-    assert ran.stdout is not None
-    assert ran.stdout.readline() == "loading\n"
-    ran.send_signal(number)
-    _, stderr = ran.communicate(timeout=30)
-    assert (ran.returncode, stderr) == (code, "")
+    wait_for_line(ran, "loading")
+    assert end(ran, number) == (code, "")
 
 
 @posix
@@ -112,11 +115,8 @@ def test_an_interrupt_while_a_device_is_probed(
     slow += "def still(*a, **k):\n    print('probing', flush=True)\n    return run(['sleep', '60'], **k)\n"
     slow += "subprocess.run = still\n"
     ran = started(slow + MAIN, "devices")
-    assert ran.stdout is not None
-    assert ran.stdout.readline() == "probing\n"
-    ran.send_signal(number)
-    _, stderr = ran.communicate(timeout=30)
-    assert (ran.returncode, stderr) == (code, "")
+    wait_for_line(ran, "probing")
+    assert end(ran, number) == (code, "")
     assert not list((tmp_path / "cache").rglob("*.part"))
 
 
@@ -128,12 +128,9 @@ def test_a_swallowed_signal_leaves_no_temporary_file(tmp_path: Path) -> None:
     slow += "gpuvision.workflows.scan_result.write_npz = still\n"
     np.save(tmp_path / "plane.npy", currents(4))
     ran = started(slow + MAIN, "scan", tmp_path / "plane.npy", "--sensor", "psd_line", "--out", tmp_path)
-    assert ran.stdout is not None
-    assert ran.stdout.readline() == "writing\n"
+    wait_for_line(ran, "writing")
     assert list(tmp_path.glob(".*.part"))
-    ran.send_signal(signal.SIGTERM)
-    _, stderr = ran.communicate(timeout=30)
-    assert (ran.returncode, stderr) == (143, "")
+    assert end(ran, signal.SIGTERM) == (143, "")
     assert [each.name for each in tmp_path.iterdir()] == ["plane.npy"]
 
 

@@ -36,8 +36,9 @@ hypothesis.configuration.set_hypothesis_home_dir(CACHE / "hypothesis")
 LEFT_COUNTS = pytest.StashKey[dict[str, int]]()
 WITHOUT_INLINE = pytest.StashKey[bool]()
 TIERS = ("fast", "full", "nightly")
-# Factor on the examples of every hypothesis test in the tier "nightly".
-NIGHTLY_EXAMPLES = 20
+# Factor on the examples of every hypothesis test by tier. The fast tier draws 10 at least, or all of fewer.
+EXAMPLES = {"fast": 0.3, "full": 1, "nightly": 20}
+LEAST_EXAMPLES = 10
 # New draws in every run; a failure prints how to repeat it. No deadline: a busy machine must not fail a test.
 hypothesis.settings.register_profile("unhurried", deadline=None, print_blob=True)
 hypothesis.settings.load_profile("unhurried")
@@ -61,10 +62,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(trylast=True)  # after -m and -k: the smoke set is selected from the remaining tests
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect the tests that the tier omits; draw more hypothesis examples in the tier "nightly"."""
+    """Deselect the tests that the tier omits; draw the tier's number of hypothesis examples."""
     tier = config.getoption("tier")
-    if tier == "nightly":
-        _draw_more_examples(items)
+    _set_examples(items, EXAMPLES[tier])
     if tier != "fast":
         return
     chosen, left, without_inline = select_fast(items, Device.all()[:1])
@@ -86,14 +86,14 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-def _draw_more_examples(items: list[pytest.Item]) -> None:
+def _set_examples(items: list[pytest.Item], factor: float) -> None:
     """Multiply the number of examples of each hypothesis test, also where the test states the number."""
     for function in {getattr(item, "obj", None) for item in items}:
         if hypothesis.is_hypothesis_test(function):
             # Hypothesis has no public name for the settings of a test.
             stated = function._hypothesis_internal_use_settings
-            more = hypothesis.settings(stated, max_examples=NIGHTLY_EXAMPLES * stated.max_examples)
-            function._hypothesis_internal_use_settings = more
+            count = max(round(factor * stated.max_examples), min(stated.max_examples, LEAST_EXAMPLES))
+            function._hypothesis_internal_use_settings = hypothesis.settings(stated, max_examples=count)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

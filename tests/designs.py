@@ -1,4 +1,4 @@
-"""All-pairs design: few cases of a product of parameters that still hold every pair of values."""
+"""Covering designs: few cases of a product of parameters that still hold every value, or every pair of values."""
 
 from __future__ import annotations
 
@@ -6,19 +6,20 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 
 
-def all_pairs(cases: Sequence[Mapping[str, object]]) -> list[int]:
-    """Return the indices of cases that hold every pair of values of two parameters that occurs in `cases`.
+def covering(cases: Sequence[Mapping[str, object]], strength: int) -> list[int]:
+    """Return the indices of cases that hold every combination of values of `strength` parameters in `cases`.
 
     Parameters
     ----------
     cases : sequence of mapping of str to object
         Values of the parameters, by name. Values are equal where their texts (`repr`) are.
+    strength : int
+        1: every value of each parameter; 2: every pair of values of two parameters.
 
     Returns
     -------
     list of int
-        Indices in ascending order: a greedy choice, the same in every process. With two parameters or fewer each case
-        has a unique pair, and all cases are chosen.
+        Indices in ascending order: a greedy choice, the same in every process.
 
     References
     ----------
@@ -28,19 +29,21 @@ def all_pairs(cases: Sequence[Mapping[str, object]]) -> list[int]:
     Examples
     --------
     >>> product = [{"a": a, "b": b, "c": c} for a in "xy" for b in "xy" for c in "xy"]
-    >>> all_pairs(product)
+    >>> covering(product, 2)
     [0, 3, 5, 6]
+    >>> covering(product, 1)
+    [0, 7]
     """
-    pairs = [set(_pairs(case)) for case in cases]
-    missing = set().union(*pairs)
+    held = [set(_combinations(case, strength)) for case in cases]
+    missing = set().union(*held)
     chosen = []
     while missing:
-        best = max(range(len(cases)), key=lambda k: len(pairs[k] & missing))  # the first of equals
+        best = max(range(len(cases)), key=lambda k: len(held[k] & missing))  # the first of equals
         chosen.append(best)
-        missing -= pairs[best]
+        missing -= held[best]
     return sorted(chosen)
 
 
-def _pairs(case: Mapping[str, object]) -> Iterator[tuple[tuple[str, str], ...]]:
+def _combinations(case: Mapping[str, object], strength: int) -> Iterator[tuple[tuple[str, str], ...]]:
     values = [(name, repr(value)) for name, value in sorted(case.items())]
-    return itertools.combinations(values, 2)
+    return itertools.combinations(values, strength)

@@ -1,4 +1,4 @@
-"""All-pairs designs hold every pair that occurs, in few cases."""
+"""Covering designs hold every value or pair that occurs, in few cases."""
 
 from __future__ import annotations
 
@@ -9,31 +9,38 @@ from typing import Any
 import pytest
 
 import designs
-from designs import all_pairs
+from designs import covering
 
 PRODUCT = [dict(zip("abcd", case, strict=True)) for case in itertools.product(range(9), "xy", (1.5, None, ()), "pq")]
 
 
-def pairs_of(cases: list[dict[str, Any]]) -> set[Any]:
-    return {pair for case in cases for pair in itertools.combinations(sorted(case.items()), 2)}
+def held_by(cases: list[dict[str, Any]], strength: int) -> set[Any]:
+    return {held for case in cases for held in itertools.combinations(sorted(case.items()), strength)}
 
 
+@pytest.mark.parametrize("strength", [1, 2])
 @pytest.mark.parametrize("cases", [PRODUCT, PRODUCT[5:], PRODUCT[::7], PRODUCT[:1]], ids=len)
-def test_every_pair_that_occurs_is_held(cases: list[dict[str, Any]]) -> None:
-    chosen = all_pairs(cases)
+def test_everything_that_occurs_is_held(cases: list[dict[str, Any]], strength: int) -> None:
+    chosen = covering(cases, strength)
     assert chosen == sorted(set(chosen))
-    assert pairs_of([cases[k] for k in chosen]) == pairs_of(cases)
+    assert held_by([cases[k] for k in chosen], strength) == held_by(cases, strength)
 
 
 def test_few_cases() -> None:
-    """No fewer cases than pairs of the two longest lists of values, and not many more."""
-    assert 27 <= len(all_pairs(PRODUCT)) <= 30
+    """No fewer cases than values or pairs of the longest lists of values, and not many more."""
+    assert len(covering(PRODUCT, 1)) == 9
+    assert 27 <= len(covering(PRODUCT, 2)) <= 30
 
 
-def test_all_cases_of_two_parameters() -> None:
+def test_all_pairs_of_two_parameters_are_all_cases() -> None:
     cases = [{"a": a, "b": b} for a in range(4) for b in range(3)]
-    assert all_pairs(cases) == list(range(12))
+    assert covering(cases, 2) == list(range(12))
+
+
+def test_each_value_of_two_parameters() -> None:
+    cases = [{"a": a, "b": b} for a in range(4) for b in range(3)]
+    assert len(covering(cases, 1)) == 4
 
 
 def test_docstring() -> None:
-    assert doctest.testmod(designs) == (0, 2)
+    assert doctest.testmod(designs) == (0, 3)

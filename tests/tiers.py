@@ -1,4 +1,4 @@
-"""Selection of the fast tier: tests of the best device, a smoke set of the others, all-pairs designs of products."""
+"""Selection of the fast tier: tests of the best device, a smoke set of the others, covering designs of products."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from designs import all_pairs
+from designs import covering
 from gpuvision.host import Device
 
+# Folders whose tests run whole tasks with the kernels of other files.
+_COMPOSED = frozenset({"cli", "profiling", "workflows"})
 # Tests of this run that the fast tier leaves to the full tier, for `pytest.Session`.
 LEFT = pytest.StashKey[list[pytest.Item]]()
 
@@ -22,7 +24,7 @@ class Selection(NamedTuple):
     chosen : list of pytest.Item
         Tests of the fast tier.
     left : list of pytest.Item
-        Slow tests, cases beyond an all-pairs design and, on all devices but the best, tests beyond the smoke set.
+        Slow tests, cases beyond a covering design and, on all devices but the best, tests beyond the smoke set.
     without_inline : set of pytest.Item
         Chosen tests that run without PoCL's inline device, for which PoCL compiles each kernel once more: all tests
         outside ``tests/host`` that are not in the smoke set.
@@ -42,13 +44,13 @@ def select_fast(items: Sequence[pytest.Item], best: Collection[Device]) -> Selec
     for item in items:
         device = device_of(item)
         case = _smoke_case(item)
-        is_more = device is not None and case in seen
+        is_more = device is not None and (case is None or case in seen)
         if item not in designed or (is_more and device not in best):
             selection.left.append(item)
             continue
         seen.add(case)
         selection.chosen.append(item)
-        if is_more and "host" not in item.path.parts:
+        if is_more and not _is_of_host(item):
             selection.without_inline.add(item)
     return selection
 
@@ -59,9 +61,11 @@ def collected_items(session: pytest.Session) -> list[pytest.Item]:
 
 
 def _designed(items: Sequence[pytest.Item]) -> Iterator[pytest.Item]:
-    """Yield an all-pairs design of each kernel test with three parameters or more, and all cases of other tests.
+    """Yield a covering design of each kernel test, and all cases of other tests.
 
-    The device is not one of these parameters.
+    Most of a kernel test's time is compilation, once for each kernel variant, dtype and option. Of a test with two
+    parameters the design holds each value, of a test with more each pair of values; the device is not a parameter.
+    In ``tests/host``, which compiles little, it holds each pair in both cases.
     """
     functions: dict[Any, list[pytest.Item]] = {}
     for item in items:
@@ -70,19 +74,25 @@ def _designed(items: Sequence[pytest.Item]) -> Iterator[pytest.Item]:
         parameters = [
             {name: value for name, value in _parameters_of(item).items() if name != "device"} for item in cases
         ]
-        is_product = device is not None and len(parameters[0]) > 2
-        yield from (cases[k] for k in (all_pairs(parameters) if is_product else range(len(cases))))
+        strength = 1 if len(parameters[0]) == 2 and not _is_of_host(cases[0]) else 2
+        is_product = device is not None and len(parameters[0]) > 1
+        yield from (cases[k] for k in (covering(parameters, strength) if is_product else range(len(cases))))
 
 
-def _smoke_case(item: pytest.Item) -> tuple[Any, ...]:
-    """Return a key: file, device, kernel variant and precision; the smoke set has the first test of each key.
+def _smoke_case(item: pytest.Item) -> tuple[Any, ...] | None:
+    """Return a key: file and device; the smoke set has the first test of each key.
 
-    Runtimes differ most in queues and memory: in ``tests/host`` the key also has the test function.
+    Runtimes differ most in queues and memory: in ``tests/host`` the key also has the test function. ``None``: the smoke
+    set has no test of the file, because it runs whole tasks with the kernels of other files.
     """
-    parameters = _parameters_of(item)
-    chosen = (parameters.get(name) for name in ("device", "variant", "precision"))
-    function = function_of(item) if "host" in item.path.parts else ""
-    return (item.path, function, *map(str, chosen))
+    if item.path.parent.name in _COMPOSED:
+        return None
+    function = function_of(item) if _is_of_host(item) else ""
+    return (item.path, function, str(device_of(item)))
+
+
+def _is_of_host(item: pytest.Item) -> bool:
+    return item.path.parent.name == "host"
 
 
 def function_of(item: pytest.Item) -> str:

@@ -77,7 +77,7 @@ def test_nothing_is_seen_above_the_horizon() -> None:
     assert PINHOLE.to_floor([(319.5, horizon + 1.0)])[0, 0] > 100.0
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, BENT])
+@pytest.mark.parametrize("camera", [pytest.param(PINHOLE, marks=pytest.mark.slow), BENT])
 def test_stripes_are_found_on_their_lines(camera: MountedCamera, rng: np.random.Generator, device: Device) -> None:
     field = read_field("robocup_msl")
     image = seen_ahead(carpet(), camera, POSE, shape=SHAPE, rng=rng)

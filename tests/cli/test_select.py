@@ -110,6 +110,7 @@ def test_what_a_board_lacks_is_told(artwork: Artwork) -> None:
         choose_features(artwork, ((7e-3, 2e-3), (11e-3, 3e-3)), IMAGING)
 
 
+@pytest.mark.slow
 def test_a_camera_is_located_as_promised(artwork: Artwork, features: FeatureSet, device: Device) -> None:
     """Errors of 8 images at the placement point agree with the deviations that were predicted before."""
     scores = []

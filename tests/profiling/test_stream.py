@@ -51,6 +51,7 @@ def test_a_rate_does_not_hold_with_drops_or_a_sensor_that_overflows():
     assert not _held(1000.0, late=0.2).holds
 
 
+@pytest.mark.slow
 def test_rows_for_each_rate_and_the_highest(device):
     cases = list(stream.cases(device, run_seconds=0.05))
     assert [case.name for case in cases] == ["1000", "4000", "4000_loaded", "highest"]

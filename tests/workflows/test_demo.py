@@ -71,6 +71,7 @@ def test_what_the_lens_does_not_see_is_dark(light: Path) -> None:
     assert np.all(done.points.status[in_shadow, columns] == 1)
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "demo"
     monkeypatch.setattr(sys, "argv", ["gpuvision", "demo", "--out", str(out), "--seed", "3"])

@@ -149,6 +149,7 @@ def test_dark_copper_is_told_from_bright(artwork: Artwork) -> None:
     assert np.abs(errors_in_sigmas(located, pose)).max() < SIGMAS
 
 
+@pytest.mark.slow
 def test_a_lens_is_undone(artwork: Artwork) -> None:
     pose = (BOARD_MIDDLE[0] + 30e-6, BOARD_MIDDLE[1] - 25e-6, -1e-3)
     lens = Lens(k1=2e-7, centre=(200.0, 147.0))

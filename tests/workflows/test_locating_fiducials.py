@@ -75,7 +75,7 @@ def is_consistent(total: float, numbers: int) -> bool:
     return bool(0.9**2 * low <= total <= 1.1**2 * high)
 
 
-@pytest.mark.parametrize("board", ["rounds", "mixed"])
+@pytest.mark.parametrize("board", [pytest.param("rounds", marks=pytest.mark.slow), "mixed"])
 def test_errors_are_as_promised(board: str, device: Device, request: pytest.FixtureRequest) -> None:
     """Errors agree with the predictions of the selection and with the covariance of each pose."""
     artwork, rng = request.getfixturevalue(board), np.random.default_rng(5)
@@ -190,6 +190,7 @@ def test_dark_marks_are_told_from_bright(rounds: Artwork, device: Device) -> Non
     assert np.abs((np.array(found.pose) - true) / found.sigmas).max() < 4.5
 
 
+@pytest.mark.slow
 def test_marks_are_seen_through_a_lens(rounds: Artwork) -> None:
     lens = Lens(k1=2e-7, centre=(205.0, 145.0))
     straight, true = moved_picture(round_picture(rounds), np.random.default_rng(6))

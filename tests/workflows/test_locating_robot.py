@@ -99,7 +99,10 @@ def is_correct(found: np.ndarray, pose: tuple[float, float, float]) -> bool:
     return bool(min(np.hypot(found[0] - s * pose[0], found[1] - s * pose[1]) for s in (1, -1)) < 0.1)
 
 
-@pytest.mark.parametrize("kind", sorted(NO_FIELDS))
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(each, marks=[] if each in ("lines", "mottled") else pytest.mark.slow) for each in sorted(NO_FIELDS)],
+)
 def test_what_is_no_field_is_refused(kind: str, rng: np.random.Generator) -> None:
     field = read_field("robocup_msl")
     for _ in range(6):

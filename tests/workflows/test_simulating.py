@@ -144,6 +144,7 @@ def test_another_task_has_other_light(part_file: Path) -> None:
     assert electronics.fingerprint == one.fingerprint
 
 
+@pytest.mark.slow
 def test_a_camera_beside_the_psd_is_hardly_moved_by_the_glow(part_file: Path, tmp_path: Path) -> None:
     worst = {}
     for name in ("psd_line", "camera_line"):
@@ -228,6 +229,7 @@ def test_the_command(
         assert lines[-1].startswith("gpuvision: ")
 
 
+@pytest.mark.slow
 def test_a_cluster_loses_a_worker_and_nothing_else(part_file: Path, tmp_path: Path) -> None:
     from distributed import LocalCluster
 
@@ -249,6 +251,7 @@ def test_a_cluster_loses_a_worker_and_nothing_else(part_file: Path, tmp_path: Pa
     np.testing.assert_array_equal(remote.attribution.error, local.attribution.error)
 
 
+@pytest.mark.slow
 def test_a_second_sensor_sees_what_is_hidden_from_the_first(
     part_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

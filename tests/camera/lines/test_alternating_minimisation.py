@@ -76,6 +76,7 @@ def test_solvers_minimise_what_the_thesis_says(points: np.ndarray, solver: str) 
     assert found.evaluations > found.minimum.iterations == 3
 
 
+@pytest.mark.slow
 def test_fit_by_a_solver(points: np.ndarray) -> None:
     """A fit reports the result and the rounds of its solver; variable projection is never worse."""
     families = grid_lines(points)

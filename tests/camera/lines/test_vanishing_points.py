@@ -87,6 +87,7 @@ def test_errors_are_as_predicted(rng: np.random.Generator) -> None:
     assert abs(np.mean(found**2) - 1.0) < 0.4
 
 
+@pytest.mark.slow
 def test_uncertainties_cover_the_truth(rng: np.random.Generator) -> None:
     cases = [
         (t, b, s) for t in (0.0, 10.0, 20.0, 30.0, 45.0) for b, s in ((0.3, 0.02), (3.0, 0.02), (3.0, 0.2), (20.0, 0.2))

@@ -362,7 +362,7 @@ def test_layers_are_where_gerbonara_says(data: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "pads", "holes", "bounds"),
     [
-        ("fritzing", 364, 482, (96.96, 97.94)),
+        pytest.param("fritzing", 364, 482, (96.96, 97.94), marks=pytest.mark.slow),
         ("upverter", 63, 63, (39.5, 60.025)),  # its holes are in two files
         ("kicad-x2-tests/x2ap", 236, 80, (80, 50)),
     ],

@@ -399,12 +399,12 @@ BOARDS = (
     "fritzing",
     *(f"kicad-x2-tests/{each}" for each in ("x2ap", "nox2ap", "x2noap", "nox2noap")),
 )
-SLOW_BOARDS = [pytest.param(each, marks=[] if each == "upverter" else pytest.mark.slow) for each in BOARDS]
 
 
 @needs_gerbv
 @pytest.mark.realdata
-@pytest.mark.parametrize("name", SLOW_BOARDS)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BOARDS)
 def test_boards_are_drawn_as_gerbv_draws_them(data: Path, tmp_path: Path, name: str) -> None:
     with open_board(data / "gerber" / name, None) as stack:
         for file in stack.graphic_layers.values():

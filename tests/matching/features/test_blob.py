@@ -127,7 +127,7 @@ def test_edges_alone_as_their_circle_has_it(device: Device, variant: Any, radius
     assert abs(blobs.size[0] - radius) < 0.01
 
 
-@pytest.mark.parametrize(("spokes", "match"), [(8, True), (20, True), (44, False)])
+@pytest.mark.parametrize(("spokes", "match"), [(8, True), pytest.param(20, True, marks=pytest.mark.slow), (44, False)])
 def test_any_number_of_rulers(device: Device, spokes: int, match: bool) -> None:
     """Numbers of fiducials that fill the kernel's vectors, and other numbers."""
     blobs = replace(PLAIN, spokes=spokes, match=match)(a_disc().astype(np.float32), place(), device=device)

@@ -18,6 +18,7 @@ def test_a_motion_is_in_the_robots_frame() -> None:
     np.testing.assert_allclose(moved.covariance, np.diag([4e-4, 1e-4, 1e-6]), atol=1e-15)
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_many_robots(rng: np.random.Generator) -> None:
     noise = np.diag([1e-4, 4e-4, 1e-4])
     robots = rng.multivariate_normal(POSE, COVARIANCE, 40_000)

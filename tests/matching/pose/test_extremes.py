@@ -62,7 +62,7 @@ def test_only_parallel_traces_are_left(board: BoardFix, device: Device, rng: np.
     assert (fixes.status == Status.AMBIGUOUS).all()
 
 
-@pytest.mark.parametrize("share", [0.5, 0.7])
+@pytest.mark.parametrize("share", [pytest.param(0.5, marks=pytest.mark.slow), 0.7])
 def test_mostly_clutter(board: BoardFix, share: float, device: Device, rng: np.random.Generator) -> None:
     """50 % or more of the rulers are on wrong edges: no pose is wrong if four other rows must support each row."""
     careful = replace(board, max_leverage=0.5)

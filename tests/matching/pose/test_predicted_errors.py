@@ -103,6 +103,7 @@ def test_no_wrong_pose_of_a_disturbed_board(
         assert_as_promised(fixes.scatter / board.chosen.sigmas, band(60))
 
 
+@pytest.mark.slow
 def test_chosen_rulers_beat_others_as_promised(drawn: BoardFix, device: Device, rng: np.random.Generator) -> None:
     board = replace(drawn, budget=16)
     assert_beats_random_sets(board, board.sharp(1, rng), 25, device, rng)

@@ -113,6 +113,7 @@ def present_share(artwork: Artwork, pose: Any, gone: set[int]) -> tuple[float, i
     return float(np.mean([own not in gone for own in traces_of_rulers(artwork)[inside]])), int(inside.sum())
 
 
+@pytest.mark.slow
 @settings(max_examples=6, deadline=None)
 @example(x=0.0, y=0.0, degrees=0.0, missing=0.125, seed=24145)  # more than a third of the traces in view
 @example(x=0.0, y=0.0, degrees=0.0, missing=0.25, seed=3902)
@@ -441,7 +442,7 @@ def agreement(pair: Path, shape: tuple[int, int], draws: int, device: Device) ->
 
 
 @pytest.mark.realdata
-@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("name", [PAIRS[0], *(pytest.param(each, marks=pytest.mark.slow) for each in PAIRS[1:])])
 def test_what_was_applied_to_a_real_picture_is_recovered(data: Path, name: str, device: Device) -> None:
     # The complete image is used.
     miss, turn = agreement(data / "pcb" / "deeppcb" / name, (860, 860), 2, device)

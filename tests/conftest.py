@@ -1,9 +1,9 @@
 """Devices, tiers and caches of the tests. Without an OpenCL device, tests that need one fail.
 
 The option ``--tier`` selects the tests. ``fast`` runs all tests without the mark ``slow`` on the best device, and a
-smoke set on every other device: one test for each file, kernel variant and precision. Of a kernel test with three
-parameters or more it runs an all-pairs design. ``full`` runs all tests on every device. ``nightly`` is ``full`` with
-more hypothesis examples.
+smoke set on every other device: one test for each file. Of kernel tests with several parameters it runs a covering
+design, and of hypothesis tests fewer examples, see `tiers`. ``full`` runs all tests on every device. ``nightly`` is
+``full`` with more hypothesis examples.
 """
 
 from __future__ import annotations

@@ -337,7 +337,8 @@ class _Job:
             coarse_registration=coarse_registration,
             device=self.device,
             seconds=self.clock.seconds,
-            warnings=self.artwork.warnings,
+            warnings=(*self.artwork.warnings, *solution.warnings),
+            scale_error=solution.scale_error,
         )
 
 

@@ -28,6 +28,7 @@ from gpuvision.formats.camera_file import write_lens
 from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
+from gpuvision.matching.board.edge_measurement import BoardMeasurer, MeasurementLimits
 from gpuvision.matching.board.located_board import LocatedBoard
 from gpuvision.workflows.locating_board import _reason_of_ambiguity, locate_board
 from gpuvision.workflows.locating_robot import floor_points
@@ -113,6 +114,44 @@ def test_a_camera_is_located_where_it_is(artwork: Artwork, turned: float, device
     assert np.all(located.sigmas[:2] < 0.05 * PIXEL)
     assert located.rulers.used.sum() >= 0.9 * located.rulers.in_image.sum()
     assert located.noise == pytest.approx(NOISE, rel=0.1)
+
+
+@pytest.mark.parametrize(("wrong", "is_refused"), [(1.005, True), (0.9978, False), (0.999, False), (1.001, False)])
+def test_a_wrong_scale_is_said(artwork: Artwork, wrong: float, is_refused: bool) -> None:
+    """More edges lie on one side of the placement point: without the test 0.1 % moves the pose by 5 sigmas."""
+    pose = (BOARD_MIDDLE[0] - 1.5e-3, BOARD_MIDDLE[1] + 1e-3, 1e-3)
+    located = locate_board(camera_image(artwork, pose), artwork, scale=wrong * PIXEL, initial_pose=(*pose[:2], 0.0))
+    assert abs(located.scale_error.value - (wrong - 1)) < SIGMAS * located.scale_error.sigma < 0.0003
+    assert bool(located.reason) == is_refused
+    message = located.reason if is_refused else located.warnings[0]
+    proposed = float(re.findall(r"is the scale ([0-9.]+) um, not", message)[0])
+    assert proposed == pytest.approx(1e6 * PIXEL, rel=SIGMAS * located.scale_error.sigma)
+    if not is_refused:
+        assert np.abs(errors_in_sigmas(located, pose)).max() < SIGMAS
+
+
+def test_a_wrong_scale_beyond_the_tolerance_of_boards_is_refused(artwork: Artwork, device: Device) -> None:
+    pose, wrong = (BOARD_MIDDLE[0] - 1.5e-3, BOARD_MIDDLE[1] + 1e-3, 1e-3), 0.999 * PIXEL
+    image = camera_image(artwork, pose)
+    located = locate_board(image, artwork, scale=wrong, initial_pose=(*pose[:2], 0.0), device=device)
+    view = BoardView(scale=wrong, shape=SHAPE, pose=(*pose[:2], 0.0))
+    how: tuple[Any, ...] = (image, located.features, located.noise, located.threshold, 1.0, 10e-6, device)
+    accepted, refused = (
+        BoardMeasurer(*how, MeasurementLimits(max_board_scale=each)).measure(view, "bright") for each in (2e-3, 5e-4)
+    )
+    assert accepted.reason == ""
+    assert re.match(
+        r"a wrong scale moves the pose by [4-7]\.\d standard deviations: the board is -0\.1", refused.reason
+    )
+
+
+def test_the_right_scale_has_no_warning(artwork: Artwork) -> None:
+    pose = (BOARD_MIDDLE[0] - 1.5e-3, BOARD_MIDDLE[1] + 1e-3, 1e-3)
+    right = locate_board(camera_image(artwork, pose), artwork, scale=PIXEL, initial_pose=(*pose[:2], 0.0))
+    assert right.reason == ""
+    assert right.warnings == ()
+    assert abs(right.scale_error.value) < SIGMAS * right.scale_error.sigma
+    assert right.report()["scale_error"] == right.scale_error._asdict()
 
 
 def test_the_placement_point_is_where_it_is_seen(artwork: Artwork) -> None:
@@ -245,8 +284,8 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> L
 
 
 POSE_KEYS = {
-    "gpuvision", "status", "reason", "side", "pose", "sigmas", "covariance", "placement", "predicted_covariance",
-    "etch_bias", "residual_scale", "condition", "scale", "copper", "noise", "threshold", "coarse_registration",
+    "gpuvision", "status", "reason", "warnings", "side", "pose", "sigmas", "covariance", "placement", "predicted_covariance",
+    "etch_bias", "residual_scale", "condition", "scale", "scale_error", "copper", "noise", "threshold", "coarse_registration",
     "counts", "rulers", "fiducials", "device", "seconds",
 }  # fmt: skip
 COUNT_KEYS = {"in_image", "found", "used", "fiducials_in_image", "fiducials_found", "fiducials_used"}

@@ -23,7 +23,7 @@ from gpuvision.matching.board.fiducial_detection import MIN_WEIGHT, FoundFiducia
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.fiducials import search_distance
 from gpuvision.matching.features.ruler import MAX_LENGTH, RulerEdges, best_smoothing
-from gpuvision.matching.pose.pose import BoardPose, SolvePose, line_rows
+from gpuvision.matching.pose.pose import BoardPose, SolvePose, Transform, line_rows
 from gpuvision.status import Status
 
 Copper = Literal["auto", "bright", "dark"]
@@ -59,6 +59,11 @@ class MeasurementLimits:
     range_factor, min_angle
         A pose of the first pass is refused beyond this multiple of the expected search range (rulers find no edge
         farther away), with at least this angle [rad] (chosen).
+    scale_significance
+        Error of the scale that is significant [standard deviations] (4: one false alarm in 16 000 for normal errors).
+    max_board_scale, max_scale_effect
+        A pose is refused if the error of the scale is larger than the first number (chosen: laminate shrinks by up to
+        0.1 %) and moves the pose by more than the second one [standard deviations] (chosen).
     """
 
     second_range_px: float = 4.0
@@ -69,6 +74,9 @@ class MeasurementLimits:
     fiducial_slack_px: float = 1.0
     range_factor: float = 2.0
     min_angle: float = 5e-3
+    scale_significance: float = 4.0
+    max_board_scale: float = 2e-3
+    max_scale_effect: float = 3.0
 
 
 class RulerMeasurements(NamedTuple):
@@ -117,8 +125,18 @@ class RulerMeasurements(NamedTuple):
         return self.weight > MIN_WEIGHT
 
 
+class ScaleError(NamedTuple):
+    """Error of the scale by which the board is larger in the image than the artwork, less 1, and its sigma."""
+
+    value: float
+    sigma: float
+
+
 class PoseSolution(NamedTuple):
-    """Result of one pass: pose, covariance at the placement point, and the reason of a refusal or ``""``."""
+    """Result of one pass: pose, covariance at the placement point, and the reason of a refusal or ``""``.
+
+    ``scale_error`` has NaN where the features do not determine it, and in the first pass.
+    """
 
     pose: Float64
     covariance: Float64
@@ -128,6 +146,8 @@ class PoseSolution(NamedTuple):
     rulers: RulerMeasurements
     fiducials: FoundFiducials
     reason: str
+    scale_error: ScaleError = ScaleError(math.nan, math.nan)
+    warnings: tuple[str, ...] = ()
 
 
 class BoardMeasurement(NamedTuple):
@@ -203,9 +223,10 @@ class BoardMeasurer:
         search_range = (limits.range_factor * imaging.shift, limits.range_factor * max(imaging.angle, limits.min_angle))
         first = self._measure_once(view, copper, reach, search_range)
         if first.reason:
-            return BoardMeasurement(view, view, first)
+            return BoardMeasurement(view, view, self._test_scale(first, view.scale))
         second_view = move_view(view, first.pose)
         second = self._measure_once(second_view, copper, np.minimum(reach, self._second_length_px(view.scale)))
+        second = self._test_scale(second, view.scale)
         return BoardMeasurement(
             second_view if second.reason else move_view(second_view, second.pose), second_view, second
         )
@@ -306,22 +327,8 @@ class BoardMeasurer:
         search_range: tuple[float, float] | None,
     ) -> PoseSolution:
         """Solve the pose, and the etch bias where single edges were measured."""
-        placement = self.features.placement
-        is_single = self.features.spacing == 0
-        has_etch_bias = bool((is_single & rulers.found).any()) and self.etch_bias_sigma > 0
-        measured = rulers.point + rulers.normal * (rulers.position_px * scale)[:, None]
-        etch_factor = np.where(is_single, 1.0, 0.0)
-        edges = line_rows(rulers.normal, rulers.point - placement, measured - placement, rulers.sigma, etch_factor)
-        rows = np.concatenate([edges, fiducials.rows(placement)])
-        fit = SolvePose(
-            scale=None,
-            min_scale=1.0,
-            etch_bias_sigma=self.etch_bias_sigma if has_etch_bias else None,
-            min_inlier_fraction=self.limits.min_share,
-            search_range=search_range,
-            max_trials=_TRIALS,
-            precision="double" if self.device.has_double else "single",
-        )(np.ascontiguousarray(rows if has_etch_bias else rows[:, :-1]), device=self.device)
+        has_etch_bias = self._has_etch_bias(rulers)
+        fit = self._fit(rulers, fiducials, scale, search_range, "rigid")
         count = len(rulers.sigma)
         weights, residuals = (np.asarray(to_numpy(each), np.float64) for each in (fit.weights, fit.residuals))
         rulers = rulers._replace(weight=np.nan_to_num(weights[:count]), residual=residuals[:count])
@@ -331,7 +338,7 @@ class BoardMeasurer:
             return _refuse(rulers, fiducials, _reason_of(fit, found, self.limits))
         residual_scale = float(to_numpy(fit.residual_scale))
         solution = PoseSolution(
-            pose=_about_origin(np.asarray(to_numpy(fit.pose), np.float64), placement),
+            pose=_about_origin(np.asarray(to_numpy(fit.pose), np.float64), self.features.placement),
             # The residuals of few edges may be small by chance: the covariance is not scaled down by them.
             covariance=np.asarray(to_numpy(fit.covariance), np.float64) / min(residual_scale, 1.0) ** 2,
             etch_bias=float(to_numpy(fit.etch_bias)) if has_etch_bias else math.nan,
@@ -342,6 +349,76 @@ class BoardMeasurer:
             reason="",
         )
         return self._check(solution, float(to_numpy(fit.scale)), scale)
+
+    def _has_etch_bias(self, rulers: RulerMeasurements) -> bool:
+        return bool(((self.features.spacing == 0) & rulers.found).any()) and self.etch_bias_sigma > 0
+
+    def _fit(
+        self,
+        rulers: RulerMeasurements,
+        fiducials: FoundFiducials,
+        scale: float,
+        search_range: tuple[float, float] | None,
+        transform: Transform,
+    ) -> BoardPose:
+        """Return the robust pose of the features, about the placement point."""
+        placement = self.features.placement
+        has_etch_bias = self._has_etch_bias(rulers)
+        measured = rulers.point + rulers.normal * (rulers.position_px * scale)[:, None]
+        etch_factor = np.where(self.features.spacing == 0, 1.0, 0.0)
+        edges = line_rows(rulers.normal, rulers.point - placement, measured - placement, rulers.sigma, etch_factor)
+        rows = np.concatenate([edges, fiducials.rows(placement)])
+        return SolvePose(
+            transform=transform,
+            scale=None,
+            min_scale=1.0,
+            etch_bias_sigma=self.etch_bias_sigma if has_etch_bias else None,
+            min_inlier_fraction=self.limits.min_share,
+            search_range=search_range,
+            max_trials=_TRIALS,
+            precision="double" if self.device.has_double else "single",
+        )(np.ascontiguousarray(rows if has_etch_bias else rows[:, :-1]), device=self.device)
+
+    def _test_scale(self, solution: PoseSolution, scale: float) -> PoseSolution:
+        """Test the given scale: solve again with the scale as one more unknown (nested model).
+
+        A wrong scale moves the pose where the features do not surround the placement point. Where the error of the
+        scale is significant, warn, and add that motion to the covariance; refuse where it is also larger than the
+        tolerance of boards and moves the pose by more than its standard deviations allow. Where large residuals refuse
+        the pose already, name the scale.
+        """
+        if not np.all(np.isfinite(solution.covariance)):
+            return solution
+        fit = self._fit(solution.rulers, solution.fiducials, scale, None, "similarity")
+        if int(to_numpy(fit.status)):
+            return solution
+        limits = self.limits
+        covariance = (
+            np.asarray(to_numpy(fit.covariance), np.float64) / min(float(to_numpy(fit.residual_scale)), 1.0) ** 2
+        )
+        error = ScaleError(float(to_numpy(fit.deformation)[..., 0]), math.sqrt(covariance[3, 3]))
+        solution = solution._replace(scale_error=error)
+        if not abs(error.value) > limits.scale_significance * error.sigma:
+            return solution
+        pose = _about_origin(np.asarray(to_numpy(fit.pose), np.float64), self.features.placement)
+        moved = self._placement_motion(pose) - self._placement_motion(solution.pose)
+        effect = math.sqrt(float(moved @ np.linalg.solve(solution.covariance, moved)))
+        wrong = (
+            f"the board is {100 * error.value:+.3f} % (standard deviation {100 * error.sigma:.3f} %) larger in the "
+            f"image than in the artwork; is the scale {1e6 * scale / (1 + error.value):.5g} um, not "
+            f"{1e6 * scale:.5g} um?"
+        )
+        is_wrong = abs(error.value) > limits.max_board_scale and effect > limits.max_scale_effect
+        if solution.reason or is_wrong:
+            before = solution.reason or f"a wrong scale moves the pose by {effect:.1f} standard deviations"
+            return solution._replace(reason=f"{before}: {wrong}")
+        return solution._replace(warnings=(wrong,), covariance=solution.covariance + np.outer(moved, moved))
+
+    def _placement_motion(self, pose: Float64) -> Float64:
+        """Return the motion of the placement point x, y [m] and the turn [rad] of a pose."""
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        x, y = self.features.placement
+        return np.array([pose[0] + c * x - s * y - x, pose[1] + s * x + c * y - y, pose[2]])
 
     def _check(self, solution: PoseSolution, residual_scale: float, scale: float) -> PoseSolution:
         """Refuse a pose with which too few rulers and fiducials agree, or agree too badly."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device
-from gpuvision.matching.board.edge_measurement import Copper, RulerMeasurements
+from gpuvision.matching.board.edge_measurement import Copper, RulerMeasurements, ScaleError
 from gpuvision.matching.board.fiducial_detection import FoundFiducials
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.pose.registration import Registration
@@ -56,12 +56,15 @@ class LocatedBoard:
         Why the pose is refused; ``""`` where it is accepted.
     coarse_registration
         Result of the coarse registration; None if it was not needed.
+    scale_error
+        Error of the scale with its standard deviation: size of the board in the image over its size in the artwork,
+        less 1; NaN where the features do not determine it.
     device
         Device of the computation.
     seconds
         Duration of each step, by name [s].
     warnings
-        What may be wrong although a pose was found: layers of the board that are missing.
+        What may be wrong although a pose was found: layers of the board that are missing, a wrong scale.
     """
 
     view: BoardView
@@ -80,6 +83,7 @@ class LocatedBoard:
     threshold: float
     reason: str
     coarse_registration: Registration | None
+    scale_error: ScaleError
     device: Device
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
@@ -134,6 +138,7 @@ class LocatedBoard:
             "residual_scale": _plain(self.residual_scale),
             "condition": _plain(self.condition),
             "scale": self.view.scale,
+            "scale_error": {name: _plain(each) for name, each in self.scale_error._asdict().items()},
             "copper": self.copper,
             "noise": self.noise,
             "threshold": self.threshold,

@@ -284,9 +284,9 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> L
 
 
 POSE_KEYS = {
-    "gpuvision", "status", "reason", "warnings", "side", "pose", "sigmas", "covariance", "placement", "predicted_covariance",
-    "etch_bias", "residual_scale", "condition", "scale", "scale_error", "copper", "noise", "threshold", "coarse_registration",
-    "counts", "rulers", "fiducials", "device", "seconds",
+    "gpuvision", "status", "reason", "warnings", "side", "pose", "sigmas", "covariance", "placement",
+    "predicted_covariance", "etch_bias", "residual_scale", "condition", "scale", "scale_error", "copper", "noise",
+    "threshold", "coarse_registration", "counts", "rulers", "fiducials", "device", "seconds",
 }  # fmt: skip
 COUNT_KEYS = {"in_image", "found", "used", "fiducials_in_image", "fiducials_found", "fiducials_used"}
 RULER_KEYS = {"point", "image_px", "found", "weight", "residual", "sigma", "status"}

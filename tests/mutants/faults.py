@@ -16,7 +16,7 @@ from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator, operator_names
 
 ROOT = Path(__file__).resolve().parents[2]
-PLANTED = Path(__file__).with_name("planted.toml")
+PLANTED, EQUIVALENT = (Path(__file__).with_name(f"{name}.toml") for name in ("planted", "equivalent"))
 # Operators of Cosmic Ray that leave a plausible program: no shifts or bit operations of floats, no identity of numbers.
 _PLAUSIBLE = re.compile(
     r"ReplaceBinaryOperator_(Add|Sub|Mul|Div|FloorDiv|Mod|Pow)_(Add|Sub|Mul|Div)$"
@@ -94,18 +94,26 @@ def planted_faults() -> list[Fault]:
 
 
 def draw_faults(rng: random.Random, code: int, kernels: int) -> Iterator[Fault]:
-    """Yield faults in Python files and in kernels; a file is drawn by its size, a place within it at random."""
+    """Yield faults in Python files and in kernels; a file is drawn by its size, a place within it at random.
+
+    Faults in the list of equivalent faults are omitted.
+    """
     python = [path for folder in ("gpuvision", "host") for path in sorted((ROOT / folder).rglob("*.py"))]
     opencl = [path for path in sorted((ROOT / "kernels").rglob("*")) if path.suffix in (".cl", ".h")]
     drawn = set()
+    equivalent = tomllib.loads(EQUIVALENT.read_text())["fault"]
     for files, draw, count in ((python, _code_fault, code), (opencl, _kernel_fault, kernels)):
         sizes = [path.stat().st_size for path in files]
         enough = len(drawn) + count
         while len(drawn) < enough:
             fault = draw(rng.choices(files, sizes)[0], rng)
-            if fault is not None and fault not in drawn:
-                drawn.add(fault)
-                yield fault
+            if fault is None or fault in drawn:
+                continue
+            row = fault.row((ROOT / fault.file).read_text())
+            if any(all(row[key] == each[key] for key in ("file", "before", "after")) for each in equivalent):
+                continue
+            drawn.add(fault)
+            yield fault
 
 
 def _code_fault(path: Path, rng: random.Random) -> Fault | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from gpuvision.matching.field.distance_map import Arc, DistanceMap, Field
 from gpuvision.matching.field.field_pose import (
     FieldPoseRefinement,
     FieldPoseSearch,
+    _same,
     find_pose_candidates,
     symmetric_twin,
 )
@@ -180,6 +182,22 @@ def test_points_twice_are_the_same_pose(device: Device, rng: np.random.Generator
     )
     other = twice.pose if np.abs(pose_errors(twice.pose, once.pose)).sum() < 1.0 else symmetric_twin(twice.pose)
     np.testing.assert_allclose(pose_errors(other, once.pose), 0.0, atol=3e-5)
+
+
+@pytest.mark.parametrize(
+    ("pose", "other", "same"),
+    [
+        ((1.0, 2.0, 0.5), (1.0, 2.0, 0.5), True),
+        ((1.0, 2.0, 0.5), (1.02, 1.98, 0.51), True),  # 28 mm, 10 mrad
+        ((1.0, 2.0, 0.5), (1.03, 1.99, 0.5), False),  # 32 mm
+        ((1.0, 2.0, 0.5), (1.0, 2.0, 0.525), False),
+        ((1.0, 2.0, math.pi - 0.005), (1.0, 2.0, 0.005 - math.pi), True),
+        ((1.0, 2.0, math.pi), (1.0, 2.0, 0.0), False),
+    ],
+)
+def test_poses_within_30_mm_and_20_mrad_are_the_same(pose: Any, other: Any, same: bool) -> None:
+    assert _same(np.array(pose), np.array(other)) is same
+    assert _same(np.array(other), np.array(pose)) is same
 
 
 def test_a_mirrored_view_is_a_mirrored_pose(device: Device, rng: np.random.Generator) -> None:

@@ -186,6 +186,7 @@ def test_one_line_tells_a_part(device: Device, rng: np.random.Generator) -> None
     assert "fix a part of it only" in located.summary()
 
 
+@pytest.mark.slow
 def test_random_points_are_refused(rng: np.random.Generator) -> None:
     """Points from another camera have no scan lines: only the test against chance applies."""
     field = read_field("robocup_msl")

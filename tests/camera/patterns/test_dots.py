@@ -153,6 +153,7 @@ def test_blobs_between_dots_are_left_out(rng: np.random.Generator) -> None:
     assert np.quantile(np.abs(errors), 0.95) < 0.1
 
 
+@pytest.mark.slow
 def test_twelve_thousand_dots(rng: np.random.Generator) -> None:
     """Tilted view through a lens that moves the corners by 10 % of the image; 5 % of the dots are missing."""
     camera = view((1400, 1400), 110, 110, 12.5, turn=5.0, tilt=15.0, barrel=140.0)

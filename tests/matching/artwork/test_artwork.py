@@ -364,7 +364,7 @@ def test_layers_are_where_gerbonara_says(data: Path, name: str) -> None:
     [
         pytest.param("fritzing", 364, 482, (96.96, 97.94), marks=pytest.mark.slow),
         ("upverter", 63, 63, (39.5, 60.025)),  # its holes are in two files
-        ("kicad-x2-tests/x2ap", 236, 80, (80, 50)),
+        pytest.param("kicad-x2-tests/x2ap", 236, 80, (80, 50), marks=pytest.mark.slow),
     ],
 )
 def test_reads_the_boards_of_three_tools(

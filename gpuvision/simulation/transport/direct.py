@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,8 +20,24 @@ from gpuvision.simulation.sensors.readings import UNIFORM, UNIFORM_UNOCCLUDED, U
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.simulation.sensors.view_rays import check_materials
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
-from gpuvision.simulation.transport.line_parts import LensVisibility, LineProjector, Parts, ProjectedLines, points_on
+from gpuvision.simulation.transport.line_parts import (
+    LensVisibility,
+    LineProjector,
+    Parts,
+    ProjectedLines,
+    concatenate_parts,
+    points_on,
+)
 from gpuvision.simulation.transport.sheet_cut import SheetIndex, concatenated_ranges
+from gpuvision.simulation.transport.slab_edges import (
+    LineScale,
+    Pieces,
+    Runs,
+    SlantedLimits,
+    find_runs,
+    intervals_to_divide,
+    slanted_limits,
+)
 from gpuvision.simulation.transport.specular_highlights import find_specular_highlights
 from gpuvision.status import Status
 
@@ -31,6 +48,8 @@ ReflectedPower = Callable[[LitLine, Integers, Float64, Float64], dict[str, Float
 
 # Nodes of the two-point Gauss-Legendre rule on [0, 1].
 _NODES = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
+# Least distance of an outer slab from the last division [sigmas]; chosen.
+_OUTER_GAP = 0.05
 # Sheets that are computed together: bounds the memory.
 _SHEETS = 36
 
@@ -54,6 +73,16 @@ class DirectLimits:
         Largest number of edges that divide a sheet, the longest ones; bounds the work.
     edge_gap
         Least distance between two divisions [sigmas].
+    max_divisions, max_levels
+        Largest number of places per sheet at which it is divided where runs of the lit or visible line begin or end,
+        and of levels that are computed to find them; they bound the work on rough surfaces, where errors of single
+        edges average out. Chosen: an edge takes 8 levels.
+    division_width
+        Distance of two levels at which the search for such a place ends [sigmas]. Derived: half of it moves a reading
+        of half a beam by 0.0016 sigma.
+    outer_slab
+        Where an end of a run moves within the sheet, the light beyond this place is a slab of its own [sigmas];
+        derived: 5e-4 of the light lies beyond.
     same_point
         Distance below which two lit points are one, as part of the largest coordinate; rounding with a wide margin.
     """
@@ -64,6 +93,10 @@ class DirectLimits:
     edge_sigmas: float = 4.0
     max_edges: int = 16
     edge_gap: float = 1e-4
+    max_divisions: int = 4
+    max_levels: int = 32
+    division_width: float = 0.005
+    outer_slab: float = 3.5
     same_point: float = 1e-9
 
 
@@ -100,6 +133,16 @@ class Slabs(NamedTuple):
         reach = math.sqrt(2.0 * math.log(count)) if count > 2 else 0.0
         return cls.from_cuts(np.linspace(-reach, reach, count - 1))
 
+    def with_outer(self, place: float) -> Slabs:
+        """Return the slabs with the light beyond +-``place`` [sigmas] as two more; the levels of the others stay."""
+        cuts = self.high[:-1]
+        first = min(-place, float(cuts[0]) - _OUTER_GAP)
+        last = max(place, float(cuts[-1]) + _OUTER_GAP)
+        outer = Slabs.from_cuts([first, last])
+        low, high = np.maximum(self.low, first), np.minimum(self.high, last)
+        inner = Slabs(low, high, _normal_share(low, high), self.middle)
+        return Slabs(*(np.concatenate([a[:1], b, a[2:]]) for a, b in zip(outer, inner, strict=True)))
+
 
 class _LitSheets(NamedTuple):
     """Lit segments of several sheets, moved to the sensor at transport 0; index of the sheet, and the motion [m]."""
@@ -107,6 +150,11 @@ class _LitSheets(NamedTuple):
     line: LitLine
     sheet: Integers
     moved: Float64
+
+    def select(self, kept: npt.NDArray[np.bool_]) -> _LitSheets:
+        """Return the segments of the sheets that ``kept`` (sheets,) marks, with new numbers of the sheets."""
+        which = kept[self.sheet]
+        return _LitSheets(self.line.select(which), (np.cumsum(kept) - 1)[self.sheet[which]], self.moved[which])
 
 
 class _SlabImage(NamedTuple):
@@ -119,7 +167,12 @@ class _SlabImage(NamedTuple):
     tail_sigmas: float
 
     def deposit(
-        self, uv: Float64, spread: Float64, slab: Integers, lights: Mapping[str, Float64]
+        self,
+        uv: Float64,
+        spread: Float64,
+        slab: Integers,
+        lights: Mapping[str, Float64],
+        limits: tuple[Float64, Float64] | None = None,
     ) -> dict[str, Exposure]:
         """Return the exposures by points of the slabs' light.
 
@@ -132,7 +185,9 @@ class _SlabImage(NamedTuple):
         slab
             (n,): index of the slab.
         lights
-            Power (n,) [W] by name.
+            Power (n,) [W] by name, if all of the slab arrives.
+        limits
+            Lower and upper limit of the light across the sheet (n,), (n,) [sigmas]. Default: the limits of the slab.
         """
         view, slabs = self.view, self.slabs
         sample = view.sample_of(uv[:, 1])
@@ -140,7 +195,8 @@ class _SlabImage(NamedTuple):
         sample, u, slab = sample[on], uv[on, 0], slab[on]
         least = 1e-9 * float(np.diff(view.u_edges).min())
         spread = np.where(np.abs(spread[on]) < least, least, spread[on])
-        low, high, middle = slabs.low[slab], slabs.high[slab], slabs.middle[slab]
+        low, high = (slabs.low[slab], slabs.high[slab]) if limits is None else (limits[0][on], limits[1][on])
+        middle = slabs.middle[slab]
         reach = u + spread * (np.clip([low, high], -self.tail_sigmas, self.tail_sigmas) - middle)
         first = np.maximum(np.searchsorted(view.u_edges, reach.min(axis=0), side="right") - 1, 0)
         last = np.minimum(np.searchsorted(view.u_edges, reach.max(axis=0), side="left"), view.bins)
@@ -177,8 +233,9 @@ class DirectLight:
         Sheet of light, on the sensor's transport.
     sub_sheets
         Number of slabs that a thick sheet is divided into, 1 or more; a thick sheet is also divided at edges that lie
-        in it, where the lit surface changes at once. Or the ascending positions, in sigmas, of all divisions. A thin
-        sheet has one slab. Default 9.
+        in it, where the lit surface changes at once, and with 3 slabs or more where edges of shadows and surfaces cross
+        it. Or the ascending positions, in sigmas, of all divisions: there are then no others. A thin sheet has one
+        slab. Default 9.
     device
         Device on which visibility is computed; None: `Device.best`.
     limits
@@ -195,8 +252,19 @@ class DirectLight:
     part of a line that falls into one bin, the two-point Gauss-Legendre rule is used.
 
     The light of a slab is placed at the slab's mean and spread over the bins as a plane surface spreads it. So planes
-    that end at edges along the sheet are exact for any number of slabs. Where the surface, its material or its shadow
-    change within a slab, the error is inversely proportional to the number of slabs.
+    that end at edges along the sheet are exact for any number of slabs.
+
+    Where a lit or visible stretch of the line ends within the sheet, light is cut off along the edge, with 3 slabs or
+    more. The place of an edge nearly parallel to the sheet is found by bisection to 0.0025 sigma, and the sheet is
+    divided there. An end that moves along the line by more than that is followed from level to level along straight
+    lines, which is exact on planes. Measured for a sheet of 60 um sigma cut by a half plane: 0.2 um of range (12 um
+    without the cuts). Not resolved: gaps narrower than the distance of the levels (half a sigma), edges that change
+    their direction between two levels, and sheets cut by more than `DirectLimits.max_divisions` edges. There, and where
+    the surface turns within a slab, the error is inversely proportional to the number of slabs. Explicit divisions, and
+    1 or 2 slabs, have no cuts.
+
+    Cost, as processor time of the direct light: 1.1 of that without cuts where no edge lies in the sheet, 1.6 for a box
+    on a plate (1.0 and 1.13 of the time of all light; PoCL).
 
     Light from a mirror into the lens: the lens takes the rays that meet its aperture; a slab's light follows the ray of
     its mean. Triangles are plane mirrors.
@@ -255,24 +323,27 @@ class DirectLight:
         }
 
     def _expose_profiles(self, places: Float64, causes: bool) -> dict[str, Exposure]:
-        by_profile = [self.slabs(float(L)) for L in places]
-        profile = np.repeat(np.arange(len(places)), [len(each.share) for each in by_profile])
-        columns = zip(*by_profile, strict=True) if by_profile else ([], [], [], [])
-        slabs = Slabs(*(np.concatenate([*each, np.zeros(0)]) for each in columns))
-        lit = self._illuminate(places[profile] + self.sheet.sigma * slabs.middle, places[profile])
+        slabs, profile, lit, parts, changes = self._divided_sheets(places, causes)
         lit = lit._replace(line=lit.line._replace(power=lit.line.power * slabs.share[lit.sheet]))
         image = _SlabImage(self.view, slabs, profile, len(places), self.limits.tail_sigmas)
-        found = self._expose(
-            lit, image, self._visible_parts(lit, with_hidden=causes), self._reflected_power, causes=causes
-        )
+        found = self._expose(lit, image, parts, self._reflected_power, causes=causes)
+        if changes:
+            found |= self._expose_slanted(lit, image, parts, causes)
         if any(each.mirror > 0.0 for each in self.materials):
             found["specular"] += self._expose_highlights(lit, image)
         return found
 
     def _expose(
-        self, lit: _LitSheets, image: _SlabImage, parts: Parts, reflect: ReflectedPower, *, causes: bool = False
+        self,
+        lit: _LitSheets,
+        image: _SlabImage,
+        parts: Parts,
+        reflect: ReflectedPower,
+        *,
+        causes: bool = False,
+        limits: tuple[Float64, Float64] | None = None,
     ) -> dict[str, Exposure]:
-        """Return the exposures by parts of segments."""
+        """Return the exposures by parts of segments; limits across the sheet (m, 2) at the ends of each segment."""
         line, images = lit.line, self._projector.project(lit.line.ends, 0.0)
         parts = self._split(images.clip_to_view(parts), images, line)
         # Both nodes of all parts.
@@ -288,7 +359,11 @@ class DirectLight:
         spread = np.zeros(len(share))
         if self.sheet.sigma > 0.0:
             spread = images.u_rates(segment, share, uv, self._shift_per_sigma(line.normals[segment], points))
-        return image.deposit(uv, spread, lit.sheet[segment], powers)
+        at_nodes = None
+        if limits is not None:
+            low, high = (_between(each[segment], share) for each in limits)
+            at_nodes = (low, np.maximum(low, high))
+        return image.deposit(uv, spread, lit.sheet[segment], powers, at_nodes)
 
     def _expose_highlights(self, lit: _LitSheets, image: _SlabImage) -> Exposure:
         """Return the exposure by light that mirrors reflect straight into the lens."""
@@ -317,6 +392,179 @@ class DirectLight:
         far = np.abs(cuts[:, None] - steps).min(axis=1) > limits.edge_gap
         steps = steps[np.diff(steps, prepend=-np.inf) > limits.edge_gap]
         return Slabs.from_cuts(np.sort(np.append(cuts[far], steps)))
+
+    # ---- edges within a thick sheet ----------------------------------------------------------------------------
+
+    @property
+    def _divides_at_edges(self) -> bool:
+        return self.sheet.sigma > 0.0 and isinstance(self.sub_sheets, int) and self.sub_sheets > 2
+
+    @functools.cached_property
+    def _scale(self) -> LineScale:
+        """Lengths on the line: the view's ends are infinite where a ray of it does not meet the sheet."""
+        points = self.view.points_in_sheet(*np.meshgrid(self.view.u_edges, self.view.v_edges, indexing="ij"))
+        x = self.sheet.ray_coordinates(self.view.sheet_coordinates(points))
+        width = float(np.nanmedian(np.abs(np.diff(x, axis=1))))
+        if not np.isfinite(x).all():
+            return LineScale(self.sheet.sigma, width, -math.inf, math.inf)
+        margin = self.limits.tail_sigmas * self.sheet.sigma
+        return LineScale(self.sheet.sigma, width, float(x.min()) - margin, float(x.max()) + margin)
+
+    def _across_transport(self, points: Float64) -> Float64:
+        """Return the coordinates (G, H) (..., 2) [m] of points (..., 3) at any transport."""
+        move = self.sheet.transport
+        axes = np.linalg.inv(np.array([move.g_axis, move.h_axis, move.direction]))
+        return np.asarray((points - np.array(move.origin)) @ axes[:, :2])
+
+    def _light_sheets(self, places: Float64, profile: Integers, t: Float64, causes: bool) -> tuple[_LitSheets, Parts]:
+        """Return the lit segments at places across the sheets of profiles [sigmas], and their parts in view."""
+        lit = self._illuminate(places[profile] + self.sheet.sigma * t, places[profile])
+        return lit, self._visible_parts(lit, with_hidden=causes)
+
+    def _divided_sheets(self, places: Float64, causes: bool) -> tuple[Slabs, Integers, _LitSheets, Parts, bool]:
+        """Return the slabs of all profiles, the profile of each, their lit segments, the segments' parts, and changes.
+
+        The last value says whether a line changes from level to level. Sheets are divided where the lit or visible line
+        changes at once. Two more levels at either side, beyond the outermost slabs, find edges there. Without such an
+        edge the levels of the slabs are computed only once.
+        """
+        by_profile = [self.slabs(float(L)) for L in places]
+        if not (self._divides_at_edges and by_profile):
+            slabs, profile = _concatenated(by_profile)
+            return slabs, profile, *self._light_sheets(places, profile, slabs.middle, causes), False
+        extended = [each.with_outer(self.limits.outer_slab) for each in by_profile]
+        slabs, profile = _concatenated(extended)
+        lit, parts = self._light_sheets(places, profile, slabs.middle, causes)
+        levels = _Levels(slabs.middle, profile, self._lines(lit, parts, causes))
+        moving, jumps = self._changes(places, levels, by_profile, causes)
+        if not any(len(each) for each in jumps):
+            # The levels of the slabs are known; where nothing moves, the outer slabs are not needed.
+            outer = np.concatenate([np.arange(len(each.share)) % (len(each.share) - 1) == 0 for each in extended])
+            kept = ~outer | moving[profile]
+            used = [large if moves else own for large, own, moves in zip(extended, by_profile, moving, strict=True)]
+            segment = np.cumsum(kept[lit.sheet]) - 1
+            parts = parts.select(kept[lit.sheet[parts.segment]])
+            parts = parts._replace(segment=segment[parts.segment])
+            return *_concatenated(used), lit.select(kept), parts, bool(moving.any())
+        divided = []
+        for slabs, found in zip(extended, jumps, strict=True):
+            cuts = slabs.high[:-1]
+            far = np.abs(cuts[:, None] - found).min(axis=1, initial=np.inf) > self.limits.edge_gap
+            divided.append(Slabs.from_cuts(np.sort(np.append(cuts[far], found))))
+        slabs, profile = _concatenated(divided)
+        return slabs, profile, *self._light_sheets(places, profile, slabs.middle, causes), True
+
+    def _changes(
+        self, places: Float64, levels: _Levels, by_profile: list[Slabs], causes: bool
+    ) -> tuple[npt.NDArray[np.bool_], list[Float64]]:
+        """Return whether ends of runs move within each profile's sheet, and where runs begin or end at once [sigmas].
+
+        The search halves the distance between two levels whose runs differ.
+        """
+        limits, width = self.limits, self._scale.width
+        smallest = limits.division_width
+        # Edges that lie in the sheet: the slabs end there already.
+        known = [np.setdiff1d(each.high[:-1], self._slabs.high[:-1]) for each in by_profile]
+        moving, added = np.zeros(len(places), bool), np.zeros(len(places), np.int64)
+        while True:
+            runs = levels.runs(self._scale)
+            after = intervals_to_divide(runs, levels.place, levels.profile, smallest, limits.max_divisions, width)
+            for each in runs:
+                moving[levels.profile[each.moves]] = True
+            after = after[added[levels.profile[after]] < limits.max_levels]
+            if not len(after):
+                break
+            place, profile = [], []
+            for k in after:
+                low, high, of = levels.place[k], levels.place[k + 1], int(levels.profile[k])
+                beside = known[of][:, None] + 0.25 * smallest * np.array([-1.0, 1.0])
+                beside = beside[(beside > low) & (beside < high)]
+                at = np.unique(beside) if len(beside) else np.array([0.5 * (low + high)])
+                place.append(at)
+                profile.append(np.full(len(at), of))
+            new_place, new_profile = np.concatenate(place), np.concatenate(profile)
+            added += np.bincount(new_profile, minlength=len(places))
+            lines = self._lines(*self._light_sheets(places, new_profile, new_place, causes), causes)
+            levels = levels.joined(_Levels(new_place, new_profile, lines))
+        step = np.append(np.diff(levels.place), np.inf)
+        open_ = np.max([each.open_length for each in runs], axis=0) > 0.0
+        found = np.flatnonzero(open_ & (step > 0.0) & (step <= smallest))
+        at, in_profile = levels.place[found] + 0.5 * step[found], levels.profile[found]
+        jumps = []
+        for n, cuts in enumerate(known):
+            mine = at[in_profile == n]
+            jumps.append(mine[np.abs(mine[:, None] - cuts).min(axis=1, initial=np.inf) > smallest])
+        return moving, jumps
+
+    def _lines(self, lit: _LitSheets, parts: Parts, causes: bool) -> tuple[Pieces, ...]:
+        """Return the visible line at each level, and with ``causes`` the lit line."""
+        shown = self._pieces(lit, parts.select(parts.visible))
+        return (shown, self._pieces(lit, _whole(lit.line))) if causes else (shown,)
+
+    def _pieces(self, lit: _LitSheets, parts: Parts) -> Pieces:
+        """Return parts of segments as pieces of lines, in their order."""
+        ends = parts.ends(lit.line)
+        place = self._across_transport(ends)
+        x, height = self.sheet.ray_coordinates(place), place[..., 1]
+        backward = (x[:, 1] < x[:, 0])[:, None]
+        x, height = np.where(backward, x[:, ::-1], x), np.where(backward, height[:, ::-1], height)
+        shift = self._shift_per_sigma(lit.line.normals[parts.segment], ends.mean(axis=1))
+        rate = self._across_transport(ends[:, 0] + shift)[:, 1] - place[:, 0, 1]
+        kind = self._material(lit.line)[parts.segment].astype(np.int64)
+        return Pieces(lit.sheet[parts.segment], x, height, rate, kind)
+
+    def _expose_slanted(self, lit: _LitSheets, image: _SlabImage, parts: Parts, causes: bool) -> dict[str, Exposure]:
+        """Return the exposures that change because ends of runs move from slab to slab; empty if there are none."""
+        found: dict[str, Exposure] = {}
+        slabs, scale = image.slabs, self._scale
+        shown = parts.select(parts.visible)
+        lines = [(shown, ["direct", "specular", UNIFORM] if causes else ["direct", "specular"])]
+        if causes:
+            lines.append((_whole(lit.line), [UNOCCLUDED, UNIFORM_UNOCCLUDED]))
+        for mine, names in lines:
+            pieces = self._pieces(lit, mine)
+            runs = find_runs(pieces, slabs.middle, image.profile, scale)
+            slanted = slanted_limits(pieces, runs, slabs.middle, slabs.low, slabs.high, scale.width)
+            if not len(slanted.piece):
+                continue
+            lit_parts, limits, all_parts = self._with_limits(lit, mine, slanted, slabs)
+            exposed = self._expose(lit_parts, image, all_parts, self._reflected_power, causes=causes, limits=limits)
+            found |= {name: exposed[name] for name in names}
+        return found
+
+    def _with_limits(
+        self, lit: _LitSheets, parts: Parts, slanted: SlantedLimits, slabs: Slabs
+    ) -> tuple[_LitSheets, tuple[Float64, Float64], Parts]:
+        """Return the segments with additional ones for slanted parts, limits of all segments (m, 2), and the parts."""
+        line, of = lit.line, parts.segment[slanted.piece]
+        ends = parts.ends(line)[slanted.piece]
+        place = self._across_transport(ends)
+        x = self.sheet.ray_coordinates(place)
+        share = np.stack([slanted.start, slanted.end], axis=1)
+        low, high = slanted.low, slanted.high
+        backward = (x[:, 1] < x[:, 0])[:, None]
+        share = np.where(backward, 1.0 - share[:, ::-1], share)
+        low, high = (np.where(backward, each[:, ::-1], each) for each in (low, high))
+        if self.sheet.source is not None:
+            # From a fraction of x to a fraction of the segment, which are projectively related.
+            near, far = (self.sheet.source[1] - place[:, n, 1] for n in (0, 1))
+            share = near[:, None] * share / (near[:, None] * share + far[:, None] * (1.0 - share))
+        cut = np.stack([points_on(ends, share[:, n]) for n in (0, 1)], axis=1)
+        more = LitLine(cut, line.normals[of], line.triangle[of], line.power[of])
+        joined = LitLine(*(np.concatenate(each) for each in zip(line, more, strict=True)))
+        sheet = np.concatenate([lit.sheet, lit.sheet[of]])
+        all_limits = []
+        for own, given in ((slabs.low, low), (slabs.high, high)):
+            all_limits.append(np.concatenate([np.repeat(own[lit.sheet][:, None], 2, axis=1), given]))
+        rest = np.ones(len(parts.segment), bool)
+        rest[slanted.piece] = False
+        added = _whole(more)
+        added = added._replace(segment=added.segment + len(line.power))
+        return (
+            _LitSheets(joined, sheet, np.concatenate([lit.moved, lit.moved[of]])),
+            (all_limits[0], all_limits[1]),
+            concatenate_parts([parts.select(rest), added]),
+        )
 
     def truth(self, L: float) -> GroundTruth:
         """Return the true position of the sheet's middle at a transport L [m], at the middle of each sample.
@@ -420,6 +668,62 @@ class DirectLight:
         direction, light = np.array(self.sheet.transport.direction), self.sheet.direction_to_light(points)
         slope = (normal @ direction) / np.sum(normal * light, axis=1)
         return np.asarray(self.sheet.sigma * (direction - light * slope[:, None]))
+
+
+class _Levels(NamedTuple):
+    """Levels across the sheets of profiles, in order, with their lines.
+
+    Attributes
+    ----------
+    place
+        float64 (levels,): place across the sheet [sigmas].
+    profile
+        int64 (levels,): index of the profile.
+    lines
+        Pieces of the visible line, of the lit line.
+    """
+
+    place: Float64
+    profile: Integers
+    lines: tuple[Pieces, ...]
+
+    def joined(self, more: _Levels) -> _Levels:
+        """Return these levels and others in order."""
+        place, profile = np.append(self.place, more.place), np.append(self.profile, more.profile)
+        order = np.lexsort((place, profile))
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        lines = []
+        for one, two in zip(self.lines, more.lines, strict=True):
+            both = Pieces(*(np.concatenate(each) for each in zip(one, two, strict=True)))
+            level = np.concatenate([one.level, two.level + len(self.place)])
+            lines.append(both._replace(level=rank[level]))
+        return _Levels(place[order], profile[order], tuple(lines))
+
+    def runs(self, scale: LineScale) -> list[Runs]:
+        """Return the runs of each kind of line."""
+        return [find_runs(pieces, self.place, self.profile, scale) for pieces in self.lines]
+
+
+def _concatenated(by_profile: Sequence[Slabs]) -> tuple[Slabs, Integers]:
+    """Return the slabs of all profiles, and the profile of each."""
+    columns = zip(*by_profile, strict=True) if by_profile else ([], [], [], [])
+    slabs = Slabs(*(np.concatenate([*each, np.zeros(0)]) for each in columns))
+    return slabs, np.repeat(np.arange(len(by_profile)), [len(each.share) for each in by_profile])
+
+
+def _whole(line: LitLine) -> Parts:
+    """Return the whole segments of a line as parts."""
+    count = len(line.power)
+    return Parts(np.arange(count), np.zeros(count), np.ones(count), np.ones(count, bool))
+
+
+def _between(ends: Float64, share: Float64) -> Float64:
+    """Return values at fractions between both ends (n, 2); exact where the ends are equal, also if infinite."""
+    start, end = ends.T
+    same = start == end
+    change = np.subtract(end, start, out=np.zeros_like(start), where=~same)
+    return np.asarray(np.where(same, start, np.where(same, 0.0, start) + share * change))
 
 
 def _mirrored_power(line: LitLine, segment: Integers, points: Float64, arriving: Float64) -> dict[str, Float64]:

@@ -239,6 +239,13 @@ class LightSheet:
         away = np.array([*self.source, 0.0]) - (points - move.origin) @ np.linalg.inv(axes)
         return np.asarray(points + away[..., :2] @ axes[:2])
 
+    def ray_coordinates(self, sheet_points: npt.ArrayLike) -> Float64:
+        """Return the G [m] at which the rays through points (G, H) (..., 2) [m] of the sheet meet H = 0, (...,)."""
+        G, H = np.moveaxis(np.asarray(sheet_points, np.float64), -1, 0)
+        if self.source is None:
+            return np.asarray(G)
+        return np.asarray(self.source[0] + self.source[1] * (G - self.source[0]) / (self.source[1] - H))
+
     # ---- light coordinates: x is constant along a ray, the height grows towards the light ----------------------
 
     def _to_light_coordinates(self, cuts: Cuts) -> tuple[Cuts, Float64, Float64]:

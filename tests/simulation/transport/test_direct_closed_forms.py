@@ -76,6 +76,67 @@ def test_half_of_the_beam_hidden(device: Device, x: float) -> None:
     assert u_of(shown[UNOCCLUDED], seen_by)[0] == pytest.approx(0.0, abs=1e-11)
 
 
+def screen_before_the_lens(seen_by: SensorView, sigma: float, x: float, slope: float) -> Scene:
+    """Return a plate, and a screen whose shadow for the lens lies beyond y = x sigma + slope G."""
+    lens, height = np.array(seen_by.lens), 0.2
+    edge = [x * sigma + slope * G + (lens[1] - x * sigma) * height / lens[2] for G in (-1.0, 1.0)]
+    return Scene(
+        np.concatenate([plate(), quad((-1, edge[0], height), (1, edge[1], height), (1, 3, height), (-1, 3, height))])
+    )
+
+
+# Sigma of the shipped sensors [m], and what the issue allows [m of range].
+SHIPPED_SIGMA, ALLOWED = 60e-6, 0.5e-6
+
+
+@pytest.mark.parametrize("x", [-2.2, -1.03, -0.4, 0.11, 0.5, 1.37, 2.9, 3.3])
+def test_shipped_slabs_at_an_edge_along_the_sheet(device: Device, x: float) -> None:
+    """With nine slabs, a half plane that cuts the beam gives the mean of a truncated Gaussian."""
+    seen_by = far_view()
+    light = light_of(
+        screen_before_the_lens(seen_by, SHIPPED_SIGMA, x, 0.0),
+        seen_by=seen_by,
+        sigma=SHIPPED_SIGMA,
+        sub_sheets=9,
+        device=device,
+    )
+    shown = light.exposures(0.0, causes=True)
+    expected = -bell(x) / float(ndtr(x)) * SHIPPED_SIGMA * u_per_metre(seen_by, (0.0, 1.0, 0.0))
+    per_height = u_per_metre(seen_by, (0.0, 0.0, 1.0))
+    assert abs(u_of(shown["direct"], seen_by)[0] - expected) / abs(per_height) < ALLOWED
+    assert shown["direct"].total()[0] / shown[UNOCCLUDED].total()[0] == pytest.approx(float(ndtr(x)), abs=2e-3)
+    assert u_of(shown[UNOCCLUDED], seen_by)[0] == pytest.approx(0.0, abs=1e-11)
+
+
+@pytest.mark.parametrize("angle", [0.2, 1.0, 5.0, 20.0, 60.0])
+def test_shipped_slabs_at_an_edge_across_the_sheet(device: Device, angle: float) -> None:
+    """The edge leaves each sample another part of the beam: integrals of the Gaussian along the sample."""
+    seen_by = sensor_view(scale=FAR, bins=3, samples=24)
+    slope, x = math.tan(math.radians(angle)), 0.3
+    light = light_of(
+        screen_before_the_lens(seen_by, SHIPPED_SIGMA, x, slope),
+        seen_by=seen_by,
+        sigma=SHIPPED_SIGMA,
+        sub_sheets=9,
+        device=device,
+    )
+    shown = light.exposures(0.0)["direct"]
+    G = np.linspace(-0.03, 0.03, 600_001)
+    v = seen_by.project(np.stack([G, 0.0 * G, 0.0 * G], axis=-1))[:, 1]
+    sample = seen_by.sample_of(v)
+    limit = x + slope * G / SHIPPED_SIGMA
+    visible, moment = ndtr(limit), -np.exp(-0.5 * limit**2) / math.sqrt(math.tau)
+    sums = [np.bincount(sample[sample >= 0], each[sample >= 0], 24) for each in (np.ones(len(G)), visible, moment)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        expected = sums[2] / sums[1] * SHIPPED_SIGMA * u_per_metre(seen_by, (0.0, 1.0, 0.0))
+    bright = sums[1] > 0.02 * sums[0]
+    error = (u_of(shown, seen_by) - expected)[bright] / abs(u_per_metre(seen_by, (0.0, 0.0, 1.0)))
+    assert 6 < bright.sum() <= 24
+    assert np.abs(error).max() < ALLOWED
+    share = shown.total() / shown.total().max()
+    np.testing.assert_allclose(share, sums[1] / sums[0] / np.max(sums[1] / sums[0]), atol=3e-3)
+
+
 @pytest.mark.parametrize(("one", "two"), [(0.0, 0.6), (0.5, -0.5), (-0.3, 0.7), (-0.6, 0.2)])
 @pytest.mark.parametrize("x", [-1.0, 0.0, 0.4])
 def test_corner_between_slopes(one: float, two: float, x: float) -> None:

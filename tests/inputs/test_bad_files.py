@@ -17,6 +17,7 @@ import pytest
 
 from boards import LAYERS, board_folder
 from gpuvision.host import GpuVisionError
+from gpuvision.matching.artwork.artwork import read_artwork
 from gpuvision.sensor.sensor import Sensor
 
 _MEMORY = 2 << 30  # bytes
@@ -79,6 +80,11 @@ def board(folder: Path, copper: str) -> Path:
 
 def step_repeat(folder: Path) -> Path:
     return board(folder, "%SRX100000Y100000I0.1J0.1*%\nD11*\nX0Y0D03*\n%SR*%\n")
+
+
+def many_copies(folder: Path) -> Path:
+    """Copies that would take more than a minute and 1 GB."""
+    return board(folder, "%SRX1000Y1000I0.1J0.1*%\nD11*\nX0Y0D03*\n%SR*%\n")
 
 
 def large_aperture(folder: Path) -> Path:
@@ -306,7 +312,8 @@ _BAD: dict[str, tuple[str, list[tuple[Callable[[Path], Path], str]]]] = {
     "board": (
         _READ_BOARD,
         [
-            (step_repeat, rf"copper.gbr: a step-and-repeat of 10000000000 copies, .* 1000000; {_LIMIT}"),
+            (step_repeat, rf"copper.gbr: a step-and-repeat of 10000000000 copies, .* 100000; {_LIMIT}"),
+            (many_copies, rf"copper.gbr: a step-and-repeat of 1000000 copies, .* 100000; {_LIMIT}"),
             (distant_pad, rf"copper.gbr: .* an object that extends to 10\d\d m, expected at most 2; {_LIMIT}"),
             (endless_aperture, "copper.gbr: .* radius of 5e.296 m, which is too large for a board"),
             (polygon, "copper.gbr: a polygon aperture of 1000000000 corners, expected 3 to 12"),
@@ -314,7 +321,7 @@ _BAD: dict[str, tuple[str, list[tuple[Callable[[Path], Path], str]]]] = {
             (macro_text, "copper.gbr: an aperture macro with .*, expected numbers and variables"),
             (long_number, "copper.gbr: a number of more than 100 digits"),
             (no_command, "copper.gbr: .* characters or more that are no command, expected Gerber"),
-            (repeated_holes, rf"outline.gbr: 1000000008 holes, expected at most 1000000; {_LIMIT}"),
+            (repeated_holes, rf"outline.gbr: 1000000008 holes, expected at most 100000; {_LIMIT}"),
             (binary_gerber, "not a readable board: .*codec can't decode"),
             (large_zip, rf"board.zip: unpacks to \d{{10}} bytes, expected at most 2147483648; {_LIMIT}"),
             (many_files, rf"board.zip: 2000 files, expected at most 1000; {_LIMIT}"),
@@ -384,6 +391,23 @@ def test_a_recording_is_unpacked_frame_by_frame(tmp_path: Path) -> None:
     outcomes, peak = run(_READ_RECORDING, zeros_npz(tmp_path))
     assert outcomes == ["accepted"]
     assert peak < _MEMORY / 4
+
+
+def test_pads_that_cover_each_other_end_the_search_for_edges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of 400 pads lies in the boxes of up to 400 others: the comparisons grow with the square of the number."""
+    folder = board(tmp_path, "%SRX20Y20I0.01J0.01*%\nD11*\nX0Y0D03*\n%SR*%\n")
+    monkeypatch.setenv("GPUVISION_MAX_BOARD_COMPARISONS", "1e6")
+    message = rf"not a readable board: its visible edges take \d{{7}} comparisons .* expected at most 1000000; {_LIMIT}"
+    with pytest.raises(GpuVisionError, match=message):
+        read_artwork(folder, layers=LAYERS)
+
+
+@pytest.mark.slow
+def test_a_crowded_board_is_refused_in_time(tmp_path: Path) -> None:
+    """The largest allowed number of copies, all upon each other."""
+    outcomes, peak = run(_READ_BOARD, board(tmp_path, "%SRX200Y200I0.01J0.01*%\nD11*\nX0Y0D03*\n%SR*%\n"))
+    assert re.search(rf"its visible edges take \d+ comparisons .* {_LIMIT}", outcomes[0]), outcomes
+    assert peak < _MEMORY
 
 
 @pytest.mark.parametrize(

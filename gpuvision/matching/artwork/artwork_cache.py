@@ -25,10 +25,17 @@ from gpuvision.host.cache import cache_folder, is_private, read_private_bytes, w
 from gpuvision.host.reading import MAX_UNPACKED_BYTES
 from gpuvision.matching.artwork.board_artwork import Artwork, Holes, Pad
 from gpuvision.matching.artwork.board_files import MAX_BOARD_BYTES, MAX_BOARD_FILES, MAX_BOARD_OBJECTS
-from gpuvision.matching.artwork.edges import BoardEdges
+from gpuvision.matching.artwork.edges import MAX_BOARD_COMPARISONS, BoardEdges
 from gpuvision.matching.artwork.shapes import MAX_BOARD_SIZE, Float64, Shape
 
-_LIMITS = (MAX_UNPACKED_BYTES, MAX_BOARD_FILES, MAX_BOARD_BYTES, MAX_BOARD_OBJECTS, MAX_BOARD_SIZE)
+_LIMITS = (
+    MAX_UNPACKED_BYTES,
+    MAX_BOARD_FILES,
+    MAX_BOARD_BYTES,
+    MAX_BOARD_OBJECTS,
+    MAX_BOARD_SIZE,
+    MAX_BOARD_COMPARISONS,
+)
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _USES = ("copper", "mask", "silk")
 _PAD_WORDS = ("role", "shape", "function", "net", "part", "pin")

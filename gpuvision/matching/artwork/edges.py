@@ -9,8 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.host.reading import FileLimit
 from gpuvision.matching.artwork.shapes import SAGITTA, Crossings, DrawnObject, Float64, Layer, is_covered
 
+MAX_BOARD_COMPARISONS = FileLimit("GPUVISION_MAX_BOARD_COMPARISONS", 200_000_000)
+"""Comparisons of lines with sides of shapes, to find the visible edges of a board. Chosen: 200 million, which take
+10 s; the largest board of the tests takes 25 million. Objects that cover each other reach it."""
 # Lines are equal where their angle [rad], distance from the origin and width [m] round to the same multiple of this
 # number. It is not a decimal fraction, so that the lengths in files never lie between two multiples.
 _QUANTUM = math.pi * 1e-8
@@ -81,12 +85,23 @@ def board_edges(
         Layers that may hide an edge; without a mask everything is bare.
     clearance
         Free distance on both sides of an edge and at its ends [m].
+
+    Raises
+    ------
+    ValueError
+        The edges take more comparisons than `MAX_BOARD_COMPARISONS`.
     """
     rows = []
+    limit = MAX_BOARD_COMPARISONS.value
+    layers = [each for each in (copper, mask, silk) if each is not None]
     for each in [*_trace_sides(strokes), *_pad_sides(outlines)]:
         for low, high, bare in _visible_parts(each, copper, mask, silk, clearance):
             along = each.end - each.start
             rows.append((each.start + low * along, each.start + high * along, each.normal, each.width, bare, *each[4:]))
+        comparisons = sum(layer.comparisons for layer in layers)
+        if comparisons > limit:
+            what = f"its visible edges take {comparisons} comparisons or more; do its objects cover each other?"
+            MAX_BOARD_COMPARISONS.check(comparisons, what, ValueError)
     columns: list[Any] = list(zip(*rows, strict=True)) if rows else [[]] * 7
     return BoardEdges(
         np.array(columns[0], dtype=np.float64).reshape(-1, 2),

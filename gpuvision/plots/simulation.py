@@ -27,8 +27,12 @@ Array = npt.NDArray[Any]
 
 _SIZE, _DPI = (8.0, 5.5), 150
 _NO_READING, _GOOD = "#4b5563", "#e5e7eb"
-# Okabe and Ito's palette: distinguishable with colour vision deficiencies, and by lightness.
-_COLOURS = ("#0072b2", "#e69f00", "#cc79a7", "#d55e00", "#009e73", "#56b4e9", "#f0e442", "#000000")
+# Okabe and Ito's palette: distinguishable with colour vision deficiencies, and by lightness. Then, for causes by path,
+# colours of Tol's muted palette.
+_COLOURS = (
+    *("#0072b2", "#e69f00", "#cc79a7", "#d55e00", "#009e73", "#56b4e9", "#f0e442", "#000000"),
+    *("#882255", "#332288", "#999933"),
+)
 
 
 class PictureScale(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradi
 from gpuvision.simulation.errors.range_error import StripErrorModel, interreflection_power_bound, select_paths
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.sensors.readings import PATHS, GroundTruth
+from gpuvision.simulation.sensors.readings import BEYOND_ENDS, PATHS, GroundTruth
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.simulation.sensors.view_rays import ViewRays, VisibleSurface
 from gpuvision.simulation.transport.direct import DirectLight
@@ -68,6 +68,9 @@ class LightPaths:
         which varies slowly.
     nodes
         Of `ViewRays`.
+    end_bins
+        Number of bins beyond either end of the samples in which direct light is imaged and blurred too, 0 or more: the
+        light that the ends cut off is then known (`BEYOND_ENDS`), and the true points beyond the ends. Default 0.
     patch_size
         Largest edge of the patches of the radiosity solution [m]; None: a sixteenth of the scene's diagonal.
     tolerance
@@ -107,6 +110,7 @@ class LightPaths:
     sub_sheets: int = 1
     blur: float = 0.0
     nodes: tuple[int, int] = (1, 1)
+    end_bins: int = 0
     patch_size: float | None = None
     tolerance: float = 0.0
     min_power: float = 0.0
@@ -126,13 +130,16 @@ class LightPaths:
         view_rays = ViewRays(
             view=self.view, scene=self.scene, materials=self.materials, nodes=self.nodes, device=device
         )
+        if self.end_bins < 0:
+            raise ValueError(f"LightPaths.end_bins is {self.end_bins}, expected 0 or more")
         direct = DirectLight(
-            view=self.view,
+            view=_widened(self.view, self.end_bins),
             scene=self.scene,
             materials=self.materials,
             sheet=self.sheet,
             sub_sheets=self.sub_sheets,
             device=device,
+            ends=(float(self.view.u_edges[0]), float(self.view.u_edges[-1])),
         )
         mirrors = Mirrors(view=self.view, scene=self.scene, materials=self.materials, device=device)
         clustered = ClusteredIrradiance(scene=self.scene, tolerance=self.tolerance, device=device)
@@ -156,14 +163,32 @@ class LightPaths:
         lit, first = self.sheet.illuminate_all(self.scene, places)
         found = []
         for k, L in enumerate(places):
-            exposures = {
-                name: self.view.blur(Exposure(each.power[k], each.moment[k]), self.blur)
+            wide = {
+                name: self._direct.view.blur(Exposure(each.power[k], each.moment[k]), self.blur)
                 for name, each in straight.items()
                 if name in self.paths or name not in PATHS
             }
+            exposures = {name: self._within_ends(each) for name, each in wide.items()}
+            if self.end_bins and "direct" in wide:
+                exposures[BEYOND_ENDS] = self._beyond_ends(wide["direct"])
             truth = GroundTruth(truths.g[k], truths.h[k], truths.status[k])
             found.append(self._profile(float(L), lit.select(slice(first[k], first[k + 1])), exposures, truth))
         return found
+
+    def _within_ends(self, wide: Exposure) -> Exposure:
+        """Return the light within the ends of the samples, of light in the widened view."""
+        inner = slice(self.end_bins, self.end_bins + self.view.bins)
+        return Exposure(wide.power[:, inner], wide.moment[:, inner])
+
+    def _beyond_ends(self, wide: Exposure) -> Exposure:
+        """Return the light beyond the ends of the samples: power and first moment in the first and the last bin."""
+        beyond, centres = self.view.dark(), self._direct.view.u_centres
+        for place, outer in ((0, slice(0, self.end_bins)), (-1, slice(self.end_bins + self.view.bins, None))):
+            power = wide.power[:, outer]
+            beyond.power[:, place] = power.sum(axis=-1)
+            from_bin = centres[outer] - self.view.u_centres[place]
+            beyond.moment[:, place] = wide.moment[:, outer].sum(axis=-1) + power @ from_bin
+        return beyond
 
     def _profile(self, L: float, lit: LitLine, exposures: dict[str, Exposure], truth: GroundTruth) -> ProfileLight:
         """Return the light of a profile: the direct light and all secondary light."""
@@ -256,3 +281,12 @@ class LightPaths:
             size = float(np.linalg.norm(np.ptp(corners, axis=0))) / 16.0
         albedo = [each.albedo for each in self.materials]
         return Radiosity.from_scene(self.scene, albedo, size=size, device=self.device)
+
+
+def _widened(view: SensorView, bins: int) -> SensorView:
+    """Return a view with more bins of the same width beyond either end in u."""
+    if not bins:
+        return view
+    edges, count = view.u_edges, np.arange(1, bins + 1)
+    low, high = edges[0] - count[::-1] * (edges[1] - edges[0]), edges[-1] + count * (edges[-1] - edges[-2])
+    return replace(view, u_edges=np.concatenate([low, edges, high]), axis=view.axis)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import io
+import math
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ from gpuvision.host import Device
 from gpuvision.host.errors import ReadError, RecordingError
 from gpuvision.host.files import atomic_write
 from gpuvision.host.reading import check_archive, reading
+from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.simulated import make_light_sheet, make_sensor_view, minimum_sample_power, require_light
 from gpuvision.simulation.light_paths import LightPaths
@@ -32,6 +34,9 @@ from gpuvision.workflows.light_key import key_of, source_digest
 
 PROFILES_PER_BLOCK = 16
 """Profiles in a file: some seconds of work, so that little is lost when a run stops."""
+# Length beyond either end of a PSD strip in which the light is computed that the end cuts off, as a fraction of the
+# strip. Chosen: far more than the width of a light spot; the computing time grows with it.
+_END_FRACTION = 0.25
 
 Float64 = npt.NDArray[np.float64]
 Progress = Callable[[int, int | None], object]
@@ -222,6 +227,7 @@ def make_light_paths(task: SimulationTask, device: Device) -> LightPaths:
         sub_sheets=light.sub_sheets,
         blur=light.blur,
         nodes=light.nodes,
+        end_bins=math.ceil(_END_FRACTION * light.bins) if isinstance(task.sensor.readout, PsdReadout) else 0,
         tolerance=task.tolerance,
         min_power=minimum_sample_power(task.sensor),
         device=device,

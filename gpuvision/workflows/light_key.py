@@ -30,6 +30,7 @@ NOT_OPTICAL: dict[type, frozenset[str]] = {
             "minimum_total",
             "saturation",
             "linearity",
+            "margin",
             "noise",
             "layout",
             "outputs",

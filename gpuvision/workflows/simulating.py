@@ -310,7 +310,7 @@ def _attribute_errors(
         statistics = _add_statistics(statistics, block)
         first += len(block.truth.h)
     attribution = _concatenate(parts)
-    if not np.isfinite(attribution.truth.h).any():
+    if not (np.isfinite(attribution.truth.h) & ((attribution.truth.status & Status.OUT_OF_RANGE) == 0)).any():
         raise ValueError(
             f"the sensor sees nothing lit in any of {first} profiles: {_describe_position(store.task.part)}; "
             "is that where sheet and sensor are, and the unit right?"

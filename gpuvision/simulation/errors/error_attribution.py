@@ -38,6 +38,7 @@ from gpuvision.simulation.sensors.camera_simulator import CameraSimulator
 from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
 from gpuvision.simulation.sensors.readings import (
     AMBIENT,
+    BEYOND_ENDS,
     PATHS,
     UNIFORM,
     UNIFORM_UNOCCLUDED,
@@ -56,10 +57,11 @@ from gpuvision.status import Status
 Float64 = npt.NDArray[np.float64]
 Method = Literal["moments", "shapley"]
 
-CAUSES = ("shape", "occlusion", "reflectivity", "specular", "secondary", "ambient", "noise")
+CAUSES = ("shape", "occlusion", "reflectivity", "specular", "secondary", "ambient", "noise", "clipped")
 """Names of the causes. "shape" is the contribution of unoccluded direct light with uniform reflectivity: the width of a
 strip or of a light spot on a part that is not flat. Without the variants of the direct light, "shape" also holds the
-contributions of occlusion and reflectivity."""
+contributions of occlusion and reflectivity. "clipped" is the contribution of the direct light that the ends of a PSD
+strip cut off; without `BEYOND_ENDS`, "shape" holds it too."""
 _VARIANTS = (UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED)
 _SECONDARY = ("diffuse-specular", "diffuse-diffuse", "multi-bounce")
 
@@ -74,7 +76,7 @@ class ReadingCategory(enum.IntFlag):
     SPURIOUS = 2
     """False reading: a reading where no lit surface is visible."""
     NO_SURFACE = 4
-    """No lit surface is visible, and there is no reading."""
+    """No lit surface is visible within the ends of the sensor, and there is no reading."""
     AMBIGUOUS = 8
     """Several lit surfaces are visible in one sample."""
 
@@ -125,13 +127,18 @@ class ErrorAttribution:
         brightest = np.stack([self.power[name] for name in self.causes]).argmax(axis=0)
         return np.where(self.is_category(ReadingCategory.SPURIOUS), brightest, largest).astype(np.int8)
 
+    @property
+    def has_surface(self) -> npt.NDArray[np.bool_]:
+        """Samples that see a lit surface within the ends of the sensor, or beyond the ends with a reading."""
+        return np.asarray(np.isfinite(self.truth.h) & ~_is_unread_beyond_ends(self.reading.h, self.truth))
+
     def is_category(self, category: ReadingCategory) -> npt.NDArray[np.bool_]:
         """Return a mask of the samples with a category flag; for VALID, of the samples without any flag."""
         return np.asarray(self.category == 0 if category == ReadingCategory.VALID else (self.category & category) != 0)
 
     def failed_fraction(self, limit: float) -> float:
         """Return the fraction of lit-surface samples without a reading within the limit [m]: dropouts and outliers."""
-        true = np.isfinite(self.truth.h)
+        true = self.has_surface
         failed = true & ~(np.abs(self.error) <= limit)
         return int(failed.sum()) / max(int(true.sum()), 1)
 
@@ -165,7 +172,7 @@ class ErrorAttribution:
             for each cause the ``rms`` and ``max`` of its contribution [m], and in how many outliers (``dominant``) and
             spurious readings (``spurious``) it is the dominant cause.
         """
-        true, error = np.isfinite(self.truth.h), np.abs(self.error[np.isfinite(self.error)])
+        true, error = self.has_surface, np.abs(self.error[np.isfinite(self.error)])
         dominant = self.dominant_cause(limit)
         outlier = np.abs(self.error) > limit
         spurious = self.is_category(ReadingCategory.SPURIOUS)
@@ -225,7 +232,8 @@ def attribute_errors(
         The sensor, with its mask and its ambient light.
     exposures
         Light by path, (..., samples, bins). With all three variants of the direct light (`UNIFORM`, `UNOCCLUDED`,
-        `UNIFORM_UNOCCLUDED`), occlusion and reflectivity are causes in addition to shape.
+        `UNIFORM_UNOCCLUDED`), occlusion and reflectivity are causes in addition to shape; with `BEYOND_ENDS` and a PSD,
+        clipped is one too.
     truth
         Ground truth of the same samples.
     seed, first_profile
@@ -285,7 +293,7 @@ def classify_readings(h: Float64, truth: GroundTruth) -> npt.NDArray[np.uint8]:
     numpy.ndarray
         uint8 `ReadingCategory` flags, (..., samples).
     """
-    true, read = np.isfinite(truth.h), np.isfinite(h)
+    true, read = np.isfinite(truth.h) & ~_is_unread_beyond_ends(h, truth), np.isfinite(h)
     several = (np.asarray(truth.status) & Status.AMBIGUOUS) != 0
     category = np.select(
         [true & ~read, read & ~true, ~read & ~true],
@@ -293,6 +301,11 @@ def classify_readings(h: Float64, truth: GroundTruth) -> npt.NDArray[np.uint8]:
     )
     category = np.where(several & ~true, 0, category)
     return (category | np.where(several, ReadingCategory.AMBIGUOUS, 0)).astype(np.uint8)
+
+
+def _is_unread_beyond_ends(h: Float64, truth: GroundTruth) -> npt.NDArray[np.bool_]:
+    """Return a mask of the samples without a reading whose lit surface is imaged beyond the ends of the sensor."""
+    return np.asarray(((np.asarray(truth.status) & Status.OUT_OF_RANGE) != 0) & ~np.isfinite(h))
 
 
 def _paths_of(cause: str, secondary_by_path: bool) -> tuple[str, ...]:
@@ -352,6 +365,9 @@ def _attribute_by_moments(
             causes["shape"] = direct - causes["occlusion"] - causes["reflectivity"]
         else:
             causes["shape"] = direct
+        if BEYOND_ENDS in light and "direct" in light:
+            causes["clipped"] = _clipping_contribution(view, light, light["direct"].total() * per_power)
+            causes["shape"] = causes["shape"] - causes["clipped"]
         for cause in _additional_causes(light, secondary_by_path):
             parts = [contribution(path) for path in _paths_of(cause, secondary_by_path) if path in light]
             causes[cause] = np.asarray(sum(parts, start=np.zeros(total.shape)))
@@ -375,6 +391,13 @@ def _direct_contributions(view: SensorView, light: Mapping[str, Exposure], weigh
     }
 
 
+def _clipping_contribution(view: SensorView, light: Mapping[str, Exposure], weight: Float64) -> Float64:
+    """Return the contribution of the light beyond the ends: the shift of the direct light's centroid without it."""
+    received, complete = light["direct"], light["direct"] + light[BEYOND_ENDS]
+    clipped, unclipped = (each.first_moment(view.u_edges) / each.total() for each in (received, complete))
+    return np.nan_to_num(weight * (clipped - unclipped))
+
+
 # ---- any readout: contributions as Shapley values ------------------------------------------------------------
 
 
@@ -392,8 +415,15 @@ def _attribute_by_shapley_values(
         if np.any(_power_of(name, light, secondary_by_path) > 0.0):
             paths = _paths_of(name, secondary_by_path)
             signals[name] = simulator.signal(total_exposure({path: light[path] for path in paths if path in light}))
-    # Occlusion and reflectivity change the direct light; the other causes add their signals to it.
-    changes = ["occlusion", "reflectivity"] if len(direct) > 1 else []
+    # Occlusion and reflectivity change the direct light, and clipping takes light from it; the other causes add their
+    # signals to it.
+    changes = ["occlusion", "reflectivity"] if _has_variants(light) else []
+    if isinstance(simulator, PsdSimulator) and BEYOND_ENDS in light:
+        changes.append("clipped")
+        lost = simulator.signal(light[BEYOND_ENDS])
+        direct = {group | {"clipped"}: signal for group, signal in direct.items()} | {
+            group: signal + lost for group, signal in direct.items()
+        }
     present = changes + list(signals)
     errors: dict[frozenset[str], Float64] = {}
     for count in range(len(present) + 1):

@@ -70,8 +70,10 @@ def _fused_attribution(
     """Return the errors of fused readings; each cause is weighted like the readings."""
     error = fused.h - truth.h
     causes = {}
-    for name in (name for name in first.causes if name in second.causes):
-        one, other = first.causes[name], second.causes[name]
+    none = np.zeros(error.shape)
+    # A cause that only one of the sensors has contributes nothing to the other.
+    for name in dict.fromkeys([*first.causes, *second.causes]):
+        one, other = first.causes.get(name, none), second.causes.get(name, none)
         mean = fused.first_weight * one + (1.0 - fused.first_weight) * other
         part = np.where(fused.first_weight == 1.0, one, np.where(fused.first_weight == 0.0, other, mean))
         causes[name] = np.where(np.isfinite(error), part, np.nan)
@@ -82,7 +84,7 @@ def _fused_attribution(
         truth=truth,
         error=error,
         causes=causes,
-        power={name: first.power[name] + second.power[name] for name in causes},
+        power={name: first.power.get(name, none) + second.power.get(name, none) for name in causes},
         category=classify_readings(fused.h, truth),
     )
 

@@ -30,6 +30,7 @@ from gpuvision.simulation.sensors.readings import (
     total_exposure,
 )
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
+from gpuvision.status import Status
 from gpuvision.validation import finite
 
 Float64 = npt.NDArray[np.float64]
@@ -321,7 +322,8 @@ def optimise_mask(
     if light.power.ndim != 3 or np.shape(truth.h) != light.power.shape[:-1]:
         raise ValueError(f"expected light (profiles, samples, bins) and its truth, got {light.power.shape}")
     true_u, slope = height_slope(view, truth)
-    valid = np.isfinite(true_u) & (direct.total() > 0.0)
+    in_range = (np.asarray(truth.status) & Status.OUT_OF_RANGE) == 0
+    valid = np.isfinite(true_u) & in_range & (direct.total() > 0.0)
     ends = _widest_cuts(view.u_edges, direct, valid, min_passed_fraction, margin)
     groups = _Groups.of(view, light, np.where(valid, true_u, np.nan), slope, ends, fixed)
     shape = (view.samples, 2) if fixed else (*light.power.shape[:-1], 2)

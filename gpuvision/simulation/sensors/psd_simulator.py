@@ -19,6 +19,7 @@ from gpuvision.ranging.psd import ELECTRON, PsdNoise, PsdReading, PsdReadout
 from gpuvision.simulation.sensors.masks import Mask, apply_mask
 from gpuvision.simulation.sensors.readings import (
     AMBIENT,
+    BEYOND_ENDS,
     AlignmentLimits,
     Reading,
     add_ambient,
@@ -198,7 +199,16 @@ class PsdSimulator:
         return total, np.divide(signal[..., 1], total, out=np.zeros_like(total), where=total > 0.0)
 
     def _incident(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
-        return apply_mask(self.mask, self.view, add_ambient(self.view, exposures, self.ambient))
+        light = add_ambient(self.view, exposures, self.ambient)
+        beyond = light.pop(BEYOND_ENDS, None)
+        passing = apply_mask(self.mask, self.view, light)
+        if beyond is not None:
+            # A mask stops light beyond an end as it stops uniform light in the bin at the end.
+            spread = Exposure(beyond.power, np.zeros_like(beyond.power))
+            power = apply_mask(self.mask, self.view, {BEYOND_ENDS: spread})[BEYOND_ENDS].power
+            share = np.divide(power, beyond.power, out=np.zeros_like(power), where=beyond.power > 0.0)
+            passing[BEYOND_ENDS] = Exposure(power, share * beyond.moment)
+        return passing
 
     def _in_order(self, light: Exposure) -> Exposure:
         step = -1 if self.readout.axes.sample_pitch < 0.0 else 1

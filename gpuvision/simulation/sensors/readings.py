@@ -24,11 +24,14 @@ AMBIENT = "ambient"
 UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED = "direct, uniform", "direct, unoccluded", "direct, uniform, unoccluded"
 """Hypothetical variants of the direct light: with uniform reflectivity of all surfaces, without occlusion between
 surfaces and lens, and both. They serve to attribute errors; the sensor never receives them."""
+BEYOND_ENDS = "direct, beyond the ends"
+"""Direct light that misses a sample beyond its ends in u, as power and first moment in its first and last bin. It
+serves to attribute errors; the sensor never receives it."""
 # For positions closer than this fraction of the region, the lens' derivative replaces the secant: a difference quotient
 # loses digits there. Chosen: the rounding error of the quotient stays below about 2e-10, and the derivative at one end
 # differs from the secant by about 1e-6 times the relative curvature of the distortion.
 _MIN_SECANT = 1e-6
-_RECEIVED, _KNOWN = (*PATHS, AMBIENT), (*PATHS, AMBIENT, UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED)
+_RECEIVED, _KNOWN = (*PATHS, AMBIENT), (*PATHS, AMBIENT, UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED, BEYOND_ENDS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +59,8 @@ class GroundTruth(NamedTuple):
     g, h
         float64, point in the sheet of light [m]; NaN where no lit surface is visible.
     status
-        uint8 `Status` flags: LOW_SIGNAL (no lit surface is visible), AMBIGUOUS (several are).
+        uint8 `Status` flags: LOW_SIGNAL (no lit surface is visible), AMBIGUOUS (several are), OUT_OF_RANGE (the lit
+        surface is imaged beyond the ends of the sensor in u; its point is given if light of it may reach the sensor).
     """
 
     g: npt.NDArray[Any]

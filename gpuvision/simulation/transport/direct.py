@@ -238,6 +238,8 @@ class DirectLight:
         slab. Default 9.
     device
         Device on which visibility is computed; None: `Device.best`.
+    ends
+        (u_low, u_high), ends of the sensor in u where the view extends beyond them [sensor unit]; None: the view's.
     limits
         Numerical limits.
 
@@ -279,6 +281,7 @@ class DirectLight:
     sheet: LightSheet
     sub_sheets: int | Sequence[float] = 9
     device: Device | None = None
+    ends: tuple[float, float] | None = None
     limits: DirectLimits = DirectLimits()
     _slabs: Slabs = field(init=False, repr=False)
     _visibility: LensVisibility = field(init=False, repr=False)
@@ -570,8 +573,8 @@ class DirectLight:
         """Return the true position of the sheet's middle at a transport L [m], at the middle of each sample.
 
         The position belongs to a lit point that is visible from the lens and imaged on the sensor. Status: LOW_SIGNAL,
-        there is no such point; OUT_OF_RANGE, the point is imaged beyond the sensor's ends in u, and is not given;
-        AMBIGUOUS, there are several, and the one with the most light is given.
+        there is no such point; OUT_OF_RANGE, the point is imaged beyond the sensor's ends in u, and is given only if
+        it is in the view (see ``ends``); AMBIGUOUS, there are several, and the one with the most light is given.
         """
         found = self.truths_of_profiles([L])
         return GroundTruth(found.g[0], found.h[0], found.status[0])
@@ -592,11 +595,13 @@ class DirectLight:
         share = images.fractions_at(mine, view.v_centres[sample], 1)
         points = points_on(line.ends[mine.segment], share)
         u = images.image_points(mine.segment, share)[:, 0]
-        on = (u >= view.u_edges[0]) & (u <= view.u_edges[-1])
+        low_u, high_u = (view.u_edges[0], view.u_edges[-1]) if self.ends is None else self.ends
+        on = (u >= low_u) & (u <= high_u)
+        in_view = on | ((u >= view.u_edges[0]) & (u <= view.u_edges[-1]))
         light = (line.power * line.lengths)[mine.segment] * (mine.end - mine.start) / (high - low)[owner]
         slot = lit.sheet[mine.segment] * view.samples + sample
         positions, same = view.sheet_coordinates(points), self.limits.same_point
-        found = _strongest_points(len(places) * view.samples, slot, positions, on, light, same)
+        found = _strongest_points(len(places) * view.samples, slot, positions, on, in_view, light, same)
         return GroundTruth(*(each.reshape(len(places), view.samples) for each in found))
 
     def _illuminate(self, sheets: Float64, transports: Float64) -> _LitSheets:
@@ -742,11 +747,20 @@ def _slabs(given: int | Sequence[float]) -> Slabs:
 
 
 def _strongest_points(
-    samples: int, sample: Integers, places: Float64, on: npt.NDArray[np.bool_], light: Float64, same: float
+    samples: int,
+    sample: Integers,
+    places: Float64,
+    on: npt.NDArray[np.bool_],
+    in_view: npt.NDArray[np.bool_],
+    light: Float64,
+    same: float,
 ) -> GroundTruth:
-    """Return for each sample the position (G, H) with the most light on the sensor, with status flags."""
-    order = np.lexsort((-light, ~on, sample))
-    sample, places, on = sample[order], places[order], on[order]
+    """Return for each sample the position (G, H) with the most light on the sensor, with status flags.
+
+    A sample without a position on the sensor gets the position in the view with the most light.
+    """
+    order = np.lexsort((-light, ~in_view, ~on, sample))
+    sample, places, on, in_view = sample[order], places[order], on[order], in_view[order]
     best = np.flatnonzero(np.diff(sample, prepend=-1))
     group = np.repeat(best, np.diff(best, append=len(sample)))
     other = on & (np.abs(places - places[group]).max(axis=1, initial=0.0) > same * np.abs(places).max(initial=0.0))
@@ -754,7 +768,7 @@ def _strongest_points(
     status = np.full(samples, Status.LOW_SIGNAL, np.uint8)
     status[sample[best]] = np.where(on[best], Status.OK, Status.OUT_OF_RANGE)
     status[sample[other]] |= np.uint8(Status.AMBIGUOUS)
-    given = best[on[best]]
+    given = best[in_view[best]]
     g[sample[given]], h[sample[given]] = places[given].T
     return GroundTruth(g, h, status)
 

@@ -7,15 +7,18 @@ import pytest
 from scipy.special import ndtr
 
 from gpuvision.host import Device
+from gpuvision.ranging.psd import clipping_bias
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution, ReadingCategory, attribute_errors
+from gpuvision.simulation.light_paths import LightPaths
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.sensors.readings import GroundTruth
+from gpuvision.simulation.sensors.readings import GroundTruth, sheet_point
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet
-from lights import psd, psd_view
+from gpuvision.status import Status
+from lights import LENGTH, psd, psd_view
 
 SIGMA = 5e-5
 # The lens is 80 mm beside the sheet and 150 mm above the plane.
@@ -59,6 +62,37 @@ def test_reflectivity_step(device: Device) -> None:
     np.testing.assert_allclose(attribution.causes["occlusion"], 0.0, atol=1e-9)
     # Strips average over a straight line: only perspective remains.
     np.testing.assert_allclose(attribution.causes["shape"], 0.0, atol=3e-3 * shift)
+
+
+@pytest.mark.parametrize("end_bins", [0, 60])
+@pytest.mark.parametrize("inside", [2.0, 1.0, 0.1, -1.0, -2.0])
+def test_surfaces_at_the_end_of_the_strips(inside: float, end_bins: int, device: Device) -> None:
+    """The end of the strips cuts the image of a plane: clipped, and beyond the end still a reading of the plane."""
+    view = psd_view(240)
+    u = 0.5 * LENGTH - inside * SIGMA
+    height = float(sheet_point(view.triangulation, u, 0.0)[1])
+    light = LightPaths(
+        view=view,
+        sheet=LightSheet(transport=view.transport),
+        scene=Scene(corners=np.array(flat(-0.01, 0.01, height))),
+        materials=[Material(diffuse=Lambert(albedo=0.5))],
+        paths=("direct",),
+        blur=SIGMA,
+        end_bins=end_bins,
+        device=device,
+    ).profile(0.0)
+    found = attribute_errors(psd(view), light.exposures, light.truth, device=device)
+    np.testing.assert_array_equal(light.truth.status, Status.OK if inside >= 0.0 else Status.OUT_OF_RANGE)
+    bias = float(clipping_bias(u, spot=SIGMA, strip_length=LENGTH))
+    expected = sheet_point(view.triangulation, u + bias, 0.0)[1] - height
+    if end_bins:
+        np.testing.assert_allclose(light.truth.h, height, atol=1e-9)
+        np.testing.assert_allclose(found.error, expected, rtol=1e-3)
+        np.testing.assert_allclose(found.causes["clipped"], found.error, rtol=2e-3)
+        assert (found.category == ReadingCategory.VALID).all()
+    else:
+        assert "clipped" not in found.causes
+        assert (found.category == (ReadingCategory.VALID if inside >= 0.0 else ReadingCategory.NO_SURFACE)).all()
 
 
 def test_blade_before_the_lens(device: Device) -> None:

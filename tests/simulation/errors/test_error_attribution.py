@@ -9,7 +9,9 @@ from scipy.special import ndtr
 from gpuvision.host import Device
 from gpuvision.ranging.psd import PsdNoise
 from gpuvision.simulation.errors.error_attribution import CAUSES, ErrorAttribution, ReadingCategory, attribute_errors
+from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.sensors.readings import (
+    BEYOND_ENDS,
     UNIFORM,
     UNIFORM_UNOCCLUDED,
     UNOCCLUDED,
@@ -20,7 +22,7 @@ from gpuvision.simulation.sensors.readings import (
 )
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.status import Status
-from lights import camera, camera_view, gaussian, psd, psd_view
+from lights import LENGTH, camera, camera_view, gaussian, psd, psd_view
 
 PIXEL = 10e-6
 
@@ -145,6 +147,52 @@ def test_reflectivity_step(method: str, device: Device) -> None:
     assert (found.dominant_cause(1e-7) == list(found.causes).index("reflectivity")).all()
 
 
+def beyond_ends(view: SensorView, u: np.ndarray, power: float, sigma: float) -> Exposure:
+    """Return the part of Gaussian spots beyond the ends of the strips: power and first moment, in the end bins."""
+    light = view.dark()
+    density = np.exp(-0.5 * ((view.u_edges[[0, -1]] - u[:, None]) / sigma) ** 2) / np.sqrt(2.0 * np.pi)
+    below, above = ndtr((view.u_edges[0] - u) / sigma), ndtr((u - view.u_edges[-1]) / sigma)
+    light.power[:, 0], light.power[:, -1] = power * below, power * above
+    light.moment[:, 0] = power * (below * (u - view.u_centres[0]) - sigma * density[:, 0])
+    light.moment[:, -1] = power * (above * (u - view.u_centres[-1]) + sigma * density[:, 1])
+    return light
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("end", [-1.0, 1.0])
+def test_spots_clipped_by_the_end_of_the_strip(method: str, end: float, device: Device) -> None:
+    """The error is sigma phi(c) / Phi(c), all of it clipped, also where the surface is imaged beyond the end."""
+    view, sigma = psd_view(600), 5e-5
+    c = np.array([2.0, 1.0, 0.0, -1.0, -2.0])
+    u = end * (0.5 * LENGTH - c * sigma)
+    truth = truth_at(view, u)
+    truth.status[c < 0.0] = Status.OUT_OF_RANGE
+    light = {"direct": gaussian(view, u, 1e-6, sigma), BEYOND_ENDS: beyond_ends(view, u, 1e-6, sigma)}
+    light["diffuse-diffuse"] = view.dark()
+    found = attribute_errors(psd(view), light, truth, method=method, device=device)
+    shift = -end * sigma * np.exp(-0.5 * c**2) / np.sqrt(2.0 * np.pi) / ndtr(c)
+    slope = height_secant(view.triangulation, u, u + shift, view.v_centres)
+    rounding = 1e-6 if device.has_double else 1e-2
+    np.testing.assert_allclose(found.error, slope * shift, rtol=rounding)
+    np.testing.assert_allclose(found.causes["clipped"], slope * shift, rtol=rounding)
+    np.testing.assert_allclose(found.causes["shape"], 0.0, atol=1e-9)
+    assert (found.category == ReadingCategory.VALID).all()
+    assert (found.dominant_cause(1e-6) == list(found.causes).index("clipped")).all()
+    assert found.summary(1e-6)["surface"] == 5
+    check_sum(found)
+    # A mask over the end stops the light on both sides of it: nothing is clipped by the end.
+    windows = np.tile(np.sort([0.0, end * (0.5 * LENGTH - 4e-5)]), (view.samples, 1))
+    masked = attribute_errors(psd(view, mask=Mask(windows=windows)), light, truth, method=method, device=device)
+    np.testing.assert_allclose(masked.causes["clipped"], 0.0, atol=1e-12)
+    # With a margin these samples have no reading. Surfaces beyond the end are then not expected to have one.
+    margin = attribute_errors(psd(view, readout={"margin": 3.0 * sigma}), light, truth, method=method, device=device)
+    assert np.isnan(margin.error).all()
+    category = np.where(c < 0.0, ReadingCategory.NO_SURFACE, ReadingCategory.MISSING)
+    np.testing.assert_array_equal(margin.category, category)
+    assert margin.failed_fraction(1e-6) == 1.0
+    assert margin.summary(1e-6)["surface"] == 3
+
+
 def test_all_causes_at_once(device: Device, rng: np.random.Generator) -> None:
     """For any light, the contributions, noise included, add up to the error."""
     view = psd_view(60)
@@ -162,6 +210,8 @@ def test_all_causes_at_once(device: Device, rng: np.random.Generator) -> None:
             UNIFORM_UNOCCLUDED,
         )
     }
+    outer = np.full(u.shape, view.u_edges[-1])
+    light[BEYOND_ENDS] = gaussian(view, outer, rng.uniform(0.1, 0.2, u.shape) * 1e-6, 1e-4)
     g, h = sheet_point(view.triangulation, u, view.v_centres)
     simulator = psd(view, ambient=1e-7, readout={"noise": PsdNoise(independent=1e-9)})
     for method in METHODS:

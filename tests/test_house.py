@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import os
 import re
 import shutil
@@ -193,13 +194,17 @@ FLOORS = (
 FLOOR = {package: number for number, packages in enumerate(FLOORS) for package in packages}
 
 
-def _imported(tree: ast.AST) -> Iterator[str]:
-    for node in ast.walk(tree):
+@functools.cache
+def _imported(path: Path) -> tuple[str, ...]:
+    """Return the modules and names that a file imports."""
+    names = []
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
             assert node.level == 0, "imports are absolute: the tree's folders are not the package's"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    return tuple(names)
 
 
 def _package(name: str) -> str:
@@ -212,7 +217,7 @@ def _package(name: str) -> str:
 def _gpuvision_imports() -> Iterator[tuple[str, str]]:
     """Yield (module, imported name) for every import within gpuvision, including imports for type checkers."""
     for module, path in _modules():
-        for name in _imported(ast.parse(path.read_text())):
+        for name in _imported(path):
             if name.split(".")[0] == "gpuvision":
                 yield module, name
 
@@ -243,7 +248,7 @@ def test_references_are_independent() -> None:
     ]
     assert wrong == []
     users = [path for path in _files("tests") if path.suffix == ".py" and path.parent.name != "reference"]
-    names = {name.split(".")[0] for path in users for name in _imported(ast.parse(path.read_text()))}
+    names = {name.split(".")[0] for path in users for name in _imported(path)}
     assert "gpuvision" in names
     assert "reference" not in names, "tests import references from gpuvision.reference only"
 
@@ -302,8 +307,7 @@ def test_the_library_needs_no_extra(top: str) -> None:
     users = [
         module
         for module, path in _modules()
-        if not module.startswith(with_extras)
-        and any(name.split(".")[0] == top for name in _imported(ast.parse(path.read_text())))
+        if not module.startswith(with_extras) and any(name.split(".")[0] == top for name in _imported(path))
     ]
     assert users == []
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import tomllib
 from pathlib import Path
 
@@ -20,9 +19,6 @@ KILLING = sorted({name for fault in PLANTED for name in fault["tests"]})
 def test_the_fast_tier_has_each_killing_test(request: pytest.FixtureRequest, name: str) -> None:
     path, _, function = name.partition("::")
     function = function.partition("[")[0]
-    tree = ast.parse((ROOT / path).read_text())
-    assert not function or function in {each.name for each in ast.walk(tree) if isinstance(each, ast.FunctionDef)}
-
     of_file = [item for item in collected_items(request.session) if item.path == ROOT / path]
     named = {item for item in of_file if function_of(item) == function or not function}
     best = Device.all()[:1]

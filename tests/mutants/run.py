@@ -84,7 +84,7 @@ def _run(faults: list[Fault], jobs: int, budget: float, report: Path) -> list[di
     unsound: set[str] = set()
     while left:
         _run_some(faults, left, trees, budget, rows, report)
-        killers = {str(rows[k]["by"]) for k in left if rows[k]["state"] == "killed"}
+        killers = {str(rows[k]["by"]) for k in left if rows[k]["state"] == "killed" and "::" in str(rows[k]["by"])}
         new = trees[0].failing(killers)
         unsound |= new
         for tree in trees:
@@ -160,6 +160,8 @@ class _Tree:
             return {"state": "not built", "by": failed[0] if failed else ""}
         if failed:
             return {"state": "killed", "by": failed[0]}
+        if status < 0:
+            return {"state": "killed", "by": f"the tests end with signal {-status}"}
         if self._pytest(tests, "--collect-only")[0] != 0:
             raise RuntimeError(f"these tests cannot be collected without a fault: {' '.join(tests)}\n{said}")
         return {"state": "not built", "by": said.strip().splitlines()[-1][:200]}

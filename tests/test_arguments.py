@@ -53,7 +53,7 @@ EXAMPLES = [
 ]
 # Numbers that may be negative: coefficients, places, angles, and directions of an axis.
 SIGNED = {
-    *(("Lens", name) for name in ("k1", "k2")),
+    *(("Lens", name) for name in ("k1", "k2", "k3", "k4")),
     *(("MountedCamera", name) for name in ("tilt", "roll", "heading")),
     *(("StraightTransport", name) for name in ("step", "start")),
     *(("Grid", name) for name in ("left", "top")),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import logging
 import lzma
 import math
@@ -23,6 +24,7 @@ from gpuvision.host.errors import RecordingError
 from gpuvision.host.image_header import image_size, is_tiff
 from gpuvision.host.reading import check_archive, check_pixels, reading
 from gpuvision.host.sources import ArraySource, FrameSource, Source, check_frame
+from gpuvision.host.video_header import check_avi
 
 Channel = Literal["grey", "red", "green", "blue", "max", "red_difference", "green_difference", "blue_difference"]
 
@@ -42,10 +44,12 @@ _IMAGES = (".png", ".bmp", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".webp", *_T
 _VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv", ".ts")
 _NPY, _ZIP = b"\x93NUMPY", b"PK"
 _PLACES = {"blue": 0, "green": 1, "red": 2}
-_LZMA = 34925
+_PACKBITS, _LZMA, _ZSTD = 32773, 34925, (34926, 50000)
 # Largest ratio of unpacked to packed bytes, by the number of the TIFF compression: Deflate (RFC 1951) stores 258 bytes
-# in 2 bits; LZMA has no fixed bound, 10 000 exceeds measured ones.
-_LARGEST_RATIO = {8: 1032, 32946: 1032, 50013: 1032, _LZMA: 10_000}
+# in 2 bits; PackBits 128 bytes in 2; Zstandard (RFC 8878, section 3.1.1.2) a block of 128 KiB in 4. LZMA has no fixed
+# bound, 10 000 exceeds measured ones. tifffile decodes all other compressions with imagecodecs, if that is installed,
+# into memory of the size of the segment.
+_LARGEST_RATIO = {8: 1032, 32946: 1032, 50013: 1032, _PACKBITS: 64, _LZMA: 10_000, **dict.fromkeys(_ZSTD, 1 << 15)}
 _SMALL_SEGMENT = 1 << 26  # bytes: smaller segments are not counted before they are decoded
 _CHUNK = 1 << 20
 
@@ -306,14 +310,37 @@ def check_tiff_page(page: Any, what: str) -> None:
 
 def _unpacks_beyond(packed: bytes, compression: int, size: int) -> bool:
     """Return whether a compressed segment unpacks to more bytes than a size."""
-    unpacker: Any = lzma.LZMADecompressor() if compression == _LZMA else zlib.decompressobj()
+    if compression == _PACKBITS:
+        return _packbits_beyond(packed, size)
+    unpacker: Any
+    if compression in _ZSTD:
+        try:
+            unpacker = importlib.import_module("compression.zstd").ZstdDecompressor()
+        except ModuleNotFoundError:  # before Python 3.14 tifffile decodes Zstandard only with imagecodecs
+            return False
+    else:
+        unpacker = lzma.LZMADecompressor() if compression == _LZMA else zlib.decompressobj()
     total = 0
     while total <= size and not unpacker.eof:
         part = unpacker.decompress(packed, _CHUNK)
-        packed = b"" if compression == _LZMA else unpacker.unconsumed_tail
+        packed = getattr(unpacker, "unconsumed_tail", b"")  # the other two keep the rest of their input
         if not part:
             break
         total += len(part)
+    return total > size
+
+
+def _packbits_beyond(packed: bytes, size: int) -> bool:
+    """Return whether a PackBits segment (TIFF 6.0, section 9) unpacks to more bytes than a size."""
+    total = at = 0
+    while at < len(packed) and total <= size:
+        control = packed[at]
+        if control < 128:
+            total += control + 1
+            at += control + 2
+        else:  # 128 is no operation
+            total += 257 - control if control > 128 else 0
+            at += 2 if control > 128 else 1
     return total > size
 
 
@@ -323,6 +350,8 @@ class Video(FrameSource):
     def __init__(self, path: str | Path, channel: Channel = "grey") -> None:
         self._path = Path(path)
         with reading(path, "video", RecordingError):
+            with self._path.open("rb") as file:
+                check_avi(file)
             self._capture = cv2.VideoCapture(str(path))
             self._grabbed = self._capture.isOpened() and self._capture.grab()
         if not self._grabbed:

@@ -12,9 +12,9 @@ import numpy.typing as npt
 from gpuvision.host.reading import FileLimit
 from gpuvision.matching.artwork.shapes import SAGITTA, Crossings, DrawnObject, Float64, Layer, is_covered
 
-MAX_BOARD_COMPARISONS = FileLimit("GPUVISION_MAX_BOARD_COMPARISONS", 200_000_000)
-"""Comparisons of lines with sides of shapes, to find the visible edges of a board. Chosen: 200 million, which take
-10 s; the largest board of the tests takes 25 million. Objects that cover each other reach it."""
+MAX_BOARD_COMPARISONS = FileLimit("GPUVISION_MAX_BOARD_COMPARISONS", 100_000_000)
+"""Comparisons of lines with sides of shapes, to find the visible edges of a board. Chosen: 100 million, which take
+5 s; the largest board of the tests takes 25 million. Objects that cover each other reach it."""
 # Lines are equal where their angle [rad], distance from the origin and width [m] round to the same multiple of this
 # number. It is not a decimal fraction, so that the lengths in files never lie between two multiples.
 _QUANTUM = math.pi * 1e-8
@@ -100,7 +100,7 @@ def board_edges(
             rows.append((each.start + low * along, each.start + high * along, each.normal, each.width, bare, *each[4:]))
         comparisons = sum(layer.comparisons for layer in layers)
         if comparisons > limit:
-            what = f"its visible edges take {comparisons} comparisons or more; do its objects cover each other?"
+            what = f"do its objects cover each other? Their visible edges take {comparisons} comparisons or more"
             MAX_BOARD_COMPARISONS.check(comparisons, what, ValueError)
     columns: list[Any] = list(zip(*rows, strict=True)) if rows else [[]] * 7
     return BoardEdges(

@@ -99,9 +99,7 @@ class Simulation:
         if self.mask is None:
             return text
         before, after = (float(np.nanmax(np.abs(each))) for each in (self.mask.error_before, self.mask.error_after))
-        return (
-            f"{text}\nmask: worst error of the light's centre {um * before:.0f} µm without, {um * after:.0f} µm with it"
-        )
+        return f"{text}\nlargest error of the centroid: {um * before:.0f} µm without, {um * after:.0f} µm with the mask"
 
     def report(self) -> dict[str, Any]:
         """Return the content of ``report.json``: lengths in metres, times in seconds."""

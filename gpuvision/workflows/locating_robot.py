@@ -64,6 +64,11 @@ class RobotLimits:
         (chosen: one in a thousand searches).
     max_missing
         Largest accepted `Evidence.missing` (chosen; tests with wrong fields and clutter confirm it).
+    max_missing_thinned, min_share, min_least_seen
+        A larger `Evidence.missing`, up to the first number, is accepted where the image is only thinned out by clutter:
+        at least ``min_share`` of the points are on lines, at least as many of the expected lines are seen, and of the
+        line that is seen least (`Evidence.least_seen`) at least ``min_least_seen`` (chosen; tests with 30 % of the
+        points replaced, and with wrong fields, confirm it).
     min_refined
         Least number of poses of the search grid that are refined (chosen: cost against the chance to miss the best
         one).
@@ -72,6 +77,9 @@ class RobotLimits:
     min_points: int = 4
     max_log_nfa: float = math.log(1e-3)
     max_missing: float = 1.0 / 3.0
+    max_missing_thinned: float = 0.7
+    min_share: float = 0.55
+    min_least_seen: float = 0.25
     min_refined: int = 24
 
 
@@ -123,7 +131,8 @@ def locate_robot(
     A pose is refused where random points reach it by chance in more than one of a thousand searches. A pose of a scan
     is also refused where the share of missing lines is more than a third of the share of explained points
     (`Evidence.missing`): clutter leaves points unexplained and robots in the way hide lines, but a wrong field does
-    both.
+    both. Clutter in place of points on lines also does both, but thins out all lines alike: such a pose is accepted
+    where no line is missing as a whole (`RobotLimits.min_least_seen`).
     """
     device = Device.best() if device is None else device
     start = time.perf_counter()
@@ -205,7 +214,12 @@ def _doubt(best: Evidence | None, count: int, limits: RobotLimits) -> str:
         return "no pose on the field fits the points; are they in metres, is this the right field?"
     if best.log_nfa > limits.max_log_nfa:
         return f"{count} points fit the field no better than random points; is it a field, are they in metres?"
-    if best.missing > limits.max_missing:
+    is_thinned = (
+        best.missing <= limits.max_missing_thinned
+        and min(best.on_lines, best.seen) >= limits.min_share
+        and best.least_seen >= limits.min_least_seen
+    )
+    if best.missing > limits.max_missing and not is_thinned:
         return (
             f"the image does not match this field: at the best pose {max(best.seen, 0.0):.0%} of the expected lines "
             f"are seen, and {best.on_lines:.0%} of the points are on lines; is the scale right?"

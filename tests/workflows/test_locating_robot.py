@@ -19,6 +19,7 @@ from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device
 from gpuvision.matching.field.distance_map import Arc, Field
 from gpuvision.matching.field.evidence import detected_fraction, distances_to_lines, expected_crossings, robot_to_field
+from gpuvision.matching.field.line_detection import FloorScan
 from gpuvision.status import Status
 from gpuvision.workflows.locating_robot import default_line_width, floor_points, locate_robot, scan_floor
 
@@ -149,6 +150,29 @@ def test_fields_are_found(spots: int, share: float, device: Device, rng: np.rand
         evidence = located.report()["evidence"]
         assert evidence["log10_nfa"] < -3.0
         assert evidence["expected"] > 20
+
+
+def replaced(scan: FloorScan, share: float, rng: np.random.Generator) -> FloorScan:
+    """Return a scan with a share of its points moved to random places on the scan lines."""
+    hit = np.flatnonzero(rng.uniform(size=len(scan.points)) < share)
+    start, end = np.split(scan.paths[rng.integers(0, len(scan.paths), len(hit))], 2, axis=1)
+    points = scan.points.copy()
+    points[hit] = start + rng.uniform(size=(len(hit), 1)) * (end - start)
+    return scan._replace(points=points)
+
+
+def test_clutter_instead_of_lines_is_no_other_field(rng: np.random.Generator) -> None:
+    """Of fields with 30 % of the points replaced by clutter more than half were refused, with the right pose."""
+    field = read_field("robocup_msl")
+    for pose in ((-6.0, 2.0, 0.7), (3.0, -1.5, -2.0), (0.5, 4.0, 1.2)):
+        scan = scan_floor(seen_from(field, pose, rng), scale=SCALE, line_width=WIDE)
+        for _ in range(3):
+            located = locate_robot(replaced(scan, 0.3, rng), field)
+            assert located.reason == ""
+            assert is_correct(located.candidates[0].pose, pose)
+        # Of another field whole lines are missing.
+        larger = scan_floor(seen_from(grown(field, 1.33), pose, rng), scale=SCALE, line_width=WIDE)
+        assert locate_robot(larger, field).reason
 
 
 def test_another_field_is_refused(device: Device, rng: np.random.Generator) -> None:

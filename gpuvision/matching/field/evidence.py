@@ -26,6 +26,7 @@ Float64 = npt.NDArray[np.float64]
 _DISTANCE_RATIOS = (0.06, 0.12, 0.25, 0.5, 1.0)
 _MIN_SINE = 0.5  # of the angle at which a scan line must cross a line to find it surely: 30 degrees (chosen)
 _MIN_CROSSING_SINE = 0.02  # of the angle at which a scan line must cross a line to count: 1.1 degrees (chosen)
+_MIN_LINE_CROSSINGS = 6  # of a line of which the share seen counts (chosen: 30 % clutter hides 6 of 6 once in 1400)
 _MIN_GAP = 3.0  # line widths between crossings that are expected separately (chosen)
 
 
@@ -38,10 +39,13 @@ class Crossings(NamedTuple):
         Positions in the robot's frame [m].
     sines : (crossings,)
         Sines of the crossing angles.
+    lines : (crossings,)
+        Indices of the lines, and after them of the arcs, that are crossed.
     """
 
     places: Float64
     sines: Float64
+    lines: npt.NDArray[np.intp]
 
 
 class Evidence(NamedTuple):
@@ -58,12 +62,16 @@ class Evidence(NamedTuple):
         Number of crossings of scan lines with lines that should have been seen; 0 where the scan lines are unknown.
     seen : float
         Share of them that was seen, corrected for chance hits of equally dense points; NaN without expected crossings.
+    least_seen : float
+        The same share of the line that is seen least, of lines with 6 expected crossings or more; NaN without such
+        lines. Clutter and gaps thin out all lines alike; a wrong field has lines that are not there at all.
     """
 
     log_nfa: float
     on_lines: float
     expected: int
     seen: float
+    least_seen: float
 
     @property
     def missing(self) -> float:
@@ -104,14 +112,24 @@ def evidence(
     nfa = log_nfa(away[alone], field, scale=scale, max_range=max_range, margin=margin)
     on_lines = float(np.mean(away <= half_line_width))
     if paths is None or not np.size(paths):
-        return Evidence(nfa, on_lines, 0, math.nan)
+        return Evidence(nfa, on_lines, 0, math.nan, math.nan)
     crossings = expected_crossings(field, pose, paths, line_width=2.0 * half_line_width)
     ends = np.asarray(paths, np.float64)
     density = len(found) / float(np.sum(np.hypot(*(ends[:, 2:] - ends[:, :2]).T)))
     windows = 2.0 * half_line_width * float(np.mean(1.0 / crossings.sines)) if len(crossings.sines) else 0.0
     by_chance = 1.0 - math.exp(-density * windows)
-    detected = (detected_fraction(crossings, found, half_line_width) - by_chance) / max(1.0 - by_chance, 1e-3)
-    return Evidence(nfa, on_lines, len(crossings.sines), detected)
+    hits = _detected(crossings, found, half_line_width)
+
+    def corrected(share: float) -> float:
+        return (share - by_chance) / max(1.0 - by_chance, 1e-3)
+
+    shares = [
+        float(np.mean(hits[crossings.lines == line]))
+        for line in np.unique(crossings.lines)
+        if np.count_nonzero(crossings.lines == line) >= _MIN_LINE_CROSSINGS
+    ]
+    seen = corrected(float(np.mean(hits))) if len(hits) else math.nan
+    return Evidence(nfa, on_lines, len(hits), seen, corrected(min(shares)) if shares else math.nan)
 
 
 def log_nfa(distances: npt.ArrayLike, field: Field, *, scale: float, max_range: float, margin: float | None) -> float:
@@ -222,26 +240,35 @@ def expected_crossings(field: Field, pose: npt.ArrayLike, paths: npt.ArrayLike, 
         for each in field.arcs
         for sign in (-1.0, 1.0)
     ]
+    # An arc is in the list twice, for the crossings into and out of its circle.
+    numbers = [*range(len(field.lines)), *(len(field.lines) + k for k in range(len(field.arcs)) for _ in range(2))]
+    line = np.repeat(np.array(numbers, np.intp), [len(each[0]) for each in found])
     path, away, sines, clear = (np.concatenate(each) for each in zip(*found, strict=True))
     order = np.lexsort((away, path))
-    path, away, sines, clear = (each[order] for each in (path, away, sines, clear))
+    path, away, sines, clear, line = (each[order] for each in (path, away, sines, clear, line))
     gap = np.where(path[1:] == path[:-1], away[1:] - away[:-1], np.inf)
     alone = np.minimum(np.append(gap, np.inf), np.append(np.inf, gap)) > _MIN_GAP * line_width
     good = alone & clear & (sines >= _MIN_SINE) & (away > line_width) & (away < length[path] - line_width)
     first, last = ends[path[good], 0], ends[path[good], 1]
     share = (away[good] / length[path[good]])[:, None]
-    return Crossings(first + share * (last - first), sines[good])
+    return Crossings(first + share * (last - first), sines[good], line[good])
 
 
 def detected_fraction(crossings: Crossings, points: npt.ArrayLike, tolerance: float) -> float:
     """Return the share of the crossings with a point within ``tolerance`` [m] of the line; NaN without crossings."""
     if not len(crossings.places):
         return math.nan
+    return float(np.mean(_detected(crossings, points, tolerance)))
+
+
+def _detected(crossings: Crossings, points: npt.ArrayLike, tolerance: float) -> npt.NDArray[np.bool_]:
+    """Return which crossings have a point within ``tolerance`` [m] of the line."""
+    found = np.asarray(points)
     detected = [
-        bool(np.any(np.hypot(*(np.asarray(points) - place).T) * sine <= tolerance))
+        bool(np.any(np.hypot(*(found - place).T) * sine <= tolerance))
         for place, sine in zip(crossings.places, crossings.sines, strict=True)
     ]
-    return float(np.mean(detected))
+    return np.array(detected, np.bool_)
 
 
 _Found = tuple[npt.NDArray[np.intp], Float64, Float64, npt.NDArray[np.bool_]]

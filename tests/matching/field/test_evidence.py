@@ -116,6 +116,26 @@ def test_missing_is_what_is_not_seen_beside_what_is_explained() -> None:
     assert (unknown.expected, unknown.missing) == (0, 0.0)
 
 
+def test_line_that_is_seen_least() -> None:
+    """Six paths across one line and six across the other one: half of one line is seen, and nothing of the other."""
+    upright = [(x, -1.0, x, 1.0) for x in (-3.5, -3.0, -2.5, 2.5, 3.0, 3.5)]
+    level = [(-1.0, y, 1.0, y) for y in (-1.6, -1.2, -0.8, 0.8, 1.2, 1.6)]
+    crossings = expected_crossings(CROSS, (0.0, 0.0, 0.0), [*upright, *level], line_width=0.05)
+    assert crossings.lines.tolist() == [0] * 6 + [1] * 6
+    settings = {"half_line_width": 0.025, "scale": 0.2, "max_range": 3.0, "margin": 0.5}
+    thinned = np.concatenate([crossings.places[:6:2], crossings.places[6:]])
+    density = len(thinned) / 24.0
+    by_chance = 1.0 - math.exp(-density * 0.05)
+    found = evidence(thinned, [*upright, *level], CROSS, (0.0, 0.0, 0.0), **settings)
+    assert found.least_seen == pytest.approx((0.5 - by_chance) / (1.0 - by_chance))
+    gone = evidence(crossings.places[6:], [*upright, *level], CROSS, (0.0, 0.0, 0.0), **settings)
+    assert gone.least_seen < 0.0 < gone.seen
+    few = evidence(thinned, [*upright[:5], *level[:5]], CROSS, (0.0, 0.0, 0.0), **settings)
+    assert math.isnan(few.least_seen)
+    rounds = expected_crossings(ROUND, (0.0, 0.0, 0.0), [(-3.0, 0.5, 2.9, 0.5), (3.7, -2.0, 3.7, 2.0)], line_width=0.05)
+    assert rounds.lines.tolist() == [0, 0, 1]
+
+
 @pytest.mark.parametrize("margin", [None, 1.0])
 @pytest.mark.parametrize("near", [0, 1, 4, 17, 50])
 def test_false_alarms_in_closed_form(near: int, margin: float | None) -> None:

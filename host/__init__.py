@@ -1,5 +1,8 @@
 """Run kernels: find devices, build programs, bind operations, stream frames. Knows no vision."""
 
+from gpuvision.host import cache as cache  # before pyopencl is imported: it checks the cache folder's variable
+
+# isort: split
 from gpuvision.host.arrays import Array, DeviceArray, FloatArray, HostArray, IntArray, StatusArray, host_view, to_numpy
 from gpuvision.host.batch import Batch
 from gpuvision.host.bound import Bound

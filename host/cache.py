@@ -39,6 +39,9 @@ def _drop_relative() -> None:
         del os.environ[_VARIABLE]
 
 
+_drop_relative()  # pyopencl makes its cache folder when it is imported
+
+
 def provide_cache() -> None:
     """Make the cache folder private; set a temporary one for this process where that is not possible.
 

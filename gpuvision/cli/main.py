@@ -74,9 +74,6 @@ def main() -> None:
     """Run the command line. Errors become one line on stderr and an exit code."""
     # Idle BLAS threads of NumPy spin for about 20 ms and take cores from the kernels; shorten that (2**4 cycles).
     os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
-    # The XDG specification has relative paths ignored; pyopencl reads the variable when it is imported.
-    if not os.path.isabs(os.environ.get("XDG_CACHE_HOME", os.sep)):
-        del os.environ["XDG_CACHE_HOME"]
     with _ending_by_signals():
         try:
             _run()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import stat
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -196,3 +197,13 @@ def test_names_of_a_driver_are_printable() -> None:
     handle = FakePlatform("P\x1b[2Jlatform").devices[0]
     listed = discovery.ListedDevice("x", "x", 0, 0, handle, "", None)
     assert listed.platform == "Platform"
+
+
+def test_the_import_ignores_a_relative_cache_folder(tmp_path: Path) -> None:
+    """pyopencl makes its cache folder when it is imported."""
+    code = "import os, gpuvision.host; print(os.environ.get('XDG_CACHE_HOME'))"
+    environment = os.environ | {"XDG_CACHE_HOME": "relative"}
+    command = [sys.executable, "-c", code]
+    ran = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path, env=environment)
+    assert ran.stdout == "None\n"
+    assert not list(tmp_path.iterdir())

@@ -13,6 +13,7 @@ _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # JPEG markers SOF0 to SOF15 start a frame and hold its size; C4, C8 and CC are other segments (ITU-T T.81, table B.1).
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _HEAD_BYTES = 4096
+_JPEG_END = b"\xff\xd9"
 _MOST_SEGMENTS = 10_000  # of a JPEG file before its frame; cameras write fewer than 100
 
 
@@ -67,7 +68,7 @@ def _check_png(file: BinaryIO) -> None:
 
 
 def _jpeg_size(file: BinaryIO) -> tuple[int, int] | None:
-    """Return the size in the first frame header of a JPEG file."""
+    """Return the size in the first frame header of a JPEG file; refuse a file without the end of its image."""
     file.seek(2)
     for _ in range(_MOST_SEGMENTS):
         segment = file.read(4)
@@ -77,6 +78,10 @@ def _jpeg_size(file: BinaryIO) -> tuple[int, int] | None:
             file.seek(-3, 1)
         elif segment[1] in _FRAMES:
             frame = file.read(5)
+            # In compressed data a byte 0xFF is never followed by 0xD9, so the pair ends the image. Without it decoders
+            # fill the missing rows with grey.
+            if _JPEG_END not in file.read():
+                raise ValueError("it is truncated: there is no end-of-image marker")
             return struct.unpack(">xHH", frame) if len(frame) == 5 else None
         else:
             (length,) = struct.unpack_from(">H", segment, 2)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import ConvexHull, QhullError
 
 from gpuvision.camera.camera import COEFFICIENT_NAMES, Camera
 from gpuvision.camera.lens import Lens
@@ -73,6 +75,24 @@ class DetectedTarget(NamedTuple):
         return int(np.count_nonzero(np.isfinite(self.grid[..., 0])))
 
 
+def image_coverage(detected: Sequence[DetectedTarget], size: tuple[int, int]) -> float:
+    """Return the part of the image inside the convex hull of all detected points, 0 to 1.
+
+    Parameters
+    ----------
+    detected : sequence of DetectedTarget
+        Detected target patterns.
+    size : (int, int)
+        Columns and rows of the image.
+    """
+    points = np.concatenate([np.asarray(line) for each in detected for family in each.families for line in family])
+    try:
+        hull = ConvexHull(points[np.isfinite(points).all(axis=1)])
+    except QhullError:
+        return 0.0
+    return min(float(hull.volume) / (size[0] * size[1]), 1.0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
     """Calibrated camera model with its detected target patterns.
@@ -105,6 +125,11 @@ class Calibration:
     def model(self) -> Lens | Camera | None:
         """Model that corrects images and points; None if the lines are straight without a lens."""
         return self.fit.lens if isinstance(self.fit, LensFit) else self.fit.camera
+
+    @property
+    def coverage(self) -> float:
+        """Part of the image inside the convex hull of all points, 0 to 1; outside the model is extrapolated."""
+        return image_coverage(self.detected_targets, self.image_size)
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
@@ -163,7 +188,8 @@ class Calibration:
         used = len(self.detected_targets)
         before, after = self.straightness_px
         return (
-            f"{self.pattern} in {used} of {used + len(self.skipped_images)} images, {points} points; "
+            f"{self.pattern} in {used} of {used + len(self.skipped_images)} images, {points} points "
+            f"over {100.0 * self.coverage:.0f} % of the image; "
             f"model {self.fit.model}: residual {self.fit.rms_px:.3g} px rms; deviation from straight lines "
             f"{before:.3g} px, corrected {after:.3g} px"
         )
@@ -174,6 +200,7 @@ class Calibration:
         table: dict[str, Any] = {
             "pattern": self.pattern,
             "image_size": list(self.image_size),
+            "coverage": self.coverage,
             "model": fit.model,
             "rms_px": fit.rms_px,
             "straightness_px": dict(zip(("measured", "corrected"), self.straightness_px, strict=True)),
@@ -188,7 +215,8 @@ class Calibration:
             "skipped_images": {path.name: reason for path, reason in self.skipped_images},
         }
         if isinstance(fit, LensFit):
-            return table | {"sigma_px": fit.sigma_px, "lines": fit.lines}
+            lack_of_fit = {"error_model": fit.error_model, "lack_of_fit": asdict(fit.lack_of_fit)}
+            return table | {"sigma_px": fit.sigma_px, "lines": fit.lines} | lack_of_fit
         tilt = {"alpha_rad": fit.sensor.alpha, "alpha_sigma_rad": fit.alpha_sigma}
         poses = [{"rotation": p.rotation.tolist(), "translation": p.translation.tolist()} for p in fit.poses]
         return table | {"sigma_px": fit.sigma_px, "tilt": tilt, "poses": poses}

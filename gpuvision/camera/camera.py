@@ -83,6 +83,12 @@ class Camera:
         if max(map(abs, self.distortion[12:])) >= 0.5 * math.pi:
             raise ValueError(f"Camera.distortion tilts by {self.distortion[12:]} rad, expected less than a right angle")
 
+    def in_window(self, first: Sequence[float], binning: int = 1) -> Camera:
+        """Return the camera in the pixels of a window of the image, as `Lens.in_window`."""
+        (fx, _, cx), (_, fy, cy), _ = self.matrix
+        cx, cy = ((c - f - 0.5 * (binning - 1)) / binning for c, f in zip((cx, cy), first, strict=True))
+        return replace(self, matrix=((fx / binning, 0.0, cx), (0.0, fy / binning, cy), (0.0, 0.0, 1.0)))
+
     # ---- kernel tables and defines -------------------------------------------------------------------------
 
     def defines(self, matrix: npt.ArrayLike | None = None) -> dict[str, Define]:

@@ -22,8 +22,11 @@ _MAX_CENTRE = 1e9
 # Imaginary part of a computed root, relative to its size, up to which the root counts as real. Derived: roots of a
 # quartic are computed to about 1e-14; a double root, which is no fold, splits by the square root of that.
 _REAL_ROOT = 1e-9
-# Scaled coefficient below which a term is left out of the search for a fold: the fold would lie at 1e7 scale radii.
-_FAINT_TERM = 1e-60
+# Inverse of the farthest fold that is searched, in squared scale radii. A scale radius is where the largest term of the
+# slope reaches 1; a thousand of them are far outside of every image.
+_FARTHEST_FOLD = 1e-6
+# Doublings of the bracket of a measured radius.
+_MAX_DOUBLINGS = 64
 _Number = TypeVar("_Number", float, npt.NDArray[np.float64])
 
 
@@ -36,29 +39,25 @@ def _horner(coefficients: Sequence[float], square: _Number) -> _Number:
     return cast("_Number", result)
 
 
-def _scaled_slope(coefficients: Sequence[float]) -> tuple[np.polynomial.Polynomial, float]:
-    """Return d/dr of r (1 + k1 r^2 + ...) as a polynomial in z = r^2 / unit with coefficients of about 1, and unit."""
+def _fold_radius(coefficients: Sequence[float]) -> float:
+    """Return the least radius at which r (1 + k1 r^2 + ...) stops rising; infinite if it rises everywhere."""
     factors = [(2 * order + 1) * k for order, k in enumerate(coefficients, 1)]
     rates = [abs(factor) ** (1.0 / order) for order, factor in enumerate(factors, 1)]
     rate = max(rates)
-    powers = [
+    # The slope in z = rate r^2 has coefficients of at most 1. Its roots in 1/z are those of a polynomial with the
+    # leading coefficient 1, which stays well conditioned when a term vanishes; the nearest fold is the largest root.
+    scaled = [
         math.copysign((each / rate) ** order, k) for order, (each, k) in enumerate(zip(rates, factors, strict=True), 1)
     ]
-    scaled = [1.0, *powers]
-    while abs(scaled[-1]) < _FAINT_TERM:
-        scaled.pop()
-    return np.polynomial.Polynomial(scaled), 1.0 / rate
-
-
-def _fold_radius(coefficients: Sequence[float]) -> float:
-    """Return the least radius at which r (1 + k1 r^2 + ...) stops rising; infinite if it rises everywhere."""
-    slope, unit = _scaled_slope(coefficients)
-    roots = [z.real for z in slope.roots() if abs(z.imag) <= _REAL_ROOT * abs(z) and z.real > 0.0]
-    if not roots:
+    inverse = np.roots([1.0, *scaled]).astype(np.complex128)
+    is_fold = (np.abs(inverse.imag) <= _REAL_ROOT * np.abs(inverse)) & (inverse.real > _FARTHEST_FOLD)
+    if not is_fold.any():
         return math.inf
-    z = min(roots)
-    change = slope.deriv()(z)
-    return math.sqrt(unit * (z - slope(z) / change if change != 0.0 else z))
+    z = 1.0 / float(inverse.real[is_fold].max())
+    change = _horner([order * c for order, c in enumerate(scaled, 1)], z)
+    if change != 0.0:
+        z -= (1.0 + z * _horner(scaled, z)) / change
+    return math.sqrt(z / rate)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,6 +148,21 @@ class Lens:
         """Return the same lens for points in (row, column) order."""
         return replace(self, centre=self.centre[::-1])
 
+    def in_window(self, first: Sequence[float], binning: int = 1) -> Lens:
+        """Return the lens in the pixels of a window of the image.
+
+        Parameters
+        ----------
+        first : sequence of 2 floats
+            Column and row of the window's first pixel in this lens' pixels.
+        binning : int
+            Pixels of this lens per pixel of the window, along each axis. Default 1.
+        """
+        powers = (binning ** (2 * order) for order in range(1, 5))
+        k1, k2, k3, k4 = (k * p for k, p in zip((self.k1, self.k2, self.k3, self.k4), powers, strict=True))
+        column, row = ((c - f - 0.5 * (binning - 1)) / binning for c, f in zip(self.centre, first, strict=True))
+        return Lens(k1=k1, k2=k2, k3=k3, k4=k4, centre=(column, row))
+
     @property
     def fold_radius(self) -> float:
         """Measured radius up to which the polynomial increases; no scene point lies beyond it (inf: no limit)."""
@@ -216,9 +230,14 @@ class Lens:
             high = np.full_like(target, fold)
             reachable = target < self.undistorted_radius(fold)
         else:
-            # Without a fold the slope has a positive lower bound, so the root is at most target / bound. (With k1
-            # alone, any k1 below 0 folds; the fold radius of a tiny one overflows to infinity.)
-            high = target / self._least_slope
+            # Without a fold the polynomial rises everywhere: double the bracket until it reaches the target.
+            high = target.copy()
+            for _ in range(_MAX_DOUBLINGS):
+                with np.errstate(over="ignore", invalid="ignore"):
+                    short = high * (1.0 + self._stretch(high**2)) < target
+                if not np.any(short):
+                    break
+                high = np.where(short, 2.0 * high, high)
             reachable = np.isfinite(target)
         low = np.zeros_like(target)
         radius = np.where(reachable, np.minimum(target, high), np.nan)
@@ -234,17 +253,6 @@ class Lens:
                 step = radius - excess / (1.0 + stretch + 2.0 * square * self._stretch_slope(square))
             radius = np.where((step >= low) & (step <= high), step, np.where(reachable, 0.5 * (low + high), np.nan))
         return radius
-
-    @property
-    def _least_slope(self) -> float:
-        """Least slope of r (1 + k1 r^2 + ...) over all radii of a lens without a fold."""
-        if len(self.coefficients) <= 2:
-            return 1.0 - 9.0 * self.k1**2 / (20.0 * self.k2) if self.k1 < 0.0 < self.k2 else 1.0
-        slope, _ = _scaled_slope(self.coefficients)
-        extrema = slope.deriv().roots()
-        return float(
-            min([1.0, *(slope(z.real) for z in extrema if abs(z.imag) <= _REAL_ROOT * abs(z) and z.real > 0.0)])
-        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the lens as a table of numbers and lists for TOML."""

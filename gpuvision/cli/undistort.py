@@ -29,6 +29,14 @@ class Border(StrEnum):
     reflect = "reflect"
 
 
+class Frame(StrEnum):
+    """Values of ``--frame``."""
+
+    same = "same"
+    all = "all"
+    valid = "valid"
+
+
 Inputs = Annotated[
     list[Path],
     typer.Argument(
@@ -59,6 +67,21 @@ Region = Annotated[
     typer.Option(metavar="COLUMN,ROW,COLUMNS,ROWS", help="Part of the corrected images to compute. Default: all."),
 ]
 
+FrameChoice = Annotated[
+    Frame | None,
+    typer.Option(
+        help="Part that the corrected images show: same (default; the rectangle of the image), all (every pixel; "
+        "OpenCV: alpha 1) or valid (no missing pixels; OpenCV: alpha 0)."
+    ),
+]
+Window = Annotated[
+    str | None,
+    typer.Option(metavar="COLUMN,ROW", help="First pixel of cropped images in the calibrated image. Default: 0,0."),
+]
+Binning = Annotated[
+    int | None, typer.Option(min=1, help="Calibrated pixels per pixel of binned or scaled images. Default: 1.")
+]
+
 
 def undistort(
     inputs: Inputs,
@@ -68,6 +91,9 @@ def undistort(
     border: BorderChoice = None,
     border_value: BorderValue = None,
     region: Region = None,
+    frame: FrameChoice = None,
+    window: Window = None,
+    binning: Binning = None,
     device: DeviceLabel = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -77,7 +103,7 @@ def undistort(
     are written only after all inputs succeeded.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    from gpuvision.formats.camera_file import read_lens
+    from gpuvision.formats.camera_file import read_calibrated_size, read_lens
     from gpuvision.host import Device
     from gpuvision.host.files import check_writable_folder
     from gpuvision.host.outputs import Outputs
@@ -87,7 +113,7 @@ def undistort(
         reject_unused("without --border constant", border_value=border_value)
     if all(each.suffix.lower() == ".npy" for each in inputs):
         reason = "for points, only for images"
-        reject_unused(reason, interpolation=interpolation, border=border, region=region)
+        reject_unused(reason, interpolation=interpolation, border=border, region=region, frame=frame)
     model = read_lens(lens)
     check_writable_folder(out)
     suffixes = (".png", ".tif", ".npy")
@@ -104,6 +130,10 @@ def undistort(
             border=(border or Border.mask).value,
             border_value=border_value or 0.0,
             region=part,
+            frame=(frame or Frame.same).value,
+            calibrated_size=read_calibrated_size(lens),
+            window=None if window is None else _window(window),
+            binning=binning or 1,
             overwrite=overwrite,
             progress=progress,
         )
@@ -116,3 +146,11 @@ def _region(text: str) -> tuple[int, int, int, int]:
     except ValueError:
         raise ValueError(f"--region is {text!r}, expected column,row,columns,rows in whole pixels") from None
     return column, row, columns, rows
+
+
+def _window(text: str) -> tuple[int, int]:
+    try:
+        column, row = (int(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"--window is {text!r}, expected column,row in whole pixels") from None
+    return column, row

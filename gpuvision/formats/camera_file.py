@@ -1,9 +1,9 @@
 """Camera files (TOML): ``gpuvision calibrate`` writes them, ``gpuvision undistort`` and sensor files read them.
 
 A file holds one of two tables: ``[lens]``, the radial distortion of measured pixels (`Lens`), as in a sensor file; or
-``[camera]``, a camera matrix and OpenCV's coefficients (`Camera`). The tables ``[image]``, ``[uncertainty]`` and
-``[fit]`` document the calibration; no reader uses them. A table ``[mount]`` describes a
-`gpuvision.camera.ground_plane.MountedCamera`.
+``[camera]``, a camera matrix and OpenCV's coefficients (`Camera`). The table ``[image]`` holds the size of the
+calibrated images (`read_calibrated_size`). The tables ``[uncertainty]`` and ``[fit]`` document the calibration; no
+reader uses them. A table ``[mount]`` describes a `gpuvision.camera.ground_plane.MountedCamera`.
 """
 
 from __future__ import annotations
@@ -53,6 +53,25 @@ def read_lens(path: str | Path) -> Lens | Camera:
     if camera is not None and lens is None:
         return _camera(camera)
     raise top.error("expected one table, [lens] or [camera]")
+
+
+def read_calibrated_size(path: str | Path) -> tuple[int, int] | None:
+    """Return columns and rows of the images that a camera file was calibrated from; None if the file does not say.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    DescriptionError
+        The size is no pair of whole numbers above 0.
+    """
+    table = read_toml(Path(path)).optional_section("image")
+    if table is None or "size" not in table:
+        return None
+    columns, rows = table.numbers("size", "pixel", (2,))
+    if min(columns, rows) < 1.0 or columns != int(columns) or rows != int(rows):
+        raise table.error(f"size is ({columns:g}, {rows:g}), expected two whole numbers of pixels above 0")
+    return int(columns), int(rows)
 
 
 def radial_lens(table: Section) -> Lens:

@@ -6,14 +6,16 @@ distortion and sensor tilt from three views of a grid, or from one view and a kn
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.calibration import Calibration, DetectedTarget, TargetPattern
+from gpuvision.camera.calibration import Calibration, DetectedTarget, TargetPattern, image_coverage
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.lines.lens_fit import LensFit
@@ -33,6 +35,12 @@ from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
 from gpuvision.host.recordings import read_image
 from gpuvision.plots.calibration import draw_calibration
+
+# Points, and part of the image that they cover, from which "no lens distortion" may be concluded. Derived: a grid of
+# 5 x 5 points leaves 10 numbers after its lines; distortion grows with the third power of the radius, so a target over
+# less than a quarter of the image (half its radius) sees less than an eighth of the displacement.
+_MIN_POINTS = 25
+_MIN_COVERAGE = 0.25
 
 Method = Literal["auto", "lines", "views"]
 Progress = Callable[[int, int | None], object]
@@ -120,6 +128,8 @@ def calibrate(
         lens_model: Any = model
         fit = fit_lens(families, model=lens_model, loss=loss)
         correction = fit.lens
+        if correction is None and model == "auto":
+            _check_enough_to_judge(detected, size, pattern)
     return Calibration(
         fit=fit,
         pattern=pattern,
@@ -130,6 +140,23 @@ def calibrate(
     )
 
 
+def _check_enough_to_judge(detected: Sequence[DetectedTarget], size: tuple[int, int], pattern: TargetPattern) -> None:
+    """Refuse to say that no correction is needed if few points, or a small part of the image, were seen.
+
+    Raises
+    ------
+    ValueError
+        Fewer than `_MIN_POINTS` points, or a coverage below `_MIN_COVERAGE`.
+    """
+    points, coverage = sum(each.points for each in detected), image_coverage(detected, size)
+    if points < _MIN_POINTS or coverage < _MIN_COVERAGE:
+        raise ValueError(
+            f"{pattern} found in {len(detected)} images: {points} points over {100.0 * coverage:.0f} % of the image, "
+            f"too few to tell whether the lens distorts; expected {_MIN_POINTS} points over "
+            f"{100.0 * _MIN_COVERAGE:.0f} %. Is this the pattern of the target?"
+        )
+
+
 def _detect_targets(
     files: Sequence[Path], pattern: TargetPattern, inner_corners: tuple[int, int] | None, progress: Progress
 ) -> tuple[list[DetectedTarget], list[tuple[Path, str]], tuple[int, int]]:
@@ -137,6 +164,7 @@ def _detect_targets(
     detected: list[DetectedTarget] = []
     skipped_images: list[tuple[Path, str]] = []
     size: tuple[int, int] | None = None
+    seen: dict[bytes, Path] = {}
     for number, file in enumerate(files):
         progress(number, len(files))
         if not file.exists():
@@ -149,6 +177,11 @@ def _detect_targets(
                 "of one camera, all of one size"
             )
         size = image_size
+        # An image given twice adds no information, but counts twice and makes the uncertainties too small.
+        first = seen.setdefault(hashlib.sha256(np.ascontiguousarray(image).data).digest(), file)
+        if first is not file:
+            skipped_images.append((file, f"it has the same pixels as {first}"))
+            continue
         try:
             detected.append(_detect(file, image[..., :3] if image.ndim == 3 else image, pattern, inner_corners))
         except ValueError as error:

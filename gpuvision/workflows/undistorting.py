@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -21,6 +21,9 @@ from gpuvision.host.files import atomic_write
 from gpuvision.host.outputs import Outputs
 from gpuvision.host.recordings import read_array, read_image
 
+# Pixels of the frame "all" over those of the image, at most: near the fold of a lens it grows without bound.
+_LARGEST_FRAME = 16
+Frame = Literal["same", "all", "valid"]
 Progress = Callable[[int, int | None], object]
 
 
@@ -34,6 +37,10 @@ def undistort_files(
     border: Border = "mask",
     border_value: float = 0.0,
     region: tuple[int, int, int, int] | None = None,
+    frame: Frame = "same",
+    calibrated_size: tuple[int, int] | None = None,
+    window: tuple[int, int] | None = None,
+    binning: int = 1,
     overwrite: bool = False,
     progress: Progress = lambda done, of: None,
 ) -> tuple[Path, ...]:
@@ -51,6 +58,18 @@ def undistort_files(
         Device to run on.
     interpolation, border, border_value, region
         See `UndistortImage`; they apply to images.
+    frame : {"same", "all", "valid"}
+        Part of the ideal plane that an image shows. "same" (default): the rectangle of the measured image; content that
+        the correction moves outside is cut off. "all": the smallest rectangle with every measured pixel (OpenCV: alpha
+        = 1). "valid": the largest rectangle between the corrected borders, without missing pixels (OpenCV: alpha = 0).
+    calibrated_size : (int, int), optional
+        Columns and rows of the images that the model was calibrated from. Images of another size are refused unless
+        ``window`` or ``binning`` says which part of the sensor they show. Default: not checked.
+    window : (int, int), optional
+        Column and row, in the calibrated image, of the first pixel of the images. Default: (0, 0).
+    binning : int
+        Pixels of the calibrated image per pixel of the images, along each axis. Default 1. ``window`` and ``binning``
+        apply to points as well.
     overwrite : bool
         Whether files may be replaced that no earlier undistortion wrote. Default False. The inputs are never replaced.
     progress : callable
@@ -78,8 +97,20 @@ def undistort_files(
     if duplicates:
         raise RecordingError(f"several inputs have the name {min(duplicates)}; undistort them into separate folders")
     written = []
+    if binning < 1:
+        raise ValueError(f"binning is {binning}, expected a whole number of 1 or more")
+    if frame != "same" and region is not None:
+        raise ValueError(f"frame {frame!r} and region both choose the part of the image; leave one out")
     outputs = Outputs("undistort", inputs=inputs, overwrite=overwrite)
-    image_options = {"interpolation": interpolation, "border": border, "border_value": border_value, "region": region}
+    is_part = window is not None or binning > 1
+    if is_part:
+        model = model.in_window(window or (0, 0), binning)
+    image_options: dict[str, Any] = {
+        "interpolation": interpolation,
+        "border": border,
+        "border_value": border_value,
+        "region": region,
+    }
     with outputs.folder(out) as folder:
         for number, file in enumerate(inputs):
             progress(number, len(inputs))
@@ -93,12 +124,73 @@ def undistort_files(
                     np.save(npy, points)
             else:
                 image = _image_without_alpha(file)
+                _check_size(file, image, calibrated_size, (window or (0, 0), binning) if is_part else None)
+                if frame != "same":
+                    image_options["region"] = frame_region(model, (image.shape[1], image.shape[0]), frame)
                 name = f"{file.stem}.tif" if image.dtype == np.float32 else f"{file.stem}.png"
                 outputs.claim(out / name)
                 _write(folder / name, _undistorted_image(image, model, device, image_options))
             written.append(out / name)
         progress(len(inputs), len(inputs))
     return tuple(written)
+
+
+def _check_size(
+    file: Path,
+    image: npt.NDArray[Any],
+    calibrated_size: tuple[int, int] | None,
+    part: tuple[tuple[int, int], int] | None,
+) -> None:
+    """Refuse an image that does not show the sensor pixels for which the model was calibrated."""
+    rows, columns = image.shape[:2]
+    if calibrated_size is None or (part is None and (columns, rows) == calibrated_size):
+        return
+    said = f"{file}: {columns} x {rows} pixels, the model was calibrated at {calibrated_size[0]} x {calibrated_size[1]}"
+    if part is None:
+        raise ValueError(f"{said}; give the window and the binning of these images, or calibrate at their size")
+    window, binning = part
+    ends = (window[0] + columns * binning, window[1] + rows * binning)
+    if min(window) < 0 or ends[0] > calibrated_size[0] or ends[1] > calibrated_size[1]:
+        raise ValueError(f"{said}; the window from {window} with binning {binning} ends at {ends}, outside")
+
+
+def frame_region(model: Lens | Camera, size: tuple[int, int], frame: Frame) -> tuple[int, int, int, int]:
+    """Return the region (column, row, columns, rows) of the ideal plane that shows all, or only valid, pixels.
+
+    Parameters
+    ----------
+    model : Lens or Camera
+        Camera model.
+    size : (int, int)
+        Columns and rows of the measured image.
+    frame : {"same", "all", "valid"}
+        See `undistort_files`.
+
+    Raises
+    ------
+    ValueError
+        The border has no corrected position (it lies past the fold of the model), or the region is empty or has more
+        than 16 times the pixels of the image.
+    """
+    columns, rows = size
+    if frame == "same":
+        return 0, 0, columns, rows
+    across, down = np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)
+    top, bottom = (np.stack([across, np.full(columns, row)], -1) for row in (0.0, rows - 1.0))
+    left, right = (np.stack([np.full(rows, column), down], -1) for column in (0.0, columns - 1.0))
+    top, bottom, left, right = (model.undistort(each) for each in (top, bottom, left, right))
+    border = np.concatenate([top, bottom, left, right])
+    if not np.all(np.isfinite(border)):
+        raise ValueError(f"frame {frame!r}: the image's border lies past the fold of the model; use --region")
+    if frame == "all":
+        first, last = np.floor(border.min(axis=0)), np.ceil(border.max(axis=0))
+    else:
+        first = np.ceil([left[:, 0].max(), top[:, 1].max()])
+        last = np.floor([right[:, 0].min(), bottom[:, 1].min()])
+    made = last - first + 1.0
+    if np.any(made < 1.0) or made[0] * made[1] > _LARGEST_FRAME * columns * rows:
+        raise ValueError(f"frame {frame!r}: it would have {made[0]:.0f} x {made[1]:.0f} pixels; use --region")
+    return int(first[0]), int(first[1]), int(made[0]), int(made[1])
 
 
 def _image_without_alpha(file: Path) -> npt.NDArray[Any]:

@@ -126,6 +126,84 @@ def test_wrong_lens_file(text: str, said: str, tmp_path: Path) -> None:
         read_lens(tmp_path / "lens.toml")
 
 
+def test_a_truncated_jpeg_is_refused(seen: View, tmp_path: Path) -> None:
+    """Decoders fill the missing rows with grey, and the dots at the seam are wrong."""
+    whole = photographed(seen, tmp_path / "whole.jpg")
+    assert calibrate([whole]).fit.model == "k1"
+    for share in (0.5, 0.9, 0.999):
+        cut = tmp_path / "cut.jpg"
+        cut.write_bytes(whole.read_bytes()[: int(share * whole.stat().st_size)])
+        with pytest.raises(RecordingError, match="truncated: there is no end-of-image marker"):
+            calibrate([cut])
+
+
+def test_an_image_given_twice_counts_once(image: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.png"
+    copy.write_bytes(image.read_bytes())
+    twice = calibrate([image, copy, image])
+    assert len(twice.detected_targets) == 1
+    assert [path for path, _ in twice.skipped_images] == [copy, image]
+    assert all("the same pixels as" in reason for _, reason in twice.skipped_images)
+    assert twice.parameters == calibrate([image]).parameters
+
+
+def test_few_points_do_not_tell_that_a_lens_is_not_needed(tmp_path: Path) -> None:
+    """A pattern of 4 x 4 dots in a corner; they are straight, and say nothing about the lens."""
+    small = view((640, 480), 4, 4, 12.0, barrel=0.0)
+    path = tmp_path / "small.png"
+    cv2.imwrite(str(path), photo(dots(small, np.ones((4, 4), bool)), np.random.default_rng(3)))
+    with pytest.raises(ValueError, match=r"dots found in 1 images: 16 points over \d+ % of the image, too few"):
+        calibrate([path])
+
+
+def test_coverage_is_part_of_the_report(done: Calibration) -> None:
+    ends = [done.detected_targets[0].grid[i, j] for i, j in ((0, 0), (0, -1), (-1, -1), (-1, 0))]
+    area = cv2.contourArea(np.array(ends, np.float32)) / (640 * 480)
+    assert done.coverage == pytest.approx(area, rel=0.03)
+    assert done.report()["coverage"] == done.coverage
+    assert f"over {100.0 * done.coverage:.0f} % of the image" in done.summary()
+
+
+def test_a_lens_of_another_size_is_refused(image: Path, tmp_path: Path) -> None:
+    write_lens(tmp_path / "lens.toml", LENS, {"image": {"size": [4000, 3000]}})
+    out = tmp_path / "straight"
+    with pytest.raises(ValueError, match="640 x 480 pixels, the model was calibrated at 4000 x 3000; give the window"):
+        run("undistort", image, "--lens", tmp_path / "lens.toml", "--out", out)
+    assert not out.exists() or not list(out.glob("*.png"))
+    with pytest.raises(ValueError, match="outside"):
+        run("undistort", image, "--lens", tmp_path / "lens.toml", "--out", out, "--window", "3500,0")
+    run("undistort", image, "--lens", tmp_path / "lens.toml", "--out", out, "--window", "100,20", "--binning", "2")
+    assert (out / "grid.png").exists()
+
+
+@pytest.mark.parametrize("model", [LENS, CAMERA])
+def test_window_and_binning_are_those_of_the_sensor(model: Lens | Camera) -> None:
+    """A binned pixel lies in the middle of the pixels that it sums."""
+    part = model.in_window((100, 20), 2)
+    points = np.array([[0.0, 0.0], [100.0, 50.0], [250.0, 180.0]])
+    sensor = 2.0 * points + np.array([100.0, 20.0]) + 0.5
+    expected = (model.undistort(sensor) - [100.0, 20.0] - 0.5) / 2.0
+    np.testing.assert_allclose(part.undistort(points), expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("k1", [2e-7, -2e-7])
+def test_frames_show_all_or_only_valid_pixels(k1: float, tmp_path: Path, device: Device) -> None:
+    lens = Lens(k1=k1, centre=(310.25, 250.5))
+    white = tmp_path / "white.png"
+    cv2.imwrite(str(white), np.full((480, 640), 255, np.uint8))
+    made = {}
+    for frame in ("same", "all", "valid"):
+        (path,) = undistort_files([white], lens, tmp_path / frame, device=device, frame=frame)
+        made[frame] = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert made["same"].shape == (480, 640)
+    assert np.all(made["valid"] == 255)
+    # Area of the corrected image, by the determinant of the Jacobian in every pixel.
+    pixels = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1)
+    area = np.sum(np.linalg.det(lens.jacobian(pixels)))
+    assert np.count_nonzero(made["all"]) == pytest.approx(area, rel=0.005)
+    assert made["valid"].size < area < made["all"].size
+
+
 def test_a_sensor_file_takes_the_lens_table(tmp_path: Path) -> None:
     write_lens(tmp_path / "lens.toml", LENS, {})
     text = resources.files("gpuvision").joinpath("presets", "sensors", "camera_line.toml").read_text()

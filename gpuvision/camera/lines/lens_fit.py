@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from gpuvision.camera.lens import Lens
+from gpuvision.camera.lines.lack_of_fit import LackOfFit
 from gpuvision.camera.lines.line_families import Float64, LineFamilies, PackedLines
 from gpuvision.camera.lines.straightness import pencil_basis
 from gpuvision.camera.lines.variable_projection import Minimum, vanishing_start
@@ -46,6 +47,11 @@ class LensFitLimits:
     min_bend_variances : float
         Decrease of the sum of squares [variances] below which the linear uncertainties of several coefficients are
         rough.
+    lack_of_fit_significance : float
+        p-value of `LackOfFit` below which the residuals count as correlated.
+    max_lack_of_fit : float
+        Ratio of the smooth residuals to the noise above which a warning names the lack of fit. Chosen: below 0.5 they
+        add less than 12 % to the residual.
     """
 
     significance: float = 0.05
@@ -54,6 +60,8 @@ class LensFitLimits:
     max_centre_sigmas: float = 3.0
     max_tail_ratio: float = 2.0
     min_bend_variances: float = 100.0
+    lack_of_fit_significance: float = 0.05
+    max_lack_of_fit: float = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +78,8 @@ class LensAlternative:
         Root mean square residual [px], as in `LensFit`.
     p_value : float
         p-value of the F test against the largest model; below 0.05 this model is rejected. The largest model has
-        vanishing points if both this one and the chosen one have them.
+        vanishing points if both this one and the chosen one have them. If the residuals of the largest model are
+        correlated, the further coefficients are tested against their covariance for correlated errors (Wald's test).
     aic : float
         Akaike information criterion minus that of the chosen model; negative favours this one.
     centre : (float, float) or None
@@ -134,6 +143,8 @@ class LensFit:
     rms_px: float
     sigma_px: float
     degrees_of_freedom: int
+    lack_of_fit: LackOfFit
+    error_model: Literal["independent", "correlated"]
     iterations: int
     alternatives: tuple[LensAlternative, ...]
     warnings: tuple[str, ...]
@@ -248,6 +259,13 @@ def fit_warnings(
         yield (
             f"half of the points lie within {robust_sigma / _NORMAL_MAD:.3g} pixels, but the rms is {fit.rms_px:.3g}: "
             "there are outliers; use loss='tukey'"
+        )
+    lack = fit.lack_of_fit
+    if lack.p_value < limits.lack_of_fit_significance and lack.rms_px > limits.max_lack_of_fit * lack.noise_px:
+        yield (
+            f"the residuals form a smooth pattern of {lack.rms_px:.3g} pixels rms over the image, beside "
+            f"{lack.noise_px:.3g} pixels of noise: the target is not flat, or the lens is not of model {fit.model}; "
+            "the uncertainties include the pattern"
         )
     if fit.lens is None:
         return

@@ -97,6 +97,22 @@ def covariance(
     columns = projected_columns(
         packed, found.parameters, found.evaluation, found.slopes, found.normal.line_coefficients
     )
+    return (
+        _sandwich(
+            inner_products(columns, columns),
+            [_per_point(columns * normal, owner) for normal in image_normals(found)],
+            len(found.parameters.k),
+            keep_centre,
+        )
+        * variance
+    )
+
+
+def image_normals(found: Minimum) -> Float64:
+    """Return the normals (2, n) of the lines' curves at the points in the measured image, times the root of the weight.
+
+    They are the derivatives of the residuals by a displacement of the measured point.
+    """
     points = found.evaluation.points
     outward = 2.0 * points.slope * found.evaluation.along
     normals = np.stack(
@@ -106,15 +122,7 @@ def covariance(
         ]
     )
     normals *= found.evaluation.inverse
-    return (
-        _sandwich(
-            inner_products(columns, columns),
-            [_per_point(columns * normal, owner) for normal in normals],
-            len(found.parameters.k),
-            keep_centre,
-        )
-        * variance
-    )
+    return normals
 
 
 def robust_covariance(

@@ -19,9 +19,11 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
+from scipy.special import fdtrc
 
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.lines.alternating_minimisation import ALTERNATING_SOLVERS, minimise_alternating
+from gpuvision.camera.lines.lack_of_fit import SmoothResiduals, correlated_covariance, smooth_residuals
 from gpuvision.camera.lines.lens_fit import (
     MODELS,
     LensAlternative,
@@ -175,6 +177,7 @@ class _ModelSearch:
         self.weight: Float64 | None = None
         self.scale = 0.0
         self.linear = linear_start(packed, centre)
+        self.smooth: dict[tuple[int, bool], SmoothResiduals] = {}
 
     @property
     def can_be_concurrent(self) -> bool:
@@ -252,6 +255,7 @@ class _ModelSearch:
             )
             # Sums of squares are comparable under the same weights only.
             self.fits.clear()
+            self.smooth.clear()
         return found
 
     def _fit_from_middle(self, found: Minimum, order: int, concurrent: bool) -> Minimum:
@@ -280,10 +284,20 @@ class _ModelSearch:
         start = self.linear.parameters
         return start._replace(k=np.append(start.k, np.zeros(order - 1))), None
 
-    def p_value_of_gain(self, smaller: tuple[int, bool], larger: tuple[int, bool]) -> float:
-        """Return the p-value of the smaller model against the larger one."""
+    def p_value(self, smaller: tuple[int, bool], larger: tuple[int, bool]) -> float:
+        """Return the p-value of the smaller model against the larger one.
+
+        The F test assumes independent errors. If the residuals of the larger model are correlated, it would accept any
+        coefficient that follows the pattern of the residuals. Wald's test compares the further coefficients with their
+        covariance for correlated errors. Whether there is a lens at all remains a question for the F test.
+        """
         worse, better = self.fit(*smaller), self.fit(*larger)
         more = self.parameters(*larger) - self.parameters(*smaller)
+        if 0 < smaller[0] < larger[0] and smaller[1] == larger[1] and self.is_correlated(*larger):
+            further = slice(smaller[0], larger[0])
+            value = better.parameters.k[further]
+            statistic = float(value @ np.linalg.solve(self.covariance(*larger)[further, further], value)) / len(value)
+            return float(fdtrc(len(value), self.smooth_residuals(*larger).lack_of_fit.modes, statistic))
         residuals = (len(self.packed.x), self.independent)
         variance = None if self.sigma is None else self.sigma**2
         return p_value_of_gain(
@@ -296,15 +310,51 @@ class _ModelSearch:
         if lines == "auto":
             self.fit(largest, False)
             concurrent = (
-                self.can_be_concurrent
-                and self.p_value_of_gain((largest, True), (largest, False)) > self.limits.significance
+                self.can_be_concurrent and self.p_value((largest, True), (largest, False)) > self.limits.significance
             )
         else:
             concurrent = lines == "vanishing"
         for order in orders[:-1]:
-            if self.p_value_of_gain((order, concurrent), (largest, concurrent)) > self.limits.significance:
+            if self.p_value((order, concurrent), (largest, concurrent)) > self.limits.significance:
                 return order, concurrent
         return largest, concurrent
+
+    def noise(self, order: int, concurrent: bool) -> float:
+        """Return the standard deviation of a residual: given, robust, or from the degrees of freedom."""
+        given = self.sigma or self.scale
+        return given or math.sqrt(
+            self.fit(order, concurrent).evaluation.cost / self.degrees_of_freedom(order, concurrent)
+        )
+
+    def is_correlated(self, order: int, concurrent: bool) -> bool:
+        """Return whether the residuals of a model contain a smooth field."""
+        lack = self.smooth_residuals(order, concurrent).lack_of_fit
+        return lack.p_value < self.limits.lack_of_fit_significance
+
+    def covariance(self, order: int, concurrent: bool) -> Float64:
+        """Return the covariance of (k..., centre, two tangents per vanishing point) in packed coordinates."""
+        packed, found = self.packed, self.fit(order, concurrent)
+        if self.weight is None:
+            variance = self.noise(order, concurrent) ** 2
+            white = covariance(packed, found, self.owner, variance, keep_centre=self.keep_centre)
+        else:
+            white = robust_covariance(
+                packed, found, self.owner, self.weight, self.loss, self.scale, keep_centre=self.keep_centre
+            )
+        if not len(white) or not self.is_correlated(order, concurrent):
+            return white
+        return correlated_covariance(packed, found, self.smooth_residuals(order, concurrent), white)
+
+    def smooth_residuals(self, order: int, concurrent: bool) -> SmoothResiduals:
+        """Return the smooth field in the residuals of a model, and its test."""
+        key = (order, concurrent)
+        found = self.fit(*key)
+        if key not in self.smooth:
+            variance = None if self.sigma is None else self.sigma**2
+            self.smooth[key] = smooth_residuals(
+                self.packed, found, self.degrees_of_freedom(*key), self.independent, variance
+            )
+        return self.smooth[key]
 
 
 def _report(search: _ModelSearch, order: int, concurrent: bool, families: LineFamilies) -> LensFit:
@@ -315,13 +365,8 @@ def _report(search: _ModelSearch, order: int, concurrent: bool, families: LineFa
             f"{len(packed.x)} points on {len(packed.counts)} lines leave nothing to estimate the errors from; "
             "expected more points on the lines"
         )
-    sigma = search.sigma or search.scale or math.sqrt(found.evaluation.cost / degrees_of_freedom)
-    if search.weight is None:
-        spread = covariance(packed, found, search.owner, sigma**2, keep_centre=search.keep_centre)
-    else:
-        spread = robust_covariance(
-            packed, found, search.owner, search.weight, search.loss, search.scale, keep_centre=search.keep_centre
-        )
+    sigma = search.noise(order, concurrent)
+    spread = search.covariance(order, concurrent)
     names, values, scaled = parameters_px(packed, found, spread)
     lens = None
     if order:
@@ -339,6 +384,8 @@ def _report(search: _ModelSearch, order: int, concurrent: bool, families: LineFa
         sigma_px=sigma * packed.unit,
         degrees_of_freedom=degrees_of_freedom,
         iterations=sum(each.iterations for each in search.fits.values()),
+        lack_of_fit=search.smooth_residuals(order, concurrent).lack_of_fit,
+        error_model="correlated" if search.is_correlated(order, concurrent) else "independent",
         alternatives=_alternatives(search, order, concurrent),
         warnings=(),
     )
@@ -366,7 +413,7 @@ def _alternatives(search: _ModelSearch, order: int, concurrent: bool) -> tuple[L
                 model=MODELS[number],
                 lines="vanishing" if with_points else "free",
                 rms_px=rms_px(search.packed, other, search.weight),
-                p_value=search.p_value_of_gain((number, with_points), (largest, concurrent and with_points)),
+                p_value=search.p_value((number, with_points), (largest, concurrent and with_points)),
                 aic=search.independent * math.log(ratio) + 2.0 * more if ratio > 0.0 else -math.inf,
                 centre=centre_px(search.packed, other) if number else None,
                 centre_distance_px=distance,

@@ -201,7 +201,7 @@ class _BoxIndex:
 
     def _cell(self, point: Float64) -> npt.NDArray[np.int64]:
         """Return column and row of the cells of points; points outside belong to the nearest cell."""
-        return np.clip((point - self._origin) / self._size, 0, self._cells - 1).astype(np.int64)
+        return np.asarray(np.clip((point - self._origin) / self._size, 0, self._cells - 1), np.int64)
 
     def near(self, low: Float64, high: Float64) -> npt.NDArray[np.int64]:
         """Return, ascending, the indices of all boxes that overlap the box from low to high, and of some others."""
@@ -210,14 +210,14 @@ class _BoxIndex:
         (left, bottom), (right, top) = self._cell(low), self._cell(high)
         rows = np.arange(bottom, top + 1) * self._cells
         parts = [self._box[self._first[row + left] : self._first[row + right + 1]] for row in rows]
-        return np.unique(np.concatenate([self._large, *parts]))
+        return np.asarray(np.unique(np.concatenate([self._large, *parts])), np.int64)
 
 
 def _ranges(start: npt.NDArray[np.int64], stop: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Return the integers from each start to before its stop, one range after the other."""
     lengths = stop - start
     total = np.cumsum(lengths)
-    return np.arange(total[-1] if len(total) else 0) + np.repeat(start - total + lengths, lengths)
+    return np.asarray(np.arange(total[-1] if len(total) else 0) + np.repeat(start - total + lengths, lengths), np.int64)
 
 
 def _side(points: Float64, along: Float64) -> Float64:

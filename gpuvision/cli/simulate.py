@@ -82,6 +82,14 @@ Tolerance = Annotated[
         min=0.0, help="Largest range error [m] that the approximation of indirect light may cause; 0: no approximation."
     ),
 ]
+PatchSize = Annotated[
+    float | None,
+    typer.Option(
+        metavar="METRES",
+        help="Largest edge of the patches for multi-bounce light [m]; half the size takes about 16 times as long. "
+        "Default: patch_size of the sensor file, or a sixteenth of the part's diagonal.",
+    ),
+]
 MaskChoice = Annotated[
     str,
     typer.Option(
@@ -123,6 +131,7 @@ def simulate(
     albedo: Albedo = None,
     paths: Paths = "direct,specular,diffuse-specular,diffuse-diffuse",
     tolerance: Tolerance = 0.0,
+    patch_size: PatchSize = None,
     mask: MaskChoice = "none",
     second: SecondSensor = None,
     rule: Annotated[
@@ -155,6 +164,8 @@ def simulate(
     names = _names(paths)
     if not {"diffuse-diffuse", "multi-bounce"} & set(names):
         reject_unused("without diffuse-diffuse or multi-bounce in --paths", tolerance=tolerance or None)
+    if "multi-bounce" not in names:
+        reject_unused("without multi-bounce in --paths", patch_size=patch_size)
     described = Sensor.load(sensor)
     second_sensor = None if second is None else Sensor.load(second)
     read = [each for each in (part, sensor, second, materials, mask) if each is not None]
@@ -165,11 +176,19 @@ def simulate(
     outputs.claim(as_json)
     before = _mask(mask)
     scene, made_of = _load_part(part, unit, materials, albedo, described)
-    task = prepare_simulation(scene, made_of, described, paths=names, tolerance=tolerance, profiles=profiles)
+    task = prepare_simulation(
+        scene, made_of, described, paths=names, tolerance=tolerance, patch_size=patch_size, profiles=profiles
+    )
     other = None
     if second_sensor is not None:
         other = prepare_simulation(
-            scene, made_of, second_sensor, paths=names, tolerance=tolerance, transports=task.transports
+            scene,
+            made_of,
+            second_sensor,
+            paths=names,
+            tolerance=tolerance,
+            patch_size=patch_size,
+            transports=task.transports,
         )
     made: dict[str, Any] = {
         "mask": before,

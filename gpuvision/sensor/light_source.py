@@ -12,6 +12,7 @@
 ``blur``        standard deviation of a point's image along u [sensor unit]
 ``bins``        PSD: number of parts of a strip in which light is collected (a camera has its pixels)
 ``nodes``       rays per bin along u and along v, for indirect light
+``patch_size``  largest edge of the patches for multi-bounce light [m]; default: a sixteenth of the scene's diagonal
 ==============  ======================================================================================================
 
 Electronics:
@@ -40,7 +41,7 @@ class Light:
 
     Attributes
     ----------
-    lens, aperture, power, thickness, source, width, profile, sub_sheets, blur, bins, nodes
+    lens, aperture, power, thickness, source, width, profile, sub_sheets, blur, bins, nodes, patch_size
         The sheet of light and the optics.
     responsivity, ambient, modulated, exposure, full_well, read_noise
         The electronics.
@@ -57,6 +58,7 @@ class Light:
     blur: float = 0.0
     bins: int = 64
     nodes: tuple[int, int] = (1, 1)
+    patch_size: float | None = None
     responsivity: float = 0.4
     ambient: float = 0.0
     modulated: bool = False
@@ -89,6 +91,7 @@ def read_light(table: Section) -> Light:
         blur=table.number("blur", "sensor unit", 0.0, at_least=0.0),
         bins=table.integer("bins", 64, at_least=2),
         nodes=(int(nodes[0]), int(nodes[1])),
+        patch_size=table.number("patch_size", "m", None, above=0.0),
         responsivity=table.number("responsivity", "A/W", 0.4, above=0.0),
         ambient=table.number("ambient", "W", 0.0, at_least=0.0),
         modulated=table.choice("modulated", ("yes", "no"), "no") == "yes",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -72,7 +74,8 @@ class LightPaths:
         Number of bins beyond either end of the samples in which direct light is imaged and blurred too, 0 or more: the
         light that the ends cut off is then known (`BEYOND_ENDS`), and the true points beyond the ends. Default 0.
     patch_size
-        Largest edge of the patches of the radiosity solution [m]; None: a sixteenth of the scene's diagonal.
+        Largest edge of the patches of the radiosity solution [m]; None: a sixteenth of the scene's diagonal. Towards
+        concave edges the patches become smaller (`Patches.from_scene`).
     tolerance
         Range error that omitted secondary light may cause [m], 0 or more; 0: all light is computed. See the notes.
     min_power
@@ -97,9 +100,14 @@ class LightPaths:
     "multi-bounce" light. At most half of the tolerance is spent on "multi-bounce" light. It does not cover the
     discretisation of the surface, of the sheet and of the patches, nor rounding, nor light paths that are not modelled.
 
-    The bound of multi-bounce light assumes diffuse reflection with the scene's largest albedo, and the solid angle of
-    the lens at the distance of the nearest *corner* of a triangle. Inner points of a large triangle can be nearer to
-    the lens, and then the bound is too small.
+    The statistics "bound of ... left out" hold the bounds of omitted pairs and of omitted multi-bounce light, also of a
+    path "multi-bounce" that is not requested. The bound of multi-bounce light assumes diffuse reflection with the
+    largest albedo of the scene, and the largest solid angle of the lens from any point of the scene. Light that also
+    meets mirrors is not covered.
+
+    "multi-bounce" light is computed with two sizes of patches, ``patch_size`` and its double. The difference of the
+    two readings is the statistic "estimated error of patches": an estimate and not a bound. The error is of first
+    order in the size at concave edges, so that the error of the smaller patches is about the difference.
     """
 
     view: SensorView
@@ -119,6 +127,7 @@ class LightPaths:
     _mirrors: Mirrors = field(init=False, repr=False)
     view_rays: ViewRays = field(init=False, repr=False)
     _radiosity: Radiosity | None = field(init=False, repr=False)
+    _coarse_radiosity: Radiosity | None = field(init=False, repr=False)
     _clustered: ClusteredIrradiance = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -147,7 +156,9 @@ class LightPaths:
         object.__setattr__(self, "_direct", direct)
         object.__setattr__(self, "_mirrors", mirrors)
         object.__setattr__(self, "view_rays", view_rays)
-        object.__setattr__(self, "_radiosity", self._make_radiosity() if "multi-bounce" in self.paths else None)
+        for name, factor in (("_radiosity", 1.0), ("_coarse_radiosity", 2.0)):
+            made = self._make_radiosity(factor) if "multi-bounce" in self.paths else None
+            object.__setattr__(self, name, made)
 
     def profile(self, L: float) -> ProfileLight:
         """Return the light at a transport L [m]."""
@@ -200,14 +211,15 @@ class LightPaths:
             seen, segments = self.view_rays.visible_surface(L), self._diffuse_segments(lit)
             reading = StripErrorModel.from_exposure(self.view, exposures["direct"], min_power=self.min_power)
             remaining = self.tolerance
+            bound = reading.error_bound(self._max_multi_bounce_power(segments))
+            omitted = float(np.max(bound, initial=0.0))
             if self._radiosity is not None:
-                choice = select_paths(
-                    {"multi-bounce": reading.error_bound(self._max_multi_bounce_power(segments))}, self.tolerance
-                )
-                remaining = choice.remaining_tolerance
+                choice = select_paths({"multi-bounce": bound}, self.tolerance)
+                remaining, omitted = choice.remaining_tolerance, sum(choice.omitted.values())
                 if "multi-bounce" in choice.modelled:
-                    exposures["multi-bounce"] = self._multi_bounce_exposure(seen, segments)
-                statistics |= {"bound of multi-bounce left out [m]": sum(choice.omitted.values())}
+                    exposures["multi-bounce"], error = self._multi_bounce_exposure(seen, segments, exposures["direct"])
+                    statistics |= {"estimated error of patches [m]": error}
+            statistics |= {"bound of multi-bounce left out [m]": omitted}
             if "diffuse-diffuse" in self.paths:
                 irradiance, counts = self._diffuse_irradiance(seen, segments, reading, remaining)
                 exposures["diffuse-diffuse"] = self.view_rays.exposure(seen, irradiance)
@@ -216,30 +228,36 @@ class LightPaths:
 
     # ---- secondary light -------------------------------------------------------------------------------------
 
-    def _multi_bounce_exposure(self, seen: VisibleSurface, segments: LitSegments) -> Exposure:
+    def _multi_bounce_exposure(
+        self, seen: VisibleSurface, segments: LitSegments, direct: Exposure
+    ) -> tuple[Exposure, float]:
+        """Return the exposure by multi-bounce light, and an estimate of the range error by the patches' size [m]."""
         assert self._radiosity is not None  # the path is requested
-        exitance = self._radiosity.solve(self._radiosity.direct_irradiance(segments))
-        light = self._radiosity.irradiance(seen.receivers, exitance)
-        return self.view_rays.exposure(seen, np.asarray(to_numpy(light.irradiance), np.float64))
+        assert self._coarse_radiosity is not None
+        found = []
+        for solver in (self._radiosity, self._coarse_radiosity):
+            light = solver.irradiance(seen.receivers, solver.solve(solver.direct_irradiance(segments)))
+            found.append(self.view_rays.exposure(seen, np.asarray(to_numpy(light.irradiance), np.float64)))
+        readings = [StripErrorModel.from_exposure(self.view, direct + each, min_power=self.min_power) for each in found]
+        read = direct.total() > self.min_power
+        difference = readings[0].slope * np.abs(readings[0].position - readings[1].position)
+        return found[0], float(np.max(difference[read], initial=0.0))
 
     def _max_multi_bounce_power(self, segments: LitSegments) -> float:
-        """Return an upper estimate of the power on the sensor by light with three or more diffuse reflections [W].
-
-        It is a bound if no point of the scene is nearer to the lens than the nearest corner (see the notes of
-        `LightPaths`).
-        """
+        """Return a bound of the power on the sensor by light with three or more diffuse reflections [W]."""
         sent = float(segments.exitance @ np.linalg.norm(segments.ends[:, 1] - segments.ends[:, 0], axis=1))
-        corners = self.scene.corners.reshape(-1, 3)
-        lens = self.view.lens_at(0.0)
-        # Least distance of a corner from the line on which the lens moves over the scene.
-        across = corners - lens
-        across -= np.outer(across @ np.array(self.view.transport.direction), self.view.transport.direction)
-        nearest = float(np.linalg.norm(across, axis=1).min(initial=np.inf))
-        opening = 0.25 * np.pi * self.view.aperture**2
-        solid_angle = min(opening / nearest**2, 2.0 * np.pi) if nearest > 0.0 else 2.0 * np.pi
         return interreflection_power_bound(
-            sent, max((each.albedo for each in self.materials), default=0.0), solid_angle
+            sent, max((each.albedo for each in self.materials), default=0.0), self._largest_solid_angle
         )
+
+    @functools.cached_property
+    def _largest_solid_angle(self) -> float:
+        """Largest solid angle of the lens from a point of the scene [sr], for any transport."""
+        nearest = distance_from_path(self.scene.corners, self.view.lens_at(0.0), self.view.transport.direction)
+        # A point of the aperture is nearer than its middle by at most the radius.
+        nearest -= 0.5 * self.view.aperture
+        opening = 0.25 * math.pi * self.view.aperture**2
+        return min(opening / nearest**2, 2.0 * math.pi) if nearest > 0.0 else 2.0 * math.pi
 
     def _diffuse_irradiance(
         self, seen: VisibleSurface, segments: LitSegments, reading: StripErrorModel, tolerance: float
@@ -274,13 +292,14 @@ class LightPaths:
         albedo = np.array([each.albedo for each in self.materials])[self.scene.material[lit.triangle]]
         return LitSegments(lit.ends, lit.normals, albedo * lit.power)
 
-    def _make_radiosity(self) -> Radiosity:
+    def _make_radiosity(self, factor: float) -> Radiosity:
+        """Return the radiosity solver with patches of ``factor`` times the size."""
         size = self.patch_size
         if size is None:
             corners = self.scene.corners.reshape(-1, 3)
             size = float(np.linalg.norm(np.ptp(corners, axis=0))) / 16.0
         albedo = [each.albedo for each in self.materials]
-        return Radiosity.from_scene(self.scene, albedo, size=size, device=self.device)
+        return Radiosity.from_scene(self.scene, albedo, size=factor * size, graded=True, device=self.device)
 
 
 def _widened(view: SensorView, bins: int) -> SensorView:
@@ -290,3 +309,31 @@ def _widened(view: SensorView, bins: int) -> SensorView:
     edges, count = view.u_edges, np.arange(1, bins + 1)
     low, high = edges[0] - count[::-1] * (edges[1] - edges[0]), edges[-1] + count * (edges[-1] - edges[-2])
     return replace(view, u_edges=np.concatenate([low, edges, high]), axis=view.axis)
+
+
+def distance_from_path(corners: npt.NDArray[np.float64], start: npt.ArrayLike, direction: npt.ArrayLike) -> float:
+    """Return the least distance between triangles and a straight line [m]; infinite without triangles.
+
+    Along the line the triangles are projected to a plane, in which the line is a point.
+
+    Parameters
+    ----------
+    corners
+        (n, 3, 3): corners [m].
+    start, direction
+        (3,): a point of the line [m], and its direction of any length.
+    """
+    corners = corners[np.isfinite(corners).all(axis=(1, 2))]
+    if not len(corners):
+        return math.inf
+    axis = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    across = np.linalg.svd(axis[None])[2][1:]
+    flat = (corners - np.asarray(start, np.float64)) @ across.T
+    ends = np.roll(flat, -1, axis=1)
+    way = ends - flat
+    square = np.sum(way * way, axis=2)
+    share = np.divide(-np.sum(flat * way, axis=2), square, out=np.zeros_like(square), where=square > 0.0)
+    points = flat + np.clip(share, 0.0, 1.0)[..., None] * way
+    side = flat[..., 0] * ends[..., 1] - flat[..., 1] * ends[..., 0]
+    inside = (side > 0.0).all(axis=1) | (side < 0.0).all(axis=1)
+    return 0.0 if inside.any() else float(np.linalg.norm(points, axis=2).min())

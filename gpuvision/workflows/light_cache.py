@@ -58,6 +58,8 @@ class SimulationTask:
         Light paths, out of `gpuvision.simulation.sensors.readings.PATHS`.
     tolerance
         Range error that omitted light may cause [m]; 0: all light is computed.
+    patch_size
+        Largest edge of the patches for multi-bounce light [m]; None: a sixteenth of the scene's diagonal.
     """
 
     part: Scene
@@ -66,6 +68,7 @@ class SimulationTask:
     transports: Float64
     paths: tuple[str, ...]
     tolerance: float = 0.0
+    patch_size: float | None = None
 
     @functools.cached_property
     def fingerprint(self) -> str:
@@ -228,6 +231,7 @@ def make_light_paths(task: SimulationTask, device: Device) -> LightPaths:
         blur=light.blur,
         nodes=light.nodes,
         end_bins=math.ceil(_END_FRACTION * light.bins) if isinstance(task.sensor.readout, PsdReadout) else 0,
+        patch_size=task.patch_size,
         tolerance=task.tolerance,
         min_power=minimum_sample_power(task.sensor),
         device=device,

@@ -67,6 +67,7 @@ def prepare_simulation(
     *,
     paths: Sequence[str] = DEFAULT_PATHS,
     tolerance: float = 0.0,
+    patch_size: float | None = None,
     profiles: int | None = None,
     transports: npt.ArrayLike | None = None,
 ) -> SimulationTask:
@@ -83,6 +84,9 @@ def prepare_simulation(
     tolerance
         Range error that omitted light may cause [m], 0 or more; 0: nothing is left out. See `LightPaths` for the errors
         that it covers.
+    patch_size
+        Largest edge of the patches for multi-bounce light [m]; None: `Light.patch_size` of the sensor, or else a
+        sixteenth of the scene's diagonal.
     profiles
         Number of profiles, about the middle of the part; None: all profiles that meet the part.
     transports
@@ -98,6 +102,10 @@ def prepare_simulation(
     assert isinstance(transport, StraightTransport)  # require_light checked it
     if not (np.isfinite(tolerance) and tolerance >= 0.0):
         raise ValueError(f"the tolerance is {tolerance}, expected metres, 0 or more")
+    if patch_size is None:
+        patch_size = require_light(sensor).patch_size
+    elif not (np.isfinite(patch_size) and patch_size > 0.0):
+        raise ValueError(f"the patch size is {patch_size}, expected metres, more than 0")
     for path in paths:
         if path not in PATHS:
             raise ValueError(f"unknown path '{path}', expected some of {', '.join(PATHS)}")
@@ -112,6 +120,7 @@ def prepare_simulation(
         else np.asarray(transports, np.float64),
         paths=tuple(dict.fromkeys(paths)),
         tolerance=float(tolerance),
+        patch_size=patch_size,
     )
 
 
@@ -331,11 +340,11 @@ def _default_limit(reading: Reading, task: SimulationTask, limits: SimulationLim
 
 
 def _add_statistics(statistics: Mapping[str, float], block: LightBlock) -> dict[str, float]:
-    """Return sums of the statistics and a block's; the larger value of bounds."""
+    """Return sums of the statistics and a block's; the larger value of bounds and estimated errors."""
     added = {}
     for name, each in block.statistics.items():
         before = statistics.get(name, 0.0)
-        largest = name.startswith("bound")
+        largest = name.startswith(("bound", "estimated"))
         added[name] = max(before, float(np.max(each))) if largest else before + float(np.sum(each))
     return added
 

@@ -21,7 +21,7 @@ from gpuvision.ranging.range_image import RangePoints
 from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution
 from gpuvision.simulation.sensors.masks import MaskOptimisation
-from gpuvision.simulation.sensors.readings import Reading
+from gpuvision.simulation.sensors.readings import PATHS, Reading
 from gpuvision.workflows.light_cache import SimulationTask
 
 Array = npt.NDArray[Any]
@@ -116,11 +116,29 @@ class Simulation:
             "errors": self.attribution.summary(self.limit),
             "mask": None if self.mask is None else _mask_report(self.mask),
             "light_statistics": self.statistics,
+            "not_in_bounds": self.not_in_bounds(),
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
             "light_fingerprint": task.fingerprint,
             "computed_blocks": self.computed_blocks,
             "seconds": self.seconds,
         }
+
+    def not_in_bounds(self) -> list[str]:
+        """Return the approximations and light paths that no bound in the statistics covers."""
+        task, light = self.task, self.task.sensor.light
+        omitted = [name for name in PATHS if name not in task.paths]
+        if "bound of multi-bounce left out [m]" in self.statistics:
+            omitted = [name for name in omitted if name != "multi-bounce"]
+        found = [f"light path {name} (not simulated)" for name in omitted]
+        if {"diffuse-diffuse", "multi-bounce"} & set(task.paths):
+            found.append("quadrature of indirect light (nodes per bin)")
+        if light is not None and light.thickness > 0.0:
+            found.append("slabs of the sheet of light (sub_sheets)")
+        if "estimated error of patches [m]" in self.statistics:
+            found.append("patches of multi-bounce light (estimated error: see light_statistics)")
+        elif "multi-bounce" in task.paths:
+            found.append("patches of multi-bounce light")
+        return [*found, "rounding"]
 
     @property
     def moves_backward(self) -> bool:

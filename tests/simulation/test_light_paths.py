@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from gpuvision.simulation.errors.range_error import StripErrorModel
-from gpuvision.simulation.light_paths import LightPaths
+from gpuvision.simulation.light_paths import LightPaths, distance_from_path
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
@@ -149,3 +149,54 @@ def test_bounces_are_left_out_where_they_cannot_matter(device):
     profile = model.profile(0.0)
     assert "multi-bounce" not in profile.exposures
     assert 0.0 < profile.statistics["bound of multi-bounce left out [m]"] <= 0.5e-3
+
+
+def test_the_error_of_the_patches_is_estimated(device):
+    """The estimate contains the change of the readings when the patches become half as large."""
+    made = {}
+    for size in (0.02, 0.01):
+        made[size] = paths(corner(), device, paths=(*PATHS, "multi-bounce"), patch_size=size).profile(0.0)
+    one = sensor_view()
+
+    def place(profile):
+        total = profile.exposures["direct"] + profile.exposures["multi-bounce"]
+        return total.first_moment(one.u_edges) / total.total()
+
+    lit = made[0.01].exposures["direct"].total() > 0.0
+    slope = StripErrorModel.from_exposure(one, made[0.01].exposures["direct"]).slope
+    change = (np.abs(place(made[0.02]) - place(made[0.01])) * slope)[lit].max()
+    assert made[0.01].statistics["estimated error of patches [m]"] == pytest.approx(change, rel=0.05)
+    assert "estimated error of patches [m]" not in paths(corner(), device).profile(0.0).statistics
+
+
+def test_bounces_that_are_not_simulated_have_a_bound(device):
+    """The bound without the path is above the shift of the readings by it, also for white surfaces."""
+    one = sensor_view()
+    for albedo in (0.5, 1.0):
+        made_of = [Material(diffuse=Lambert(albedo=albedo))]
+        model = paths(corner(), device, paths=(*PATHS, "multi-bounce"), materials=made_of, patch_size=0.02)
+        with_bounces = model.profile(0.0).exposures
+        profile = paths(corner(), device, materials=made_of).profile(0.0)
+        reading = StripErrorModel.from_exposure(one, profile.exposures["direct"])
+        moved = StripErrorModel.from_exposure(one, profile.exposures["direct"] + with_bounces["multi-bounce"])
+        error = (np.abs(moved.position - reading.position) * reading.slope)[reading.power > 0.0]
+        bound = profile.statistics["bound of multi-bounce left out [m]"]
+        assert 0.0 < error.max() <= bound < math.inf
+
+
+def test_distance_of_the_scene_from_the_path_of_the_lens(rng):
+    """The inside of a large triangle, and edges, are nearer than the corners: random points of the triangles."""
+    assert distance_from_path(np.zeros((0, 3, 3)), (0, 0, 0), (0, 1, 0)) == math.inf
+    floor = np.array([[(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (0.0, 1.0, 0.0)]])
+    assert distance_from_path(floor, (0.1, 5.0, 0.3), (0.0, 2.0, 0.0)) == pytest.approx(0.3, rel=1e-12)
+    assert distance_from_path(floor, (0.1, 5.0, 0.3), (0.0, 0.0, 1.0)) == pytest.approx(
+        distance_from_path(floor, (0.1, 5.0, 0.0), (0.0, 0.0, -3.0)), rel=1e-12
+    )
+    assert distance_from_path(floor, (0.1, 0.0, 7.0), (0.0, 0.0, 1.0)) == 0.0
+    for _ in range(20):
+        corners, start, way = rng.normal((3.0, 0.0, 0.0), 1.0, (2, 3, 3)), rng.normal(size=3), rng.normal(size=3)
+        share = rng.dirichlet([0.5, 0.5, 0.5], 200_000)
+        across = np.cross(np.concatenate(share @ corners) - start, way / np.linalg.norm(way))
+        nearest = np.linalg.norm(across, axis=1).min()
+        found = distance_from_path(corners, start, way)
+        assert nearest - 0.05 < found <= nearest + 1e-12

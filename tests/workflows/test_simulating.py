@@ -73,6 +73,10 @@ def test_what_is_read_is_told_apart_by_cause(part_file: Path, tmp_path: Path) ->
     np.testing.assert_array_equal(arrays["error"], attribution.error)
     assert units["cause_secondary"] == "m"
     report = json.loads((tmp_path / "report.json").read_text())
+    # The path without bounces has a bound; what has none is named.
+    assert report["light_statistics"]["bound of multi-bounce left out [m]"] > 0.0
+    expected = ["quadrature of indirect light (nodes per bin)", "slabs of the sheet of light (sub_sheets)", "rounding"]
+    assert report["not_in_bounds"] == expected
     assert report["errors"]["valid"] == np.isfinite(attribution.error).sum()
     for name in ("errors.png", "causes.png", "picture.png", "range_image.tiff", "range_image.ply"):
         assert (tmp_path / name).stat().st_size > 1000

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.transport.sheet_cut import concatenated_ranges
 
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -38,6 +39,12 @@ class MeshingLimits:
     slack
         Distance before an outline within which nothing occludes it, in units of the triangles' largest distance from
         its plane: a grazing ray meets the surface earlier.
+    grading
+        Graded meshes: longest edge of a triangle, as part of its distance from the nearest surface that faces it.
+    least_size
+        Graded meshes: least longest edge, as part of the patch size.
+    max_graded
+        Graded meshes: largest number of large triangles, beyond which a mesh is not graded; bounds time and memory.
     """
 
     small: float = 0.5
@@ -46,6 +53,9 @@ class MeshingLimits:
     one_way: float = 0.7
     least_fill: float = 0.2
     slack: float = 4.0
+    grading: float = 1.0
+    least_size: float = 0.25
+    max_graded: int = 2000
 
 
 class PatchMesh(NamedTuple):
@@ -67,7 +77,12 @@ class _Outlines(NamedTuple):
 
 
 def mesh_scene(
-    scene: Scene, size: float, both_sides: bool | None, limits: MeshingLimits = MeshingLimits()
+    scene: Scene,
+    size: float,
+    both_sides: bool | None,
+    limits: MeshingLimits = MeshingLimits(),
+    *,
+    graded: bool = False,
 ) -> PatchMesh:
     """Divide a scene into patches, as `gpuvision.simulation.transport.patches.Patches.from_scene` says."""
     numbers = scene.bvh.numbers
@@ -77,7 +92,10 @@ def mesh_scene(
         corners = np.concatenate([corners, corners[back][:, ::-1]])
         numbers = np.concatenate([numbers, numbers[back]])
     small = longest_edges(corners)[0] < limits.small * size
-    large, of_large = subdivide_to(corners[~small], numbers[~small], size)
+    if graded and np.count_nonzero(~small) <= limits.max_graded:
+        large, of_large = _subdivide_graded(corners[~small], numbers[~small], size, limits)
+    else:
+        large, of_large = subdivide_to(corners[~small], numbers[~small], size)
     corners, numbers = corners[small], numbers[small]
     group = _group_small(corners, np.asarray(scene.material)[numbers], size)
     order = np.argsort(group, kind="stable")
@@ -125,6 +143,57 @@ def subdivide_to(corners: Reals, numbers: Integers, size: float) -> tuple[Reals,
         of.append(numbers[fits])
         corners, numbers = bisect_triangles(corners[~fits]), np.tile(numbers[~fits], 2)
     return np.concatenate(done), np.concatenate(of)
+
+
+def _subdivide_graded(corners: Reals, numbers: Integers, size: float, limits: MeshingLimits) -> tuple[Reals, Integers]:
+    """Halve triangles as `subdivide_to`, and further towards other triangles that face them."""
+    facing = _facing_pairs(corners, size / limits.grading)
+    begin, count = np.searchsorted(facing[0], np.arange(len(corners))), np.bincount(facing[0], minlength=len(corners))
+    pieces, owner = corners, np.arange(len(corners))
+    done, of = [corners[:0]], [owner[:0]]
+    while len(pieces):
+        longest = longest_edges(pieces)[0]
+        allowed = np.full(len(pieces), size)
+        number = np.where(longest <= size, count[owner], 0)
+        piece = np.repeat(np.arange(len(pieces)), number)
+        other = facing[1][concatenated_ranges(begin[owner], number)]
+        away = limits.grading * _distance_to_triangles(pieces[piece].mean(axis=1), corners[other])
+        np.minimum.at(allowed, piece, np.maximum(away, limits.least_size * size))
+        fits = longest <= allowed
+        done.append(pieces[fits])
+        of.append(owner[fits])
+        pieces, owner = bisect_triangles(pieces[~fits]), np.tile(owner[~fits], 2)
+    return np.concatenate(done), numbers[np.concatenate(of)]
+
+
+def _facing_pairs(corners: Reals, reach: float) -> tuple[Integers, Integers]:
+    """Return pairs of triangles, each partly before the other, whose boxes are nearer than ``reach``; sorted."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    # A triangle in the plane of another one lies before it by rounding only.
+    least = 1e-6 * reach
+    one, two = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for k in range(len(corners)):
+        near = np.flatnonzero(np.all((low <= high[k] + reach) & (high >= low[k] - reach), axis=1))
+        before = ((corners[near] - corners[k, 0]) @ normals[k]).max(axis=1) > least
+        back = np.einsum("nvd,nd->nv", corners[k] - corners[near][:, :1], normals[near]).max(axis=1) > least
+        found = near[before & back]
+        one.append(np.full(len(found), k))
+        two.append(found)
+    return np.concatenate(one), np.concatenate(two)
+
+
+def _distance_to_triangles(points: Reals, corners: Reals) -> Reals:
+    """Return the distance of each point (n, 3) from its triangle (n, 3, 3)."""
+    ends = np.roll(corners, -1, axis=1)
+    way, to_point = ends - corners, points[:, None] - corners
+    share = np.clip(np.sum(to_point * way, axis=2) / np.sum(way * way, axis=2), 0.0, 1.0)
+    from_edges = np.linalg.norm(to_point - share[..., None] * way, axis=2).min(axis=1)
+    normal = np.cross(way[:, 0], way[:, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    over = np.all(np.einsum("nvd,nvd->nv", np.cross(normal[:, None], way), to_point) >= 0.0, axis=1)
+    return np.asarray(np.where(over, np.abs(np.sum(to_point[:, 0] * normal, axis=1)), from_edges))
 
 
 def _hash64(values: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:

@@ -110,6 +110,7 @@ class Patches:
         scene: Scene,
         *,
         size: float,
+        graded: bool = False,
         both_sides: bool | None = None,
         limits: MeshingLimits = _MESHING_LIMITS,
     ) -> Patches:
@@ -127,6 +128,10 @@ class Patches:
             Surfaces; degenerate triangles are omitted.
         size
             Largest edge of a patch [m], more than 0.
+        graded
+            Whether triangles become smaller towards concave edges: the longest edge is then at most the distance
+            from the nearest surface that faces it, but not below a quarter of ``size`` (`MeshingLimits.grading`,
+            `MeshingLimits.least_size`). Default False.
         both_sides
             Whether the back of every triangle is also a surface. None: all backs except the backs of closed surfaces
             whose front is outside.
@@ -142,7 +147,7 @@ class Patches:
             raise ValueError(f"Patches.from_scene: size is {size!r}, expected metres, more than 0")
         if not len(scene.bvh.numbers):
             raise ValueError("Patches.from_scene: the scene has no triangles")
-        return cls(*mesh_scene(scene, size, both_sides, limits))
+        return cls(*mesh_scene(scene, size, both_sides, limits, graded=graded))
 
     @property
     def count(self) -> int:

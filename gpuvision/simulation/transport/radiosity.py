@@ -130,6 +130,7 @@ class Radiosity:
         *,
         size: float,
         refinements: int = 0,
+        graded: bool = False,
         both_sides: bool | None = None,
         device: Device | None = None,
         max_dense: int = 4096,
@@ -145,6 +146,8 @@ class Radiosity:
             As of `Patches.from_scene`; size in metres.
         refinements
             Number of times that patches close to others are halved (`refine_corners`). Default 0.
+        graded
+            Whether patches become smaller towards concave edges, as `Patches.from_scene` says. Default False.
         device, max_dense, limits
             As of `Radiosity`.
 
@@ -153,7 +156,7 @@ class Radiosity:
         ValueError
             A parameter lies outside its range, or an albedo is missing.
         """
-        patches = Patches.from_scene(scene, size=size, both_sides=both_sides)
+        patches = Patches.from_scene(scene, size=size, graded=graded, both_sides=both_sides)
         if refinements:
             patches = refine_corners(patches, refinements, scene, device=device, limits=limits)
         of_material = np.asarray(albedo, np.float64)

@@ -183,6 +183,45 @@ def test_patches_in_corners_are_graded(device: Device) -> None:
     assert from_edge[small].mean() < 0.6 * from_edge[~small].mean()
 
 
+def test_graded_patches_in_a_groove(device: Device) -> None:
+    """Line across a groove of 90 degrees: the light of all further bounces, integrated along the groove.
+
+    This integral is the light in a groove that is lit evenly, a one-dimensional equation with the closed kernel
+    a b / (2 (a^2 + b^2)^(3/2)), solved with nodes that are graded towards the edge.
+    """
+    width, length, albedo = 0.02, 0.08, 0.8
+    side = width / np.sqrt(2.0)
+    edge = [(0.0, -length / 2, 0.0), (0.0, length / 2, 0.0)]
+    left, right = ([(x, y, side) for y in (-length / 2, length / 2)] for x in (-side, side))
+    quads = [(*edge, left[1], left[0]), (edge[0], right[0], right[1], edge[1])]
+    scene = Scene(np.array([each for a, b, c, d in quads for each in ((a, b, c), (a, c, d))]))
+    node, weight = np.polynomial.legendre.leggauss(200)
+    s = 0.5 + 0.5 * node
+    b, share = width * s**4, 0.5 * weight * 4.0 * width * s**3
+
+    def kernel(at: np.ndarray) -> Any:
+        return 0.5 * at[:, None] * b / (at[:, None] ** 2 + b**2) ** 1.5 * share
+
+    exitance = np.linalg.solve(np.eye(len(b)) - albedo * kernel(b), albedo * kernel(b).sum(axis=1))
+    at = np.array([0.5e-3, 1e-3, 2e-3])
+    expected = kernel(at) @ exitance
+    normals = np.array([[1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]]) / np.sqrt(2.0)
+    lit = LitSegments([[[0, 0, 0], [-side, 0, side]], [[0, 0, 0], [side, 0, side]]], normals, [1.0, 1.0])
+    y = np.sinh(np.linspace(-7.0, 7.0, 301))
+    y *= 0.5 * length / y.max()
+    receivers = np.zeros((len(at), len(y), 6))
+    receivers[..., 0], receivers[..., 2] = -at[:, None] / np.sqrt(2.0), at[:, None] / np.sqrt(2.0)
+    receivers[..., 1], receivers[..., 3:] = y, normals[0]
+    worst = {}
+    for graded in (False, True):
+        groove = Radiosity.from_scene(scene, [albedo], size=5e-3, graded=graded, both_sides=False, device=device)
+        light = groove.irradiance(receivers, groove.solve(groove.direct_irradiance(lit))).irradiance
+        found = np.trapezoid(np.asarray(light, np.float64), y, axis=1)
+        worst[graded] = np.abs(found / expected - 1.0).max()
+    assert worst[False] > 0.15
+    assert worst[True] < 0.03
+
+
 def test_materials_and_receivers(device: Device) -> None:
     scene = room(1.0, 0.8, 0.6, lid=True)
     box = Radiosity.from_scene(scene, [0.7, 0.2], size=0.5, refinements=1, both_sides=True, device=device)

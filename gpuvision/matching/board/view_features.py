@@ -8,7 +8,7 @@ import numpy as np
 
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.matching.artwork.artwork import Artwork
-from gpuvision.matching.features.candidates import FeatureCandidates, find_ruler_candidates
+from gpuvision.matching.features.candidates import FeatureCandidates, find_ruler_candidates, pixel_hint
 from gpuvision.matching.features.feature_set import FeatureSet, select_feature_set
 from gpuvision.matching.features.fiducials import search_distance, select_fiducials
 from gpuvision.matching.features.imaging import Imaging
@@ -52,7 +52,8 @@ def select_features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging,
         raise ValueError(
             f"{len(rulers.sigma)} edges of the {artwork.side} artwork in view have room for a ruler, and "
             f"{len(fiducials.sigma)} round pads can serve as fiducials, expected 3 or more together; are the "
-            "initial pose and the scale right, is the blur less?"
+            "initial pose and the scale right, is the blur less? "
+            + pixel_hint(artwork, view.bounds, placement, imaging)
         )
     return select_feature_set(rulers, imaging, artwork.side, fiducials=fiducials, are_free=True, budget=budget)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -64,6 +65,10 @@ class FeatureCandidates(NamedTuple):
         return np.asarray(long * np.where(self.radius > 0, long, imaging.width_px))
 
 
+_FINER_PIXELS = (0.8, 0.65, 0.5, 0.35, 0.25)  # pixel sizes that a hint tries, relative to the given one (chosen)
+_MIN_RULERS = 3  # as many as unknowns of a pose
+
+
 def find_ruler_candidates(
     artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike, imaging: Imaging
 ) -> FeatureCandidates:
@@ -122,6 +127,22 @@ def find_ruler_candidates(
     return FeatureCandidates(
         point, normal, sigma, pair, length, probability, source, across, np.zeros(len(rows)), place
     )
+
+
+def pixel_hint(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike, imaging: Imaging) -> str:
+    """Return a hint for a region without rulers: the room that an edge needs, and a pixel size that leaves it.
+
+    The parameters are those of `find_ruler_candidates`.
+    """
+    room = 3 * imaging.smoothing_px * imaging.pixel + imaging.registration
+    hint = f"an edge needs {1e6 * room:.0f} um without another edge on both sides"
+    hint += f" at {1e6 * imaging.pixel:.3g} um per pixel"
+    for factor in _FINER_PIXELS:
+        pixel = factor * imaging.pixel
+        count = len(find_ruler_candidates(artwork, region, placement, replace(imaging, pixel=pixel)).sigma)
+        if count >= _MIN_RULERS:
+            return f"{hint}; at {1e6 * pixel:.3g} um, {count} rulers have room"
+    return hint
 
 
 _Row = tuple[Float64, Float64, float, bool, int]

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from gpuvision.host.reading import FileLimit
 from gpuvision.matching.artwork.shapes import SAGITTA, Crossings, DrawnObject, Float64, Layer, is_covered
 
-MAX_BOARD_COMPARISONS = FileLimit("GPUVISION_MAX_BOARD_COMPARISONS", 100_000_000)
-"""Comparisons of lines with sides of shapes, to find the visible edges of a board. Chosen: 100 million, which take
+MAX_BOARD_COMPARISONS = FileLimit("GPUVISION_MAX_BOARD_COMPARISONS", 50_000_000)
+"""Comparisons of lines with sides of shapes, to find the visible edges of a board. Chosen: 50 million, which take
 5 s; the largest board of the tests takes 25 million. Objects that cover each other reach it."""
 # Lines are equal where their angle [rad], distance from the origin and width [m] round to the same multiple of this
 # number. It is not a decimal fraction, so that the lengths in files never lie between two multiples.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -75,14 +76,22 @@ class Bound(Generic[R]):
         # buffer.
         known = self._own if device.kind == "intel" and device.shares_memory else ()
         self._known = {id(each): _buffer_over(device.context, each) for each in known}
-        self._queue_site = self._site_on(self.queue)
+        self._queue_is_inline = device.is_inline(self.queue)
         self._inline_site: _Site | None = None
-        if not self._queue_site.inline and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
+        if not self._queue_is_inline and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
             inline_queue = device.inline_queue(self.queue, groups=launch.groups)
             self._inline_site = None if inline_queue is None else self._site_on(inline_queue)
         for array in self.inputs:
             self._clear(array)
         self().wait()
+
+    @functools.cached_property
+    def _queue_site(self) -> _Site:
+        """Site of launches in the queue; with an inline site only launches that wait for an event need it."""
+        return self._site_on(self.queue)
+
+    def prepare_queue(self) -> None:
+        """Build the kernel for the queue and launch it once, so that no later call compiles."""
         if self._inline_site is not None and not self._empty:
             self._set_arrays(self._queue_site, self._own)
             cl.enqueue_nd_range_kernel(self.queue, self._queue_site.kernel, self._global, self._local).wait()
@@ -90,7 +99,7 @@ class Bound(Generic[R]):
     @property
     def inline(self) -> bool:
         """Whether a call runs the kernel in the calling thread, unless it must wait for an event."""
-        return self._queue_site.inline or self._inline_site is not None
+        return self._queue_is_inline or self._inline_site is not None
 
     @property
     def enqueue_arguments(self) -> tuple[Any, Any, tuple[int, ...], tuple[int, ...] | None]:
@@ -131,7 +140,7 @@ class Bound(Generic[R]):
     def run(self, *frames: DeviceArray, out: R | None = None) -> R:
         """Launch, wait with the least delay, and return the written arrays: `out` or `outputs`."""
         event = self._enqueue(self._own if not frames and out is None else self._given(frames, out))
-        if not self._queue_site.inline:
+        if not self._queue_is_inline:
             self._wait(event)
         return self.outputs if out is None else out
 

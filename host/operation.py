@@ -97,6 +97,12 @@ class Operation(Generic[R]):
         BuildError
             The kernel does not compile on this device.
         """
+        bound = self._bind(device, shape, dtype, queue)
+        bound.prepare_queue()
+        return bound
+
+    def _bind(self, device: Device | None, shape: tuple[int, ...], dtype: DTypeLike, queue: Any) -> Bound[R]:
+        """Return a bound instance; a short launch is built for the queue only when it first waits for an event."""
         device, dtype = _device(device), np.dtype(dtype)
         if not dtype.isnative:
             raise TypeError(
@@ -156,7 +162,7 @@ class Operation(Generic[R]):
         kept: collections.OrderedDict[Any, Bound[R]] = _kept_bound()
         key = (self, device, queue, first.shape, first.dtype)
         if key not in kept:
-            kept[key] = self.bind(device, first.shape, first.dtype, queue=queue)
+            kept[key] = self._bind(device, first.shape, first.dtype, queue)
             if len(kept) > _KEPT_BOUND:
                 kept.popitem(last=False)
         kept.move_to_end(key)

@@ -239,7 +239,8 @@ def _pads(copper: tuple[DrawnObject, ...], finder: _Finder) -> tuple[Pad, ...]:
     spots = [each for each in spots if each.shapes[0].dark]
     spots.sort(key=lambda each: -max(abs(area(shape.outline)) for shape in each.shapes))
     chosen = [spots[index] for index in _first_of_equals(_centres(spots))]
-    chosen.sort(key=copper.index)
+    order = {id(each): place for place, each in enumerate(copper)}
+    chosen.sort(key=lambda each: order[id(each)])
     return tuple(_pad(each, finder) for each in chosen)
 
 

@@ -92,16 +92,10 @@ def board_edges(
         The edges take more comparisons than `MAX_BOARD_COMPARISONS`.
     """
     rows = []
-    limit = MAX_BOARD_COMPARISONS.value
-    layers = [each for each in (copper, mask, silk) if each is not None]
     for each in [*_trace_sides(strokes), *_pad_sides(outlines)]:
         for low, high, bare in _visible_parts(each, copper, mask, silk, clearance):
             along = each.end - each.start
             rows.append((each.start + low * along, each.start + high * along, each.normal, each.width, bare, *each[4:]))
-        comparisons = sum(layer.comparisons for layer in layers)
-        if comparisons > limit:
-            what = f"do its objects cover each other? Their visible edges take {comparisons} comparisons or more"
-            MAX_BOARD_COMPARISONS.check(comparisons, what, ValueError)
     columns: list[Any] = list(zip(*rows, strict=True)) if rows else [[]] * 7
     return BoardEdges(
         np.array(columns[0], dtype=np.float64).reshape(-1, 2),
@@ -180,7 +174,16 @@ def _visible_parts(
 
     def along(layer: Layer, *offsets: float) -> list[Crossings]:
         shifts = [offset * edge.normal for offset in offsets]
-        return [layer.crossings(edge.start + shift, edge.end + shift) for shift in shifts]
+        found = []
+        for shift in shifts:
+            found.append(layer.crossings(edge.start + shift, edge.end + shift))
+            check()
+        return found
+
+    def check(places: int = 0) -> None:
+        comparisons = places + sum(each.comparisons for each in (copper, mask, silk) if each is not None)
+        what = f"do its objects cover each other? Their visible edges take {comparisons} comparisons or more"
+        MAX_BOARD_COMPARISONS.check(comparisons, what, ValueError)
 
     inside, outside = along(copper, -clearance, -_CLOSE), along(copper, _CLOSE, clearance)
     inks = along(silk, -clearance, 0.0, clearance)
@@ -189,6 +192,7 @@ def _visible_parts(
     cuts = np.unique(np.concatenate([np.array([0.0, 1.0]), *crossings]))
     cuts = cuts[(cuts >= 0) & (cuts <= 1)]
     middle = (cuts[1:] + cuts[:-1]) / 2
+    check(len(crossings) * len(middle))
     hidden = np.logical_or.reduce([is_covered(each, middle) for each in (*outside, *inks)])
     good = np.logical_and.reduce([is_covered(each, middle) for each in inside]) & ~hidden
     bare = np.ones(len(middle), dtype=np.int64)

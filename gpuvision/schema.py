@@ -293,10 +293,12 @@ def read_toml(path: Path) -> Section:
     Raises
     ------
     OSError
-        The file cannot be read.
+        The file cannot be read, or it is a folder.
     DescriptionError
         The file is not valid TOML; the message has line and column.
     """
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: a folder, expected a TOML file")
     with reading(path.name, "TOML file", DescriptionError):
         try:
             with path.open("rb") as file:

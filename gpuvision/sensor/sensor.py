@@ -151,7 +151,7 @@ class Sensor:
             with resources.as_file(brought[str(path)]) as file:
                 return cls.from_section(read_toml(file))
         path = Path(path)
-        if not path.is_file():
+        if not path.exists():
             close = difflib.get_close_matches(path.stem, brought, 1)
             hint = f"did you mean '{close[0]}'?" if close else f"give a file or one of {', '.join(sorted(brought))}"
             raise FileNotFoundError(f"there is no sensor file {path}; {hint}")

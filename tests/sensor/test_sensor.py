@@ -393,3 +393,9 @@ def test_an_automatic_threshold() -> None:
     assert not Sensor.load("camera_line").auto_threshold
     with pytest.raises(DescriptionError, match=r"line\.threshold is 'automatic', expected a number"):
         sensor_of(changed("camera_line", line__threshold="automatic"))
+
+
+def test_a_folder_is_no_sensor_file(tmp_path: Path) -> None:
+    (tmp_path / "sensor.toml").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"sensor\.toml: a folder, expected a TOML file"):
+        Sensor.load(tmp_path / "sensor.toml")

@@ -10,7 +10,9 @@ Tables of the file (the files in ``gpuvision/presets/sensors`` are commented exa
                       default of ``background`` is the photocurrent of the ambient light in ``[light]``
 ``[frame]``           camera: columns and rows of a frame; needed for a triangulation
 ``[axes]``            map from positions and samples to the coordinates of the triangulation, see `SampleAxes`
-``[lens]``            radial distortion, see `Lens`
+``[lens]``            radial distortion in sensor coordinates, see `Lens`; or ``file``, a lens that ``gpuvision
+                      calibrate`` wrote, with ``window``, the column and row of a frame's first pixel in the
+                      calibrated images
 ``[triangulation]``   sensor to sheet, for a straight transport: ``baseline``, ``stand_off`` and so on (see
                       `Triangulation.from_stand_off`); or a camera's ``focal_length_px``, ``principal_point_px`` and the
                       sheet in its frame, ``sheet_origin``, ``g_axis``, ``h_axis``; or ``homography``; or ``constants``
@@ -33,7 +35,7 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from gpuvision.camera.lens import Lens
-from gpuvision.formats.camera_file import radial_lens
+from gpuvision.formats.camera_file import radial_lens, read_calibrated_size, read_lens
 from gpuvision.host.recordings import CHANNELS, Channel
 from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
@@ -179,19 +181,22 @@ class Sensor:
         kind = top.choice("kind", ("camera", "psd"))
         name = top.text("name", "")
         recording = _recording(kind, top.optional_section("recording"))
-        radial = top.optional_section("lens")
-        lens = None if radial is None else radial_lens(radial)
         readout = top.section("line" if kind == "camera" else "psd")
         along: Along = readout.choice("along", ("columns", "rows"), "columns") if kind == "camera" else "columns"
         frame = _frame(kind, top, readout)
         moving = top.section("transport")
-        axes, sheet = SampleAxes(), None
+        sheet = None
         transport: StraightTransport | RotatingSheet
         # A PSD does not measure the place of the light in the plane of the beam: it cannot see a rotating sheet.
-        if moving.choice("kind", ("straight", "rotating") if kind == "camera" else ("straight",)) == "rotating":
+        is_rotating = (
+            moving.choice("kind", ("straight", "rotating") if kind == "camera" else ("straight",)) == "rotating"
+        )
+        axes = SampleAxes() if is_rotating else _axes(top.optional_section("axes"))
+        lens = _lens(top.optional_section("lens"), frame, along, axes)
+        if is_rotating:
             transport = _rotating(moving, lens, along)
         else:
-            transport, axes = _straight(moving), _axes(top.optional_section("axes"))
+            transport = _straight(moving)
             region = _region(kind, top, frame, along, axes, readout)
             sheet = _triangulation(top.section("triangulation"), {"region": region, "along": along, "lens": lens})
         output = _output(top.section("output"))
@@ -258,6 +263,37 @@ def _axes(table: Section | None) -> SampleAxes:
     values = {name: table.number(name, "sensor unit", getattr(SampleAxes(), name)) for name in names}
     table.finish()
     return SampleAxes(**values)
+
+
+def _lens(table: Section | None, frame: tuple[int, int] | None, along: Along, axes: SampleAxes) -> Lens | None:
+    """Read a lens in sensor coordinates, or a file with a lens in pixels."""
+    if table is None or "file" not in table:
+        return None if table is None else radial_lens(table)
+    path = table.file("file")
+    column, row = table.numbers("window", "pixel", (2,), (0.0, 0.0))
+    table.finish()
+    lens, size = read_lens(path), read_calibrated_size(path)
+    if not isinstance(lens, Lens):
+        raise table.error(f"{path} has a table [camera], expected [lens]: calibrate with --method lines")
+    if frame is not None and size is not None and size != frame[::-1] and "window" not in table:
+        raise table.error(
+            f"{path} is for images of {size[0]} x {size[1]} pixels, the frames have {frame[1]} x {frame[0]}; "
+            "give lens.window, the column and row of a frame's first pixel in those images"
+        )
+    with table.checking():
+        return _in_sensor_coordinates(lens.in_window((column, row)), along, axes)
+
+
+def _in_sensor_coordinates(lens: Lens, along: Along, axes: SampleAxes) -> Lens:
+    """Return a lens in pixels (column, row) as a lens in the sensor coordinates of these axes."""
+    position, sample = (axes.position_origin, axes.position_pitch), (axes.sample_origin, axes.sample_pitch)
+    column, row = (sample, position) if along == "columns" else (position, sample)
+    scale = abs(column[1])
+    if scale != abs(row[1]):
+        raise ValueError("a lens of a file needs pitches of equal size in [axes]: its pixels are square")
+    centre = tuple(origin + pitch * each for (origin, pitch), each in zip((column, row), lens.centre, strict=True))
+    terms = {f"k{order}": value / scale ** (2 * order) for order, value in enumerate(lens.coefficients, 1)}
+    return Lens(**terms, centre=(centre[0], centre[1]))
 
 
 def _region(

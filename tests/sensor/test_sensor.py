@@ -14,6 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.lens import Lens
+from gpuvision.formats.camera_file import write_lens
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.range_image import RotatingSheet, StraightTransport
@@ -307,7 +310,7 @@ def test_files_that_are_no_sensor(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no sensor file .*corner.toml; did you mean 'corner_scene'\?"):
         Sensor.load(tmp_path / "corner.toml")
     with pytest.raises(FileNotFoundError, match="give a file or one of camera_line, corner_scene, psd_line"):
-        Sensor.load(tmp_path)
+        Sensor.load(tmp_path / "nothing")
 
 
 def test_frames_of_another_sensor_are_refused() -> None:
@@ -399,3 +402,53 @@ def test_a_folder_is_no_sensor_file(tmp_path: Path) -> None:
     (tmp_path / "sensor.toml").mkdir()
     with pytest.raises(IsADirectoryError, match=r"sensor\.toml: a folder, expected a TOML file"):
         Sensor.load(tmp_path / "sensor.toml")
+
+
+# ---- lens of a calibration ----------------------------------------------------------------------------------
+
+
+PIXEL_LENS = Lens(k1=-3e-8, k2=2e-14, k3=-1e-21, centre=(251.3, 40.2))
+
+
+def with_lens_file(folder: Path, size: Any = (480, 64), lens: Any = PIXEL_LENS, **values: Any) -> Sensor:
+    """Return the shipped camera with the lens of a file; size (columns, rows) of the calibrated images."""
+    (folder / "lens.toml").unlink(missing_ok=True)
+    write_lens(folder / "lens.toml", lens, {} if size is None else {"image": {"size": list(size)}})
+    table = changed("camera_line", lens={"file": "lens.toml"}, **values)
+    return Sensor.from_section(Section(table, "sensor.toml", folder=folder))
+
+
+@pytest.mark.parametrize("pitch", [1.0, -1.0, 3.5e-6])
+@pytest.mark.parametrize("window", [(0.0, 0.0), (64.0, 200.0)])
+def test_the_lens_of_a_calibration_acts_on_the_pixels_of_the_frames(
+    tmp_path: Path, pitch: float, window: tuple[float, float]
+) -> None:
+    """Undistorted pixels of the calibrated image, mapped to sensor coordinates, against the sensor's lens."""
+    size = (480, 64) if window == (0.0, 0.0) else (1920, 1080)
+    values = {"lens__window": list(window)} if any(window) else {}
+    table = changed("camera_line", lens={"file": "lens.toml"}, axes__sample_pitch=abs(pitch), **values)
+    table["axes"]["position_pitch"] = pitch
+    write_lens(tmp_path / "lens.toml", PIXEL_LENS, {"image": {"size": list(size)}})
+    sensor = Sensor.from_section(Section(table, "sensor.toml", folder=tmp_path))
+    lens: Any = sensor.readout.triangulation.lens  # type: ignore[union-attr]  # the shipped camera has one
+    axes = table["axes"]
+    pixels = np.random.default_rng(1).uniform((0, 0), (479, 63), (200, 2))
+    straight = PIXEL_LENS.undistort(pixels + window) - window
+
+    def mapped(points: Any) -> Any:
+        column = axes["sample_origin"] + axes["sample_pitch"] * points[:, 0]
+        return np.stack([column, axes["position_origin"] + axes["position_pitch"] * points[:, 1]], axis=1)
+
+    np.testing.assert_allclose(lens.undistort(mapped(pixels)), mapped(straight), rtol=0, atol=1e-9 * abs(pitch) * 480)
+
+
+def test_the_lens_of_a_calibration_for_other_images_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DescriptionError, match=r"images of 1920 x 1080 pixels, the frames have 480 x 64; .*window"):
+        with_lens_file(tmp_path, (1920, 1080))
+    assert with_lens_file(tmp_path, None).readout.triangulation is not None
+    with pytest.raises(DescriptionError, match=r"pitches of equal size in \[axes\]"):
+        with_lens_file(tmp_path, axes__sample_pitch=2.0)
+    with pytest.raises(DescriptionError, match=r"has a table \[camera\], expected \[lens\]"):
+        with_lens_file(tmp_path, lens=Camera(matrix=((900.0, 0.0, 240.0), (0.0, 900.0, 32.0), (0.0, 0.0, 1.0))))
+    with pytest.raises(DescriptionError, match=r"unknown key 'lens\.k1'"):
+        sensor_of(changed("camera_line", lens={"file": "lens.toml", "k1": 0.1}))

@@ -400,11 +400,8 @@ def test_a_map_too_large_to_hold_is_refused() -> None:
 
 
 @pytest.fixture(scope="module")
-def corner() -> Scan:
-    recording = Path(__file__).resolve().parents[2] / "shared" / "data" / "laser" / "corner_scene_sweep.mp4"
-    if not recording.exists():
-        pytest.skip("the recordings in ../shared/data are not here")
-    return scan(recording, Sensor.load("corner_scene"))
+def corner(data: Path) -> Scan:
+    return scan(data / "laser" / "corner_scene_sweep.mp4", Sensor.load("corner_scene"))
 
 
 # The surface of each region was read from scan.png; the positions of the surfaces follow from a fit of the whole scene

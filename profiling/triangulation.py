@@ -52,7 +52,7 @@ def _numba_lens(u, v, table, g, h, status):
         at_g = table[7] + (table[8] * p + table[9] * q)
         at_h = table[10] + (table[11] * p + table[12] * q)
         hidden = w <= table[4]
-        folded = square >= table[17]
+        folded = square >= table[19]
         lost = not np.isfinite(u[i] + v[i])
         g[i] = nan if hidden | lost | folded else at_g
         h[i] = nan if hidden | lost | folded else at_h
@@ -67,7 +67,7 @@ def _numpy(u: NDArray[Any], v: NDArray[Any], table: NDArray[Any], lens: bool) ->
         square = along * along + across * across
         stretch = square * (table[15] + table[16] * square)
         x, y = x + along * stretch, y + across * stretch
-        status[square >= table[17]] = 128
+        status[square >= table[19]] = 128
     w = 1 + table[5] * x + table[6] * y
     x, y = x / w, y / w
     g, h = table[7] + (table[8] * x + table[9] * y), table[10] + (table[11] * x + table[12] * y)

@@ -1,0 +1,22 @@
+"""Benchmark of the triangulation: its NumPy and Numba peers read the parameter table as the kernel does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gpuvision.host import Device
+from gpuvision.profiling import triangulation
+from gpuvision.ranging.triangulation import Triangulation
+
+
+@pytest.mark.parametrize("lens", [None, triangulation.LENS])
+def test_the_peers_agree_with_the_kernel(device: Device, lens: object) -> None:
+    operation = Triangulation(homography=triangulation.HOMOGRAPHY, region=triangulation.REGION, lens=lens)
+    # The case itself compares the flags of the kernel with those of NumPy in double precision.
+    case = triangulation._case(device, operation, "float32", 1001, "small")
+    assert case.error < 1e-5
+    assert set(case.peers) == {"numba", "numpy"}
+    g, *_ = case.peers["numpy"]()
+    assert np.isfinite(g).mean() > 0.5
+    case.peers["numba"]()

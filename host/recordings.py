@@ -13,7 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -28,16 +28,7 @@ from gpuvision.host.video_header import check_avi
 
 Channel = Literal["grey", "red", "green", "blue", "max", "red_difference", "green_difference", "blue_difference"]
 
-CHANNELS: tuple[Channel, ...] = (
-    "grey",
-    "red",
-    "green",
-    "blue",
-    "max",
-    "red_difference",
-    "green_difference",
-    "blue_difference",
-)
+CHANNELS: tuple[Channel, ...] = get_args(Channel)
 _DIFFERENCE = "_difference"
 _TIFF = (".tif", ".tiff")
 _IMAGES = (".png", ".bmp", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".webp", *_TIFF)

@@ -44,8 +44,8 @@ def _fold_radius(coefficients: Sequence[float]) -> float:
     factors = [(2 * order + 1) * k for order, k in enumerate(coefficients, 1)]
     rates = [abs(factor) ** (1.0 / order) for order, factor in enumerate(factors, 1)]
     rate = max(rates)
-    # The slope in z = rate r^2 has coefficients of at most 1. Its roots in 1/z are those of a polynomial with the
-    # leading coefficient 1, which stays well conditioned when a term vanishes; the nearest fold is the largest root.
+    # As a polynomial in z = rate r^2, the slope has coefficients of at most 1. Solve for 1/z: that polynomial has the
+    # leading coefficient 1 and stays well conditioned when a term vanishes. The largest root is the nearest fold.
     scaled = [
         math.copysign((each / rate) ** order, k) for order, (each, k) in enumerate(zip(rates, factors, strict=True), 1)
     ]

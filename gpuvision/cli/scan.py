@@ -119,7 +119,7 @@ def scan(
     done.write(out, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
     for advice in done.advice():
-        typer.echo(f"gpuvision: {advice}", err=True)
+        echo(f"warning: {advice}", err=True)
     echo(f"{done.summary()}\nlook at {out / 'picture.png'} and {out / 'report.json'}", err=prints_report(as_json))
 
 

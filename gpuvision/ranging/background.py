@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from gpuvision.host.arrays import HostArray
 from gpuvision.host.errors import RecordingError
-from gpuvision.host.sources import Arrivals, Source
+from gpuvision.host.sources import Arrivals, Source, check_frame
 
 # The threshold lies at this multiple of the distance between the median of the noise and its 0.1 % quantile: 6.2
 # standard deviations of Gaussian noise. Chosen: one false sample in 1e9.
@@ -79,11 +79,7 @@ class ImageSubtracted(_Subtracted):
 
     def __init__(self, source: Source, background: HostArray, *, saturation: float | None = None) -> None:
         super().__init__(source)
-        if background.shape != source.shape or background.dtype != source.dtype:
-            raise RecordingError(
-                f"the background is {_described(background.shape, background.dtype)}, "
-                f"the frames are {_described(source.shape, source.dtype)}; both must be alike"
-            )
+        check_frame(background, source.shape, source.dtype, "the background")
         self._background = background.copy()
         self._limit = _saturation(source.dtype, saturation)
 
@@ -337,7 +333,3 @@ def _subtract(frame: HostArray, background: HostArray, out: HostArray, limit: fl
     np.subtract(out, background, out=out)
     if saturated is not None:
         out[saturated] = kept
-
-
-def _described(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
-    return f"{'x'.join(map(str, shape))} {dtype}"

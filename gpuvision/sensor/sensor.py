@@ -30,7 +30,7 @@ import math
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -46,7 +46,7 @@ from gpuvision.schema import DescriptionError, Section, read_toml
 from gpuvision.sensor.light_source import Light, read_light
 
 Background = Literal["none", "median", "previous", "dark_after", "dark_before"]
-BACKGROUNDS: tuple[Background, ...] = ("none", "median", "previous", "dark_after", "dark_before")
+BACKGROUNDS: tuple[Background, ...] = get_args(Background)
 Folded = Literal["drop", "top"]
 Ambiguous = Literal["drop", "keep"]
 

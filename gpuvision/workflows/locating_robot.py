@@ -131,8 +131,8 @@ def locate_robot(
     A pose is refused where random points reach it by chance in more than one of a thousand searches. A pose of a scan
     is also refused where the share of missing lines is more than a third of the share of explained points
     (`Evidence.missing`): clutter leaves points unexplained and robots in the way hide lines, but a wrong field does
-    both. Clutter in place of points on lines also does both, but thins out all lines alike: such a pose is accepted
-    where no line is missing as a whole (`RobotLimits.min_least_seen`).
+    both. Clutter that replaces points on lines also does both, but it thins out all lines alike: such a pose is
+    accepted where no whole line is missing (`RobotLimits.min_least_seen`).
     """
     device = Device.best() if device is None else device
     start = time.perf_counter()

@@ -21,7 +21,7 @@ from gpuvision.host.files import atomic_write
 from gpuvision.host.outputs import Outputs
 from gpuvision.host.recordings import read_array, read_image
 
-# Pixels of the frame "all" over those of the image, at most: near the fold of a lens it grows without bound.
+# Largest number of pixels of the frame "all" per pixel of the image: near the fold of a lens the frame is unlimited.
 _LARGEST_FRAME = 16
 Frame = Literal["same", "all", "valid"]
 Progress = Callable[[int, int | None], object]

@@ -49,7 +49,7 @@ def _documented() -> Iterator[tuple[str, object, object]]:
 
 
 def _literal(source: ast.expr | str) -> object:
-    """Return a value; None for None, which stands for a documented value, and for an expression."""
+    """Return a literal value; None for an expression, and for None, whose meaning the docstring states."""
     try:
         return ast.literal_eval(source)
     except (ValueError, SyntaxError):

@@ -44,8 +44,8 @@ def environment(tree: Path) -> dict[str, str]:
 def tests_of(fault: Fault, budget: float) -> list[str]:
     """Return the test files of a file, and recorded tests that run the lines of the fault, up to `budget` seconds.
 
-    Lines that run only at import have no recorded tests; for them, take all tests that run any line of the file. The
-    test files of a kernel are those of the operations that launch it, at most `_MAX_FILES` of a header of many.
+    Lines that run only at import have no recorded tests; for them, take all tests that run any line of the file. For a
+    kernel, take the test files of the operations that launch it; for a header of many kernels, at most `_MAX_FILES`.
     """
     path = ROOT / fault.file
     is_code = path.suffix == ".py"
@@ -65,7 +65,7 @@ def tests_of(fault: Fault, budget: float) -> list[str]:
 
 @cache
 def _test_files(path: Path, *, direct: bool = True) -> tuple[str, ...]:
-    """Return the test files of a Python file: the one of the same name, then those that mention most of its names.
+    """Return the test files of a Python file: the one of the same name, then the files that mention most of its names.
 
     A module whose names no test mentions is tested through the modules that import it.
     """

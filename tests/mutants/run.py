@@ -29,7 +29,7 @@ sys.path[:0] = [str(ROOT / "tests")]
 from mutants import record  # noqa: E402
 from mutants.faults import Fault, draw_faults, planted_faults  # noqa: E402
 
-_BUDGET = 60.0  # of the recorded tests of one fault beyond those of its test files [s], by the times of the record
+_BUDGET = 60.0  # for recorded tests of one fault, in addition to its test files [s]; by the times of the record
 _TIMEOUT = 900.0  # of all tests of one fault [s]: kernels are compiled anew, and the machine may be busy
 _TEST_TIMEOUT = 150.0  # of one test [s]: an endless loop in Python fails the test
 _KERNEL_SHARE = 0.3  # of the sample

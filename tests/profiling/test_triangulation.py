@@ -13,7 +13,7 @@ from gpuvision.ranging.triangulation import Triangulation
 @pytest.mark.parametrize("lens", [None, triangulation.LENS])
 def test_the_peers_agree_with_the_kernel(device: Device, lens: object) -> None:
     operation = Triangulation(homography=triangulation.HOMOGRAPHY, region=triangulation.REGION, lens=lens)
-    # The case itself compares the flags of the kernel with those of NumPy in double precision.
+    # `_case` compares the flags of kernel and NumPy in double precision.
     case = triangulation._case(device, operation, "float32", 1001, "small")
     assert case.error < 1e-5
     assert set(case.peers) == {"numba", "numpy"}

@@ -104,7 +104,9 @@ def test_a_stated_saturation_replaces_the_largest_code() -> None:
 
 @pytest.mark.parametrize("background", [np.zeros((7, 10), np.uint8), np.zeros((7, 11), np.uint16)])
 def test_another_background_is_refused(background: Any) -> None:
-    with pytest.raises(RecordingError, match=r"the background is 7x1[01] uint(8|16), the frames are 7x11 uint8"):
+    with pytest.raises(
+        RecordingError, match=r"the background: 7x1[01] uint(8|16) where the first frame was 7x11 uint8"
+    ):
         ImageSubtracted(ArraySource(frames_of(2, np.uint8)), background)
 
 

@@ -120,11 +120,11 @@ def test_new_fields_are_in_the_key() -> None:
 
 def test_fields_that_are_not_optical_exist() -> None:
     for kind, names in NOT_OPTICAL.items():
-        assert names <= {each.name for each in dataclasses.fields(kind)}  # type: ignore[arg-type]
+        assert names <= {each.name for each in dataclasses.fields(kind)}
 
 
 def test_every_number_counts() -> None:
-    """Long arrays differ in one element; NumPy and Python numbers, shapes and types are told apart."""
+    """Long arrays differ in one element; the key distinguishes NumPy and Python numbers, shapes and types."""
     long = np.zeros(100_000)
     changed = long.copy()
     changed[50_000] = 1e-300

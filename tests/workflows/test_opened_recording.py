@@ -84,10 +84,10 @@ def test_a_failed_scan_says_what_to_try(device: Device) -> None:
 
 def test_the_threshold_lies_between_noise_and_line() -> None:
     opened = open_for_scan(daylight("median"), sensor("median"))
-    threshold: Any = opened.sensor.readout.threshold  # type: ignore[union-attr]  # a camera
+    threshold: Any = opened.sensor.readout.threshold
     assert 6 * NOISE <= threshold <= 0.3 * 100.0
     previous = open_for_scan(daylight("median"), sensor("previous")).sensor
-    assert previous.readout.threshold >= threshold  # type: ignore[union-attr]  # a camera
+    assert previous.readout.threshold >= threshold
 
 
 def test_a_source_that_gives_its_frames_once_is_refused() -> None:

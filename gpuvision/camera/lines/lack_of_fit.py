@@ -262,7 +262,7 @@ def _jackknife(columns: Float64, normal: Float64, residual: Float64, cluster: In
 
 
 def _not_below(matrix: Float64, least: Float64) -> Float64:
-    """Return the matrix with its variances raised to those of ``least`` in the directions where they are smaller."""
+    """Return a covariance that is at least ``least`` in every direction: raise the variances that are smaller."""
     values, vectors = np.linalg.eigh(least)
     root = vectors * np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))
     inner = np.linalg.solve(root, np.linalg.solve(root, matrix).T)

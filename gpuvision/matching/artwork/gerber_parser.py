@@ -71,8 +71,7 @@ class TransformedAperture:
         return float(self.aperture.equivalent_width(unit)) * math.sqrt(abs(np.linalg.det(self.matrix)))
 
 
-# gerbonara has no type annotations, so that its classes are Any for mypy.
-class _Parser(GerberParser):  # type: ignore[misc]
+class _Parser(GerberParser):  # type: ignore[misc]  # gerbonara has no type annotations: its classes are Any
     """Parser that also draws step-and-repeat, transformed apertures and rotated polygons, and reads G1, G2 and G3."""
 
     STATEMENT_REGEXES: ClassVar[dict[str, str]] = {

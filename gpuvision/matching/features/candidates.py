@@ -132,7 +132,7 @@ def find_ruler_candidates(
 def pixel_hint(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike, imaging: Imaging) -> str:
     """Return a hint for a region without rulers: the room that an edge needs, and a pixel size that leaves it.
 
-    The parameters are those of `find_ruler_candidates`.
+    See `find_ruler_candidates` for the parameters.
     """
     room = 3 * imaging.smoothing_px * imaging.pixel + imaging.registration
     hint = f"an edge needs {1e6 * room:.0f} um without another edge on both sides"

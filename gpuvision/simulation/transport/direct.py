@@ -81,8 +81,8 @@ class DirectLimits:
         Distance of two levels at which the search for such a place ends [sigmas]. Derived: half of it moves a reading
         of half a beam by 0.0016 sigma.
     outer_slab
-        Where an end of a run moves within the sheet, the light beyond this place is a slab of its own [sigmas];
-        derived: 5e-4 of the light lies beyond.
+        Place across the sheet beyond which the light is a separate slab, where an end of a run moves within the sheet
+        [sigmas]; derived: 5e-4 of the light lies beyond.
     same_point
         Distance below which two lit points are one, as part of the largest coordinate; rounding with a wide margin.
     """

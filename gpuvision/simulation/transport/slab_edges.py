@@ -202,7 +202,7 @@ def find_runs(pieces: Pieces, place: Float64, sheet: Integers, scale: LineScale)
 def _straight_ends(
     ends: Float64, place: Float64, following: Integers, previous: Integers, sigma: float, width: float
 ) -> Flags:
-    """Return whether the ends of runs move to those of the next runs along straight lines, (r, 2)."""
+    """Return for both ends of each run whether the end moves to the next level along a straight line, (r, 2)."""
     slope = np.full(ends.shape, np.nan)
     has = np.flatnonzero(following >= 0)
     slope[has] = (ends[following[has]] - ends[has]) / (place[following[has]] - place[has])[:, None]

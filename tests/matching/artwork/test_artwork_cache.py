@@ -1,4 +1,4 @@
-"""Cache of parsed artwork: equal to what it stands for, private, verified and bounded."""
+"""Cache of parsed artwork: equal to freshly parsed artwork, private, verified, of limited size."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_all_that_the_artwork_depends_on_is_in_the_key(
     read_artwork(board, layers=LAYERS)
     renamed = {name: each for name, each in LAYERS.items() if name != "mask.gbr"}
     for count, change in enumerate(({"clearance": 60e-6}, {"via_drill": 1e-3}, {"layers": renamed}), 2):
-        read_artwork(board, **({"layers": LAYERS} | change))  # type: ignore[arg-type]
+        read_artwork(board, **({"layers": LAYERS} | change))
         assert len(entries(cache)) == count
     copper = board / "copper.gbr"
     copper.write_text(copper.read_text().replace("C,0.5*", "C,0.6*"))

@@ -1,4 +1,4 @@
-"""Layers of a board: what is missing or not recognised is said, with the options that name it."""
+"""Layers of a board: messages about missing and unrecognised layers, with the options to name them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_complete_board_has_no_warning(tmp_path: Path) -> None:
     board(tmp_path)
     (tmp_path / "README.txt").write_text("made by hand\n")
     for side in ("top", "bottom"):
-        assert read_artwork(tmp_path, side=side).warnings == ()  # type: ignore[arg-type]
+        assert read_artwork(tmp_path, side=side).warnings == ()
 
 
 def test_a_mask_that_is_not_recognised_is_said(tmp_path: Path) -> None:

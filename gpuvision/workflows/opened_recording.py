@@ -84,17 +84,7 @@ def open_for_scan(recording: str | Path | Source | Array, sensor: Sensor) -> Ope
         background = sensor.recording.background
         image = read_frame(background, sensor.recording.channel) if isinstance(background, Path) else None
         if background == "median" or sensor.auto_threshold:
-            if isinstance(recording, Source):
-                raise RecordingError(
-                    f"{name}: a median background and an automatic threshold need a recording that can be read twice; "
-                    "give [recording] background the file of an image, and [line] threshold a number"
-                )
-            group = 2 if background in ("dark_after", "dark_before") else 1
-            again, _ = _open(recording, sensor)
-            try:
-                frames = sample_frames(again, group=group)
-            finally:
-                again.close()
+            frames = _sampled(recording, sensor)
             image = median_background(frames[:, 0]) if background == "median" else image
             sensor = _with_threshold(sensor, frames, image) if sensor.auto_threshold else sensor
         subtracted = _subtracted(source, sensor, image)
@@ -102,6 +92,23 @@ def open_for_scan(recording: str | Path | Source | Array, sensor: Sensor) -> Ope
         source.close()
         raise
     return OpenedRecording(source=subtracted, name=name, sensor=sensor)
+
+
+def _sampled(recording: str | Path | Source | Array, sensor: Sensor) -> Array:
+    """Return frames that are spread over a recording, (groups, group, rows, columns): pairs where the light alternates.
+
+    The recording is opened a second time for them.
+    """
+    if isinstance(recording, Source):
+        raise RecordingError(
+            f"{type(recording).__name__}: a median background and an automatic threshold need a recording that can be "
+            "read twice; give [recording] background the file of an image, and [line] threshold a number"
+        )
+    source, _ = _open(recording, sensor)
+    try:
+        return sample_frames(source, group=2 if sensor.recording.background in ("dark_after", "dark_before") else 1)
+    finally:
+        source.close()
 
 
 def _open(recording: str | Path | Source | Array, sensor: Sensor) -> tuple[Source, str]:

@@ -29,6 +29,22 @@ class QueuePolicy(StrEnum):
     stop = "raise"
 
 
+class SurfaceFile(StrEnum):
+    """Values of ``--format``."""
+
+    x3p = "x3p"
+    sur = "sur"
+    sdf = "sdf"
+    sdf_ascii = "sdf-ascii"
+
+
+class PlyPoints(StrEnum):
+    """Values of ``--ply``."""
+
+    organised = "organised"
+    valid = "valid"
+
+
 Recording = Annotated[
     Path,
     typer.Argument(
@@ -55,6 +71,22 @@ RoomPolicy = Annotated[
         "--rate), or raise an error."
     ),
 ]
+SurfaceFiles = Annotated[
+    list[SurfaceFile] | None,
+    typer.Option(
+        "--format",
+        help="Also write the height map for surface metrology programs: X3P (ISO 25178-72), SUR (Digital Surf), SDF "
+        "(ISO 25178-71, binary or text); repeat the option for several.",
+    ),
+]
+PlyFile = Annotated[
+    PlyPoints,
+    typer.Option(
+        "--ply",
+        help="Points of range_image.ply: organised (all samples in scan order, NaN in holes) or valid (for viewers "
+        "that do not support NaN).",
+    ),
+]
 TraceFile = Annotated[
     Path | None,
     typer.Option(
@@ -75,6 +107,8 @@ def scan(
     ] = None,
     rate: Rate = None,
     policy: RoomPolicy = None,
+    formats: SurfaceFiles = None,
+    ply: PlyFile = PlyPoints.organised,
     trace: TraceFile = None,
     as_json: ReportFile = None,
     overwrite: Overwrite = False,
@@ -89,7 +123,7 @@ def scan(
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
-    from gpuvision.workflows.scan_result import SCAN_FILES
+    from gpuvision.workflows.scan_result import SCAN_FILES, surface_files
     from gpuvision.workflows.scanning import scan as run
 
     described = Sensor.load(sensor)
@@ -97,7 +131,8 @@ def scan(
     if isinstance(described.recording.background, Path):
         inputs.append(described.recording.background)
     outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
-    outputs.claim_folder(out, SCAN_FILES)
+    chosen_formats = [each.value for each in formats or ()]
+    outputs.claim_folder(out, (*SCAN_FILES, *surface_files(chosen_formats).values()))
     outputs.claim(as_json)
     if trace is not None:
         if trace.absolute() in (out.absolute(), *out.absolute().parents):
@@ -116,7 +151,7 @@ def scan(
             overwrite=overwrite,
             progress=progress,
         )
-    done.write(out, overwrite=overwrite)
+    done.write(out, formats=chosen_formats, ply_points=ply.value, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
     for advice in done.advice():
         echo(f"warning: {advice}", err=True)

@@ -66,7 +66,23 @@ def _numpy(values: Values) -> Array:
     return to_numpy(values) if isinstance(values, DeviceArray) else np.asarray(values)
 
 
-def _heights(z: Values, grid: Grid | None) -> Array:
+def height_array(z: Values, grid: Grid | None) -> Array:
+    """Return heights as a NumPy array after a check of their shape.
+
+    Parameters
+    ----------
+    z : array_like or device array
+        Heights [m], (rows, columns).
+    grid : Grid, optional
+        Grid with the same shape.
+
+    Raises
+    ------
+    TypeError
+        The heights are a masked array.
+    ValueError
+        The heights do not have two dimensions, or not the shape of the grid.
+    """
     if isinstance(z, np.ma.MaskedArray):
         raise TypeError("heights are a masked array, expected a plain array with NaN in holes; use .filled(math.nan)")
     heights = _numpy(z)
@@ -111,7 +127,7 @@ def write_tiff(path: str | os.PathLike[str], z: Values, grid: Grid | None = None
     ValueError
         ``z`` does not have two dimensions, or not the shape of the grid.
     """
-    z = _heights(z, grid).astype(np.float32)
+    z = height_array(z, grid).astype(np.float32)
     cells: dict[str, Any] = (
         {} if grid is None else {"resolution": (_CENTIMETRE / grid.cell_x, _CENTIMETRE / grid.cell_y)}
     )
@@ -176,7 +192,7 @@ def write_png16(
     ValueError
         ``z`` does not have two dimensions, or not the shape of the grid; or ``low`` exceeds ``high``.
     """
-    z = _heights(z, grid).astype(np.float64)
+    z = height_array(z, grid).astype(np.float64)
     finite = z[np.isfinite(z)]
     low = float(finite.min(initial=math.inf)) if low is None else low
     high = float(finite.max(initial=-math.inf)) if high is None else high

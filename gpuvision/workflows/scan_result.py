@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
+from gpuvision.formats.surface_files import SURFACE_WRITERS, SurfaceFormat
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
@@ -26,6 +28,7 @@ from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 
 Array = npt.NDArray[Any]
+PlyPoints = Literal["organised", "valid"]
 
 SCAN_FILES = (
     "range_image.tiff",
@@ -37,6 +40,31 @@ SCAN_FILES = (
     "report.json",
 )
 """Names of the files that `Scan.write` writes."""
+
+
+def surface_files(formats: Iterable[str]) -> dict[SurfaceFormat, str]:
+    """Return the name of the file of each surface format that `Scan.write` writes.
+
+    Parameters
+    ----------
+    formats : iterable of str
+        Names of formats: "x3p", "sur", "sdf" or "sdf-ascii".
+
+    Raises
+    ------
+    ValueError
+        A format is unknown, or two formats have the same file.
+    """
+    names: dict[SurfaceFormat, str] = {}
+    for given in dict.fromkeys(formats):
+        each = next((known for known in SURFACE_WRITERS if known == given), None)
+        if each is None:
+            raise ValueError(f"the format is {given!r}, expected one of {', '.join(SURFACE_WRITERS)}")
+        name = f"range_image.{SURFACE_WRITERS[each][0]}"
+        if name in names.values():
+            raise ValueError(f"two formats write {name}; give one of them")
+        names[each] = name
+    return names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +189,14 @@ class Scan:
             "map": dataclasses.asdict(self.grid) | {"valid_fraction": valid_cells},
         }
 
-    def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
+    def write(
+        self,
+        folder: str | Path,
+        *,
+        formats: Iterable[str] = (),
+        ply_points: PlyPoints = "organised",
+        overwrite: bool = False,
+    ) -> None:
         """Write the range image, pictures and the report into a folder; after an error no file remains.
 
         ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` show the height map. ``range_image.ply``
@@ -171,6 +206,10 @@ class Scan:
         ----------
         folder : str or Path
             Output folder; created if it is missing.
+        formats : iterable of {"x3p", "sur", "sdf", "sdf-ascii"}, optional
+            Further files of the height map, ``range_image.x3p`` and so on; see `gpuvision.formats.surface_files`.
+        ply_points : {"organised", "valid"}
+            Points in the PLY file: all samples in scan order with NaN in holes (default), or only the valid points.
         overwrite : bool
             Whether files may be replaced that no earlier scan wrote. Default False.
 
@@ -186,7 +225,10 @@ class Scan:
             z, points = self.heights.z, self.points
             write_tiff(inside / "range_image.tiff", z, self.grid)
             write_png16(inside / "range_image.png", z, self.grid)
-            write_ply(inside / "range_image.ply", *points[:3], self.intensity, points.status)
+            organised = ply_points == "organised"
+            write_ply(inside / "range_image.ply", *points[:3], self.intensity, points.status, organised=organised)
+            for each, name in surface_files(formats).items():
+                SURFACE_WRITERS[each][1](inside / name, z, self.grid)
             write_npz(inside / "range_image.npz", *self._arrays())
             # One colour scale: the two pictures show the same heights.
             span = height_span(to_numpy(points.z).astype(np.float64))

@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from SurfaceTopography.IO import open_topography
 
+from gpuvision.formats.range_image import read_ply, read_tiff
 from gpuvision.host.files import atomic_folder, check_writable_file, check_writable_folder
 from gpuvision.sensor.sensor import Sensor
+from gpuvision.workflows.scan_result import surface_files
 from gpuvision.workflows.scanning import scan
 from scanning import Ran, check_refused, currents
 
@@ -108,3 +111,22 @@ def test_an_empty_name_is_not_this_folder(plane: Path, tmp_path: Path, run: Any)
             check("")
     with pytest.raises(ValueError, match="is empty"):
         scan(currents(2), Sensor.load("psd_line")).write("")
+
+
+def test_a_scan_also_writes_surface_files_and_a_ply_of_valid_points(plane: Path, tmp_path: Path, run: Any) -> None:
+    out = tmp_path / "out"
+    formats = ("--format", "x3p", "--format", "sur", "--format", "sdf-ascii", "--ply", "valid")
+    assert run("scan", plane, "--sensor", "psd_line", "--out", out, *formats).code == 0
+    heights = read_tiff(out / "range_image.tiff")
+    for name in ("range_image.x3p", "range_image.sur", "range_image.sdf"):
+        shape = open_topography(str(out / name)).topography().nb_grid_pts
+        assert shape == heights.z.shape[::-1]
+    assert all(np.isfinite(read_ply(out / "range_image.ply")["z"]))
+    assert run("scan", plane, "--sensor", "psd_line", "--out", out, *formats).code == 0  # its own files, replaced
+
+
+def test_two_formats_of_one_file_are_refused(plane: Path, tmp_path: Path, run: Any) -> None:
+    ran = run("scan", plane, "--sensor", "psd_line", "--out", tmp_path / "out", "--format=sdf", "--format=sdf-ascii")
+    check_refused(ran, r"two formats write range_image\.sdf; give one of them")
+    with pytest.raises(ValueError, match="the format is 'stl', expected one of x3p, sur, sdf, sdf-ascii"):
+        surface_files(["stl"])

@@ -1,0 +1,75 @@
+"""X3P, SUR and SDF files, read back by SurfaceTopography."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+
+import numpy as np
+import pytest
+from SurfaceTopography.IO import open_topography
+
+from gpuvision.formats.surface_files import SURFACE_WRITERS, write_sdf, write_sur, write_x3p
+from gpuvision.ranging.regrid import Grid
+
+GRID = Grid(left=-2e-3, top=5e-3, cell_x=20e-6, cell_y=30e-6, columns=7, rows=5)
+METRES = {"m": 1.0, "mm": 1e-3, "µm": 1e-6}
+
+
+@pytest.fixture
+def z(rng):
+    heights = rng.normal(1e-3, 40e-6, GRID.shape)
+    heights[2, 3] = heights[0, 0] = np.nan
+    return heights
+
+
+def read(path):
+    """Return heights [m] with NaN in holes, as (x, y) from the first stored row, and the size [m]."""
+    topography = open_topography(str(path)).topography()
+    unit = METRES[topography.unit]
+    return np.ma.filled(topography.heights(), np.nan) * unit, np.array(topography.physical_sizes) * unit
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("name", SURFACE_WRITERS)
+def test_surface_topography_reads_heights_holes_and_size(tmp_path, z, name, dtype):
+    ending, write = SURFACE_WRITERS[name]
+    path = tmp_path / f"map.{ending}"
+    write(path, z.astype(dtype), GRID)
+    heights, size = read(path)
+    rows = z if name == "sur" else z[::-1]
+    # SUR: half a step of the integers; the others keep every digit.
+    error = 1.3e-3 / 2**30 + 6e-8 * 1.3e-3 if dtype is np.float32 else 1.3e-3 / 2**30
+    np.testing.assert_allclose(heights.T, rows, rtol=1e-15, atol=error if dtype is np.float32 or name == "sur" else 0)
+    np.testing.assert_allclose(size, [7 * 20e-6, 5 * 30e-6], rtol=1e-7)
+
+
+def test_an_x3p_states_positions_and_checksums(tmp_path, z):
+    write_x3p(tmp_path / "map.x3p", z, GRID)
+    with zipfile.ZipFile(tmp_path / "map.x3p") as archive:
+        text, points = archive.read("main.xml").decode(), archive.read("bindata/data.bin")
+        checksum = archive.read("md5checksum.hex").decode().split()[0]
+    assert "<Offset>-0.002</Offset>" in text  # x of the first column
+    assert f"<Offset>{5e-3 - 4 * 30e-6!r}</Offset>" in text  # y of the lowest row
+    assert hashlib.md5(points).hexdigest().upper() in text
+    assert checksum == hashlib.md5(text.encode()).hexdigest().upper()
+
+
+def test_a_sur_of_holes_and_zeros_can_be_read(tmp_path):
+    pair = Grid(left=0, top=0, cell_x=1, cell_y=1, columns=2, rows=1)
+    write_sur(tmp_path / "flat.sur", np.array([[0.0, np.nan]]), pair)
+    assert (tmp_path / "flat.sur").stat().st_size == 512 + 8
+    np.testing.assert_array_equal(read(tmp_path / "flat.sur")[0].T, [[0.0, np.nan]])
+    heights = np.array([[-7e-3, 2e-3]])  # the hole's integer is below the smallest height
+    write_sur(tmp_path / "low.sur", heights, pair)
+    np.testing.assert_allclose(read(tmp_path / "low.sur")[0].T, heights, atol=7e-3 / 2**30)
+
+
+def test_maps_that_do_not_fit_are_refused(tmp_path, z):
+    for write in (write_x3p, write_sur, write_sdf):
+        with pytest.raises(ValueError, match=r"the grid has \(5, 7\)"):
+            write(tmp_path / "map", z.T, GRID)
+    wide = Grid(left=0, top=0, cell_x=1, cell_y=1, columns=65536, rows=1)
+    with pytest.raises(ValueError, match="an SDF file holds at most 65535 a side"):
+        write_sdf(tmp_path / "map", np.zeros((1, 65536)), wide)
+    assert list(tmp_path.iterdir()) == []

@@ -134,7 +134,7 @@ def locate(
     that the image does not support is refused with a reason. For robots on a field: gpuvision locate-robot.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    from gpuvision.formats.camera_file import read_lens
+    from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size, read_lens
     from gpuvision.formats.features_file import read_features
     from gpuvision.host import Device
     from gpuvision.host.recordings import read_image
@@ -156,6 +156,8 @@ def locate(
     pose, distance_and_angle = initial_pose_of(initial_pose), _search_range(search_range)
     etch_bias_sigma = quantities(etch_bias, "--etch-bias", "m")[0]
     picture = read_image(image)
+    if camera is not None:
+        check_calibrated_size(image, (picture.shape[1], picture.shape[0]), read_calibrated_size(camera))
     artwork = _artwork(board, chosen, "top" if side is None else side.value, layers, pixel, blur_px)
     located = locate_board(
         picture,

@@ -86,6 +86,7 @@ def locate_robot(
     look alike; both are listed. INPUT that does not fit the field is refused with a reason.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size
     from gpuvision.formats.field_file import read_field
     from gpuvision.host import Device
     from gpuvision.plots.field import draw_located_robot
@@ -112,6 +113,8 @@ def locate_robot(
         measured = read_points(source)
     else:
         picture = read_floor(source)
+        if camera is not None:
+            check_calibrated_size(source, (picture.shape[1], picture.shape[0]), read_calibrated_size(camera))
         measured = _scan(
             picture, described, camera, pixel, line_width, blind_radius, threshold=threshold, device=chosen
         )

@@ -74,6 +74,45 @@ def read_calibrated_size(path: str | Path) -> tuple[int, int] | None:
     return int(columns), int(rows)
 
 
+def check_calibrated_size(
+    file: str | Path,
+    size: tuple[int, int],
+    calibrated_size: tuple[int, int] | None,
+    part: tuple[tuple[int, int], int] | None = None,
+) -> None:
+    """Check that an image shows the sensor pixels for which a camera model was calibrated.
+
+    Parameters
+    ----------
+    file : str or Path
+        File of the image, for the message.
+    size : (int, int)
+        Columns and rows of the image.
+    calibrated_size : (int, int) or None
+        Columns and rows of the calibrated images, see `read_calibrated_size`; None: no check.
+    part : ((int, int), int), optional
+        Part of the sensor that the image shows: column and row of its first pixel in the calibrated image, and
+        calibrated pixels per pixel along each axis. Default: the whole sensor.
+
+    Raises
+    ------
+    ValueError
+        The image has another size, or the part does not lie within the calibrated image.
+    """
+    if calibrated_size is None or (part is None and size == calibrated_size):
+        return
+    columns, rows = size
+    said = f"{file}: {columns} x {rows} pixels, the model was calibrated at {calibrated_size[0]} x {calibrated_size[1]}"
+    if part is None:
+        raise ValueError(
+            f"{said}; give the window and the binning of these images to gpuvision undistort, or calibrate at this size"
+        )
+    window, binning = part
+    ends = (window[0] + columns * binning, window[1] + rows * binning)
+    if min(window) < 0 or ends[0] > calibrated_size[0] or ends[1] > calibrated_size[1]:
+        raise ValueError(f"{said}; the window from {window} with binning {binning} ends at {ends}, outside")
+
+
 def radial_lens(table: Section) -> Lens:
     """Return the lens of a table ``[lens]``; refuse unknown keys."""
     k1 = table.number("k1", "sensor unit^-2")

@@ -235,12 +235,14 @@ def read_points(path: Path) -> Float32:
     OSError
         The file cannot be read.
     RecordingError
-        The file has another content.
+        The file has another content, or none of its points is finite.
     """
     with reading(path, "list of points", RecordingError):
         points = read_array(path) if path.suffix.lower() == ".npy" else np.loadtxt(path, delimiter=",", ndmin=2)
     if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind not in "fiu":
         raise RecordingError(f"{path}: {points.dtype} of shape {points.shape}, expected points (n, 2) in metres")
+    if len(points) and not np.isfinite(points).all(axis=1).any():
+        raise RecordingError(f"{path}: none of the {len(points)} points is finite")
     return np.ascontiguousarray(points, np.float32)
 
 

@@ -15,6 +15,7 @@ from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.undistort_image import Border, Interpolation, UndistortImage
 from gpuvision.camera.undistort_points import UndistortPoints
+from gpuvision.formats.camera_file import check_calibrated_size
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import atomic_write
@@ -124,34 +125,16 @@ def undistort_files(
                     np.save(npy, points)
             else:
                 image = _image_without_alpha(file)
-                _check_size(file, image, calibrated_size, (window or (0, 0), binning) if is_part else None)
+                size = (image.shape[1], image.shape[0])
+                check_calibrated_size(file, size, calibrated_size, (window or (0, 0), binning) if is_part else None)
                 if frame != "same":
-                    image_options["region"] = frame_region(model, (image.shape[1], image.shape[0]), frame)
+                    image_options["region"] = frame_region(model, size, frame)
                 name = f"{file.stem}.tif" if image.dtype == np.float32 else f"{file.stem}.png"
                 outputs.claim(out / name)
                 _write(folder / name, _undistorted_image(image, model, device, image_options))
             written.append(out / name)
         progress(len(inputs), len(inputs))
     return tuple(written)
-
-
-def _check_size(
-    file: Path,
-    image: npt.NDArray[Any],
-    calibrated_size: tuple[int, int] | None,
-    part: tuple[tuple[int, int], int] | None,
-) -> None:
-    """Refuse an image that does not show the sensor pixels for which the model was calibrated."""
-    rows, columns = image.shape[:2]
-    if calibrated_size is None or (part is None and (columns, rows) == calibrated_size):
-        return
-    said = f"{file}: {columns} x {rows} pixels, the model was calibrated at {calibrated_size[0]} x {calibrated_size[1]}"
-    if part is None:
-        raise ValueError(f"{said}; give the window and the binning of these images, or calibrate at their size")
-    window, binning = part
-    ends = (window[0] + columns * binning, window[1] + rows * binning)
-    if min(window) < 0 or ends[0] > calibrated_size[0] or ends[1] > calibrated_size[1]:
-        raise ValueError(f"{said}; the window from {window} with binning {binning} ends at {ends}, outside")
 
 
 def frame_region(model: Lens | Camera, size: tuple[int, int], frame: Frame) -> tuple[int, int, int, int]:

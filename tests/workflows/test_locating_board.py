@@ -449,6 +449,27 @@ def test_quantities_have_units() -> None:
             quantities(wrong, "--initial-pose", "m,m,rad")
 
 
+def test_a_camera_file_of_another_image_size_is_refused(tmp_path: Path, run: Locate) -> None:
+    """The model of 4000 x 3000 pixels would move points of a smaller image by the wrong amount."""
+    camera = tmp_path / "camera.toml"
+    write_lens(camera, Lens(k1=1e-9, centre=(2000.0, 1500.0)), {"image": {"size": [4000, 3000]}})
+    cv2.imwrite(str(tmp_path / "image.png"), np.zeros((80, 128), np.uint8))
+    for command, described in (("locate", ("--board", tmp_path)), ("locate-robot", ("--field", "robocup_msl"))):
+        options = (*described, "--scale", "1cm", "--camera", camera)
+        code, out, err = run(tmp_path / "image.png", *options, command=command)
+        assert (code, out) == (1, "")
+        assert "image.png: 128 x 80 pixels, the model was calibrated at 4000 x 3000" in err.replace("\n", "")
+
+
+@pytest.mark.parametrize("name", ["points.csv", "points.npy"])
+def test_a_file_without_a_finite_point_is_named(tmp_path: Path, run: Locate, name: str) -> None:
+    points = np.full((9, 2), np.nan)
+    np.savetxt(tmp_path / name, points, delimiter=",") if name.endswith("csv") else np.save(tmp_path / name, points)
+    code, out, err = run(tmp_path / name, "--field", "robocup_msl", command="locate-robot")
+    assert (code, out) == (1, "")
+    assert f"{name}: none of the 9 points is finite" in err.replace("\n", "")
+
+
 def test_points_of_any_camera_will_do(tmp_path: Path, run: Locate, rng: np.random.Generator) -> None:
     field = read_field("robocup_msl")
     image = floor_image(field, (-6.0, 2.0, 0.7), scale=0.03, shape=(400, 440), line_width=0.125, rng=rng)

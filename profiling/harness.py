@@ -12,6 +12,7 @@ import importlib
 import json
 import platform
 import time
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
@@ -133,6 +134,26 @@ class Row:
 
 
 @dataclass(frozen=True)
+class Failure:
+    """Operation whose benchmark raised an exception. Its rows on the device are missing.
+
+    Attributes
+    ----------
+    operation, device
+        Name of the operation, and label of the device.
+    reason
+        Type and message of the exception.
+    traceback
+        Traceback of the exception.
+    """
+
+    operation: str
+    device: str
+    reason: str
+    traceback: str
+
+
+@dataclass(frozen=True)
 class Run:
     """Rows of a benchmark run.
 
@@ -144,16 +165,24 @@ class Run:
         Whether the machine held its speed during the measurement.
     machine
         Description of the machine, see `describe_machine`.
+    failures
+        Operations without rows, because their benchmark raised an exception.
     """
 
     rows: Sequence[Row]
     valid: bool
     machine: Mapping[str, Any]
+    failures: Sequence[Failure] = ()
 
     def to_json(self) -> str:
         """Return the run as JSON."""
-        rows = [row.to_dict() for row in self.rows]
-        return json.dumps({"machine": self.machine, "valid": self.valid, "rows": rows}, indent=1) + "\n"
+        table = {
+            "machine": self.machine,
+            "valid": self.valid,
+            "failures": [asdict(failure) for failure in self.failures],
+            "rows": [row.to_dict() for row in self.rows],
+        }
+        return json.dumps(table, indent=1) + "\n"
 
     def write(self, path: Path, *, overwrite: bool = False) -> None:
         """Write the run as JSON; on an error no file is written.
@@ -240,6 +269,8 @@ def profile(
 ) -> Run:
     """Measure the cases of the given operations on the given devices.
 
+    An operation that raises an exception is added to the failures of the run; the other operations are still measured.
+
     Parameters
     ----------
     operations
@@ -252,14 +283,25 @@ def profile(
         Function that is called with lines of text about the progress.
     """
     rows: list[Row] = []
+    failures: list[Failure] = []
     valid = True
     for operation in operations:
         for device in devices:
             progress(f"{operation} on {device.label}")
-            section, steady = _steady_section(operation, device, seconds, progress)
+            try:
+                section, steady = _steady_section(operation, device, seconds, progress)
+            except Exception as error:
+                failures.append(_failure(operation, device, error))
+                progress(f"  failed: {failures[-1].reason}")
+                continue
             rows += section
             valid &= steady
-    return Run(rows, valid, describe_machine(devices))
+    return Run(rows, valid, describe_machine(devices), failures)
+
+
+def _failure(operation: str, device: Device, error: Exception) -> Failure:
+    reason = "".join(traceback.format_exception_only(error)).strip()
+    return Failure(operation, device.label, reason, "".join(traceback.format_exception(error)))
 
 
 def _steady_section(

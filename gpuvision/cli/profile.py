@@ -44,7 +44,8 @@ def profile(
     """Measure operations against their peers: NumPy, Numba, OpenCV.
 
     Candidates run interleaved. The ratio is the time of the peer over the time of gpuvision. A run during which the
-    machine changed its speed is marked invalid, and the exit code is 1.
+    machine changed its speed is marked invalid, and the exit code is 1. If the measurement of an operation fails, the
+    others are still measured; the report names the operation and the reason, and the exit code is 1.
     """
     if importlib.util.find_spec("numba") is None:
         raise GpuVisionError("the peer numba is missing; install it: pip install 'gpuvision[profile]'")
@@ -78,6 +79,9 @@ def profile(
         echo(f"look at {', '.join(str(plots / name) for name in drawn)}" if drawn else _NO_PLOTS, err=True)
     if not run.valid:
         echo("not valid: the machine changed its speed during the measurement; run the command again", err=True)
+    for failure in run.failures:
+        echo(f"not measured: {failure.operation} on {failure.device}: {failure.reason}", err=True)
+    if run.failures or not run.valid:
         raise typer.Exit(1)
 
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from gpuvision.cli.main import application
 from gpuvision.host import Device, GpuVisionError, NoDeviceError
 from gpuvision.profiling import harness
-from gpuvision.profiling.harness import Row, Run
+from gpuvision.profiling.harness import Failure, Row, Run
 
 ROW = Row(
     operation="psd",
@@ -38,7 +38,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
     def profile(operations: Sequence[str], devices: Sequence[Device], **options: Any) -> Run:
         seen.update(operations=list(operations), devices=[each.label for each in devices], **options)
-        return Run([ROW], seen.get("valid", True), {"processor": "abacus"})
+        return Run([ROW], seen.get("valid", True), {"processor": "abacus"}, seen.get("failures", ()))
 
     monkeypatch.setattr(harness, "profile", profile)
     return seen
@@ -96,6 +96,20 @@ def test_without_names_everything_is_measured_everywhere(asked: dict[str, Any]) 
     assert asked["devices"] == [each.label for each in Device.all()]
     assert "not valid: the machine changed its speed" in ran.output
     assert ran.exit_code == 1
+
+
+def test_an_operation_that_fails_is_named_and_the_rows_of_the_others_are_written(
+    asked: dict[str, Any], tmp_path: Path
+) -> None:
+    asked["failures"] = [Failure("line", "pocl", "ValueError: no such table", "Traceback")]
+    file = tmp_path / "rows.json"
+    ran = CliRunner().invoke(application(), ["profile", "psd", "line", "--json", str(file)])
+    assert ran.exit_code == 1
+    assert "not measured: line on pocl: ValueError: no such table\n" in ran.stderr
+    assert "not valid" not in ran.stderr
+    written = json.loads(file.read_text())
+    assert [each["case"] for each in written["rows"]] == ["float32/1e6"]
+    assert [each["reason"] for each in written["failures"]] == ["ValueError: no such table"]
 
 
 @pytest.mark.parametrize(

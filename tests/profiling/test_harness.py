@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import json
-import time
 import types
 
 import numpy as np
@@ -26,25 +25,51 @@ def case(**changes):
     return harness.Case(**(fields | changes))
 
 
-def test_a_row_holds_a_peer_against_us(device):
-    (row,) = harness.measure(case(), device, seconds=0.01)
+class StepClock:
+    """Replacement of the module `time`: a reading takes 0.1 ms, and a function of `work` its number of seconds."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def perf_counter(self):
+        self.now += 1e-4
+        return self.now
+
+    def work(self, seconds):
+        def call():
+            self.now += seconds
+
+        return call
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = StepClock()
+    monkeypatch.setattr(harness, "time", clock)
+    return clock
+
+
+def test_a_row_holds_a_peer_against_us(clock, device):
+    (row,) = harness.measure(case(peers={"numpy": clock.work(3e-4)}), device, seconds=0.01)
     assert (row.peer, row.peer_version, row.case) == ("numpy", np.__version__, "float32/16")
-    assert row.ratio > 1.0  # summing 2000 numbers takes measurable time
+    assert (row.seconds, row.peer_seconds) == pytest.approx((1e-4, 4e-4))
+    assert row.ratio == pytest.approx(4.0)
     assert row.fraction is None
 
 
-def test_the_ceiling_moves_the_bytes_of_the_case(monkeypatch, device):
+def test_the_ceiling_moves_the_bytes_of_the_case(clock, monkeypatch, device):
     calls = []
 
     def move(*bytes_and_repeats):
         calls.append(bytes_and_repeats)
-        return lambda: time.sleep(2e-3)
+        return clock.work(1.9e-3)
 
     monkeypatch.setattr(ceiling, "move", move)
-    slow = case(ours=lambda: time.sleep(20e-3), traffic=(3 << 20, 1 << 20), repeats=8)
+    slow = case(ours=clock.work(19.9e-3), traffic=(3 << 20, 1 << 20), repeats=8)
     (row,) = harness.measure(slow, device, seconds=0.05)
     assert calls == [(device, 3 << 20, 1 << 20, 8)]
-    assert 0.0 < row.fraction < 1.0  # fraction of the device's limit
+    assert row.seconds == pytest.approx(20e-3 / 8)
+    assert row.fraction == pytest.approx(0.1)  # fraction of the device's limit
 
 
 def test_what_moves_bytes_runs(device):
@@ -57,23 +82,14 @@ def test_facts_stand_beside_the_columns(device):
     assert "metadata" not in row.to_dict()
 
 
-def test_a_part_of_a_peers_work_stands_for_all_of_it(device, monkeypatch):
-    # The peer moves the clock by 2 ms: on a busy machine a peer that sleeps takes several times as long.
-    waited = 0.0
-
-    def work():
-        nonlocal waited
-        waited += 2e-3
-
-    clock = types.SimpleNamespace(perf_counter=lambda: time.perf_counter() + waited)
-    monkeypatch.setattr(harness, "time", clock)
+def test_a_part_of_a_peers_work_stands_for_all_of_it(clock, device):
     (part,), (complete,) = (
-        harness.measure(case(peers={"numpy": work}, factors=factors), device, seconds=0.01)
+        harness.measure(case(peers={"numpy": clock.work(1.9e-3)}, factors=factors), device, seconds=0.01)
         for factors in ({}, {"numpy": 1e3})
     )
-    assert part.peer_seconds == pytest.approx(2e-3, rel=0.9)
-    assert complete.peer_seconds == pytest.approx(2.0, rel=0.9)
-    assert complete.ratio > 100.0 * part.ratio
+    assert part.peer_seconds == pytest.approx(2e-3)
+    assert complete.peer_seconds == pytest.approx(2.0)
+    assert complete.ratio == pytest.approx(1e3 * part.ratio)
 
 
 @pytest.fixture
@@ -111,3 +127,35 @@ def test_a_machine_that_never_holds_its_speed_voids_the_run(fake, device, tmp_pa
     assert expected | {"fraction"} <= set(table["rows"][0])
     assert datetime.date.fromisoformat(table["machine"]["date"]).year >= 2026
     assert table["machine"]["devices"][device.label]["driver"] == device.driver
+
+
+def test_rows_stay_when_another_operation_fails(monkeypatch, device, tmp_path):
+    """The others are measured, also after the failed one; its name and the reason are in the file."""
+
+    def fail(device):
+        yield case(name="before")
+        raise ValueError("no such\ntable")
+
+    modules = {
+        name: types.SimpleNamespace(cases=lambda device, name=name: [case(name=name)]) for name in ("psd", "line")
+    }
+    modules["rays"] = types.SimpleNamespace(cases=fail)
+    monkeypatch.setattr(harness.importlib, "import_module", lambda name: modules[name.rpartition(".")[2]])
+    monkeypatch.setattr(ceiling, "flop_rate", lambda device, **_: 100.0)
+    lines = []
+    run = harness.profile(["psd", "bvh", "line"], [device], seconds=0.01, progress=lines.append)
+    assert [row.case for row in run.rows] == ["psd", "line"]
+    assert run.valid
+    run.write(tmp_path / "run.json")
+    table = json.loads((tmp_path / "run.json").read_text())
+    assert [row["case"] for row in table["rows"]] == ["psd", "line"]
+    (failure,) = table["failures"]
+    assert (failure["operation"], failure["device"]) == ("bvh", device.label)
+    assert failure["reason"] == "ValueError: no such\ntable"
+    assert "in fail" in failure["traceback"]
+    assert lines == [
+        f"psd on {device.label}",
+        f"bvh on {device.label}",
+        "  failed: ValueError: no such\ntable",
+        f"line on {device.label}",
+    ]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import subprocess
 import sys
-import time
+import threading
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -20,13 +21,15 @@ from matplotlib.figure import Figure
 from gpuvision.formats.range_image import read_npz, read_ply, read_png16, read_tiff
 from gpuvision.host import Device, RecordingError, StreamError
 from gpuvision.host.outputs import MANIFEST
-from gpuvision.host.sources import ArraySource, PacedSource
+from gpuvision.host.pipeline import Pipeline
+from gpuvision.host.sources import ArraySource, PacedSource, Source
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.workflows import scanning
 from gpuvision.workflows.scan_result import Scan
 from gpuvision.workflows.scanning import scan
 from scanning import Ran, check_refused, currents, line_frames
+from streams import producer_ended
 
 FILES = {
     MANIFEST,
@@ -159,15 +162,49 @@ def test_a_delay_is_in_seconds_in_the_report_and_in_milliseconds_in_the_summary(
     assert "frames were read up to 36 ms late" in overdue.summary()
 
 
-def test_dropped_frames_do_not_shift_the_transport() -> None:
+class SensorClock:
+    """Clock that only sleeps of the sensor advance; after the first quarter of a second they wait for `release`."""
+
+    def __init__(self) -> None:
+        self._now = 0
+        self._released = threading.Event()
+
+    def __call__(self) -> int:
+        return self._now
+
+    def sleep(self, seconds: float) -> None:
+        """Wake a millisecond late: a reader that wakes early reads the clock until the time has come."""
+        now = self._now + round(seconds * 1e9) + 1_000_000
+        assert now < 250_000_000 or self._released.wait(60)
+        self._now = now
+
+    def release(self) -> None:
+        self._released.set()
+
+
+@pytest.fixture
+def sensor_clock(monkeypatch: pytest.MonkeyPatch) -> SensorClock:
+    """The clock of all parts of a scan."""
+    clock = SensorClock()
+
+    class Paced(PacedSource):
+        def __init__(self, source: Source, rate: float) -> None:
+            super().__init__(source, rate, clock=clock, sleep=clock.sleep)
+
+    monkeypatch.setattr(scanning, "PacedSource", Paced)
+    monkeypatch.setattr(scanning, "Pipeline", functools.partial(Pipeline, clock=clock))
+    return clock
+
+
+def test_dropped_frames_do_not_shift_the_transport(sensor_clock: SensorClock) -> None:
     sensor = Sensor.load("psd_line")
-    stalls = iter((1.0,))  # twice as long as the ring holds
-    done = scan(
-        ArraySource(currents(2), count=300),
-        sensor,
-        rate=200.0,
-        progress=lambda done, of: time.sleep(next(stalls, 0.0)),
-    )
+
+    def stall(done: int, of: int | None) -> None:
+        """Hold up the first batch until the last frame has come; the ring holds fewer frames than come meanwhile."""
+        sensor_clock.release()
+        producer_ended()
+
+    done = scan(ArraySource(currents(2), count=300), sensor, rate=200.0, progress=stall)
     report = done.report()
     assert report["dropped"] > 0
     assert report["frames"] + report["dropped"] == 300
@@ -178,11 +215,18 @@ def test_dropped_frames_do_not_shift_the_transport() -> None:
     assert report["stream"]["policy"] == "drop_oldest"
     assert len(done.frame_numbers) == report["frames"]
     assert np.all(np.diff(done.frame_numbers) > 0)
+    assert done.frame_numbers[-1] == 299
     np.testing.assert_allclose(done.points.y[:, 0], 0.25e-3 * done.frame_numbers, atol=1e-8)
+
+
+def test_a_scan_ends_at_a_stall_where_no_frame_may_be_lost(sensor_clock: SensorClock) -> None:
+    def stall(done: int, of: int | None) -> None:
+        sensor_clock.release()
+        producer_ended()
+
     endless = ArraySource(currents(2), count=10**9)
-    stalls = iter((1.0,))
     with pytest.raises(StreamError, match="no slot was free"):
-        scan(endless, sensor, rate=400.0, policy="raise", progress=lambda done, of: time.sleep(next(stalls, 0.0)))
+        scan(endless, Sensor.load("psd_line"), rate=400.0, policy="raise", progress=stall)
 
 
 def test_files_hold_what_was_scanned(tmp_path: Path) -> None:

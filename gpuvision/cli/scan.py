@@ -130,6 +130,8 @@ def scan(
     inputs: list[str | Path] = [recording, sensor]
     if isinstance(described.recording.background, Path):
         inputs.append(described.recording.background)
+    if described.encoder is not None:
+        inputs.append(described.encoder.file)
     outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
     chosen_formats = [each.value for each in formats or ()]
     outputs.claim_folder(out, (*SCAN_FILES, *surface_files(chosen_formats).values()))

@@ -17,7 +17,9 @@ Tables of the file (the files in ``gpuvision/presets/sensors`` are commented exa
                       `Triangulation.from_stand_off`); or a camera's ``focal_length_px``, ``principal_point_px`` and the
                       sheet in its frame, ``sheet_origin``, ``g_axis``, ``h_axis``; or ``homography``; or ``constants``
                       (`Triangulation.from_constants`); or ``points``: calibration points (u, v, G, H) to fit
-``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`
+``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`;
+                      with an encoder ``encoder``, a file with a count for each profile, and ``metres_per_count`` or
+                      ``radians_per_count`` instead of a step
 ``[output]``          see `Output`
 ``[light]``           light source and electronics, for a simulation: see `gpuvision.sensor.light_source`
 ====================  ==================================================================================================
@@ -33,17 +35,19 @@ from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from gpuvision.camera.lens import Lens
 from gpuvision.formats.camera_file import radial_lens, read_calibrated_size, read_lens
 from gpuvision.host.recordings import CHANNELS, Channel
 from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
-from gpuvision.ranging.range_image import Limits, RotatingSheet, StraightTransport, Vector
+from gpuvision.ranging.range_image import Limits, StraightTransport
 from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Along, Triangulation
 from gpuvision.schema import DescriptionError, Section, read_toml
 from gpuvision.sensor.light_source import Light, read_light
+from gpuvision.sensor.transports import Encoder, Transport, read_transport
 
 Background = Literal["none", "median", "previous", "dark_after", "dark_before"]
 BACKGROUNDS: tuple[Background, ...] = get_args(Background)
@@ -124,16 +128,19 @@ class Sensor:
         Whether a scan estimates the threshold of the readout from the recording (``threshold = "auto"``).
     light
         Light source and electronics for a simulation, if the file has them.
+    encoder
+        Transport of each profile, if an encoder measured it.
     """
 
     name: str
     readout: LineReadout | PsdReadout
-    transport: StraightTransport | RotatingSheet
+    transport: Transport
     output: Output
     recording: Recording = Recording()
     frame: tuple[int, int] | None = None
     auto_threshold: bool = False
     light: Light | None = None
+    encoder: Encoder | None = None
 
     @classmethod
     def load(cls, path: str | Path) -> Sensor:
@@ -186,17 +193,14 @@ class Sensor:
         frame = _frame(kind, top, readout)
         moving = top.section("transport")
         sheet = None
-        transport: StraightTransport | RotatingSheet
         # A PSD does not measure the place of the light in the plane of the beam: it cannot see a rotating sheet.
         is_rotating = (
             moving.choice("kind", ("straight", "rotating") if kind == "camera" else ("straight",)) == "rotating"
         )
         axes = SampleAxes() if is_rotating else _axes(top.optional_section("axes"))
         lens = _lens(top.optional_section("lens"), frame, along, axes)
-        if is_rotating:
-            transport = _rotating(moving, lens, along)
-        else:
-            transport = _straight(moving)
+        transport, encoder = read_transport(moving, lens, along, is_rotating=is_rotating)
+        if not is_rotating:
             region = _region(kind, top, frame, along, axes, readout)
             sheet = _triangulation(top.section("triangulation"), {"region": region, "along": along, "lens": lens})
         output = _output(top.section("output"))
@@ -211,12 +215,27 @@ class Sensor:
             frame=frame,
             auto_threshold=kind == "camera" and readout.word("threshold", ("auto",)) is not None,
             light=light,
+            encoder=encoder,
         )
 
     @property
     def kind(self) -> Literal["camera", "psd"]:
         """Kind of the sensor: ``"camera"`` or ``"psd"``."""
         return "camera" if isinstance(self.readout, LineReadout) else "psd"
+
+    def transports(self, profiles: int) -> npt.NDArray[np.float64]:
+        """Return the transport of the first profiles of a recording, (profiles,): [m], or the angle [rad] of the sheet.
+
+        Raises
+        ------
+        ValueError
+            The encoder has fewer positions.
+        """
+        if self.encoder is None:
+            return self.transport.transport(profiles)
+        if profiles > len(self.encoder.positions):
+            self.encoder.check_length(profiles, "the recording")
+        return self.encoder.positions[:profiles]
 
     def check_frame(self, shape: tuple[int, ...], what: str) -> None:
         """Check that the frames of a recording have the shape of this sensor's frames.
@@ -434,43 +453,7 @@ def _noise(table: Section | None, ambient: float) -> PsdNoise | None:
     return noise
 
 
-def _straight(table: Section) -> StraightTransport:
-    default = StraightTransport()
-    transport = StraightTransport(
-        step=table.number("step", "m per profile"),
-        start=table.number("start", "m", 0.0),
-        g_axis=_vector(table, "g_axis", "", default.g_axis),
-        h_axis=_vector(table, "h_axis", "", default.h_axis),
-        direction=_vector(table, "direction", "", default.direction),
-        origin=_vector(table, "origin", "m", default.origin),
-    )
-    table.finish()
-    return transport
-
-
-def _rotating(table: Section, lens: Lens | None, along: Along) -> RotatingSheet:
-    column, row = table.numbers("principal_point_px", "pixel", (2,))
-    identity = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    sheet = RotatingSheet(
-        along=along,
-        lens=lens,
-        focal_length_px=table.number("focal_length_px", "pixel", above=0.0),
-        principal_point_px=(column, row),
-        axis_point=_vector(table, "axis_point", "m"),
-        axis_direction=_vector(table, "axis_direction", ""),
-        sheet_normal=_vector(table, "sheet_normal", ""),
-        sheet_offset=table.number("sheet_offset", "m", 0.0),
-        first_angle=table.number("first_angle", "rad", at_least=-2 * math.pi, at_most=2 * math.pi),
-        angle_step=table.number("angle_step", "rad per profile", above=-math.pi, below=math.pi),
-        scene_axes=table.rows("scene_axes", "", 3, identity),
-        scene_origin=_vector(table, "scene_origin", "m", (0.0, 0.0, 0.0)),
-        horizon=table.number("horizon", "", 1e-4, above=0.0, below=1.0),
-    )
-    table.finish()
-    return sheet
-
-
-def _light(top: Section, transport: StraightTransport | RotatingSheet) -> Light | None:
+def _light(top: Section, transport: Transport) -> Light | None:
     table = top.optional_section("light")
     if table is None:
         return None
@@ -509,8 +492,3 @@ def _limits(table: Section, key: str) -> tuple[float, float]:
     if not low < high:
         raise table.error(f"{table.dotted(key)} is [{low}, {high}], expected the lowest below the highest [m]")
     return low, high
-
-
-def _vector(table: Section, key: str, unit: str, default: tuple[float, ...] | None = None) -> Vector:
-    x, y, z = table.numbers(key, unit, (3,)) if default is None else table.numbers(key, unit, (3,), default)
-    return x, y, z

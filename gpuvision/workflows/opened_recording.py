@@ -72,7 +72,7 @@ def open_for_scan(recording: str | Path | Source | Array, sensor: Sensor) -> Ope
         The recording or the background image cannot be read, they differ in shape, or a background or threshold is to
         be estimated from a source that gives its frames only once.
     ValueError
-        The frames do not fit the sensor.
+        The frames do not fit the sensor, or the encoder has more or fewer positions than the recording has profiles.
 
     Notes
     -----
@@ -88,6 +88,8 @@ def open_for_scan(recording: str | Path | Source | Array, sensor: Sensor) -> Ope
             image = median_background(frames[:, 0]) if background == "median" else image
             sensor = _with_threshold(sensor, frames, image) if sensor.auto_threshold else sensor
         subtracted = _subtracted(source, sensor, image)
+        if sensor.encoder is not None and subtracted.length is not None:
+            sensor.encoder.check_length(subtracted.length, name)
     except BaseException:
         source.close()
         raise

@@ -143,7 +143,8 @@ class Scan:
     def summary(self) -> str:
         """Return one line: frames, throughput, fraction of valid samples, size of the height map.
 
-        A replay at a rate also names its longest stall and the part of the stream that spent it.
+        A replay at a rate also names its longest stall and the part of the stream that spent it. With an encoder the
+        line gives the number of profiles that do not advance.
         """
         stream, sensor_rate, delay = self.stream, self.sensor.recording.rate, self.metadata["late"]
         dropped = f" ({stream.dropped} dropped)" if stream.dropped else ""
@@ -156,8 +157,10 @@ class Scan:
         )
         stall = stream.longest_stall if self.metadata["rate"] is not None else None
         stalled = "" if stall is None else f"; longest stall {stall}"
+        backward = (self.metadata["encoder"] or {}).get("not_advancing", 0)
+        unordered = f"; {backward} profiles do not advance" if backward else ""
         size = f"{self.grid.columns} x {self.grid.rows} cells"
-        return f"{stream.frames} frames{dropped} at {speed}, {valid}, {size}{overdue}{stalled}"
+        return f"{stream.frames} frames{dropped} at {speed}, {valid}, {size}{overdue}{stalled}{unordered}"
 
     @property
     def throughput(self) -> float:

@@ -7,6 +7,7 @@ resampled to a height map (`gpuvision.ranging`).
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -147,8 +148,20 @@ def _metadata(name: str, sensor: Sensor, rate: float | None, source: Source) -> 
         "threshold": sensor.readout.threshold if isinstance(sensor.readout, LineReadout) else None,
         "sensor_rate": sensor.recording.rate,
         "rate": rate,
+        "encoder": _encoder(sensor),
         "late": source.late * 1e-9 if isinstance(source, PacedSource) else None,
     }
+
+
+def _encoder(sensor: Sensor) -> dict[str, Any] | None:
+    """Return the file of the encoder and the regularity of its positions [m or rad]."""
+    if sensor.encoder is None:
+        return None
+    statistics = dataclasses.asdict(sensor.encoder.statistics())
+    known = {
+        name: None if isinstance(value, float) and math.isnan(value) else value for name, value in statistics.items()
+    }
+    return {"file": str(sensor.encoder.file), "scale": sensor.encoder.scale, **known}
 
 
 def _with_range_outputs(sensor: Sensor, precision: Precision) -> LineReadout | PsdReadout:
@@ -197,8 +210,11 @@ def _read_frames(
 def _points(sensor: Sensor, fields: dict[str, Array], frame_numbers: Array, device: Device) -> RangePoints:
     """Return the organised range image of the readout's outputs, with the transport of each frame number."""
     positions = [fields[name] for name in ("position", "g", "h") if name in fields]
-    transports = sensor.transport.transport(int(frame_numbers[-1]) + 1)[frame_numbers]
-    return assemble_points(sensor, positions, transports, fields["status"], device)
+    profiles = int(frame_numbers[-1]) + 1
+    transports, status = sensor.transports(profiles)[frame_numbers], fields["status"]
+    if sensor.encoder is not None:
+        status[sensor.encoder.not_advancing()[frame_numbers]] |= np.uint8(Status.NOT_INVERTIBLE)
+    return assemble_points(sensor, positions, transports, status, device)
 
 
 def assemble_points(

@@ -110,6 +110,8 @@ def main() -> None:
     write_npz(SEEDS / "result.npz", {"z": z}, {"z": "m"})
     _write_light(z)
     (SEEDS / "points.csv").write_text("0.5,1.0\n-0.5,2e-1\n0.0,0.3\n")
+    (SEEDS / "encoder.csv").write_text("count\n0\n12\n25.5\n")
+    np.savez_compressed(SEEDS / "encoder.npz", count=np.arange(5))
     np.save(SEEDS / "points.npy", z.reshape(-1, 2))
     (SEEDS / "mask.txt").write_text("# lower, upper end\n0.0, 1.0\n0.5, 2.0\n")
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gpuvision.formats.camera_file import read_lens, read_mounted
+from gpuvision.formats.encoder_file import read_encoder
 from gpuvision.formats.features_file import read_features
 from gpuvision.formats.field_file import read_field
 from gpuvision.formats.materials_file import read_materials
@@ -114,6 +115,7 @@ _ALL = (
     Reader("frames.avi", _frames),
     *(Reader(f"image.{kind}", read_image) for kind in ("png", "jpg", "bmp", "pgm", "webp", "tiff")),
     Reader("sensor.toml", Sensor.load),
+    *(Reader(f"encoder.{kind}", read_encoder) for kind in ("csv", "npz")),
     Reader("camera.toml", _camera),
     Reader("features.toml", read_features),
     Reader("field.toml", read_field),

@@ -1,0 +1,70 @@
+"""Order and regularity of the positions of an encoder."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gpuvision.ranging.encoder import EncoderStatistics, not_advancing
+
+
+def longest_monotone(values: list[float]) -> int:
+    """Return the length of the longest strictly monotone subsequence, by trying all of them."""
+    for count in range(len(values), 0, -1):
+        for kept in combinations(values, count):
+            steps = np.diff(kept)
+            if np.all(steps > 0) or np.all(steps < 0):
+                return count
+    return 0
+
+
+@given(st.lists(st.integers(-4, 4), min_size=1, max_size=9))
+def test_the_smallest_set_is_marked(counts: list[int]) -> None:
+    marked = not_advancing(counts)
+    steps = np.diff(np.array(counts, dtype=float)[~marked])
+    assert np.all(steps > 0) or np.all(steps < 0)
+    assert np.count_nonzero(~marked) == longest_monotone([float(each) for each in counts])
+
+
+@pytest.mark.parametrize(
+    ("counts", "marked"),
+    [
+        ([0, 1, 2, 3], []),
+        ([3, 2, 1, 0], []),
+        ([0, 1, 90, 3, 4, 5], [2]),  # a wrong position marks no profile after it
+        ([0, 1, 2, 2, 2, 3], [3, 4]),  # the belt stands: its first profile stays
+        ([9, 8, 8, 7], [2]),
+        ([5], []),
+    ],
+)
+def test_profiles_that_do_not_advance(counts: Any, marked: list[int]) -> None:
+    assert np.flatnonzero(not_advancing(counts)).tolist() == marked
+
+
+def test_jitter_is_the_error_of_a_position() -> None:
+    rng = np.random.default_rng(3)
+    time = np.arange(20_000.0)
+    smooth = 1e-3 * time + 2e-3 * np.sin(time / 500.0)  # the speed changes by 0.4 %
+    found = EncoderStatistics.from_positions(smooth + rng.normal(0.0, 2e-5, time.size))
+    assert found.jitter == pytest.approx(2e-5, rel=0.02)
+    assert found.step_mean == pytest.approx(1e-3, rel=1e-2)
+    assert found.not_advancing == 0
+    assert EncoderStatistics.from_positions(smooth).jitter < 1e-8
+
+
+def test_rounding_to_counts_is_jitter() -> None:
+    profile = np.arange(20_000.0)
+    # The speed grows from 10 to 22 counts per profile, so that the roundings of neighbours are uncorrelated on average.
+    position = np.floor(10.0 * profile + 3e-4 * profile**2)
+    assert EncoderStatistics.from_positions(position).jitter == pytest.approx(1.0 / np.sqrt(12.0), rel=0.03)
+
+
+def test_few_positions_have_no_jitter() -> None:
+    one, two = (EncoderStatistics.from_positions(np.arange(float(n))) for n in (1, 2))
+    assert np.isnan([one.step_mean, one.jitter, two.jitter]).all()
+    assert two.step_mean == two.step_largest == 1.0

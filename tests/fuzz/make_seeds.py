@@ -108,12 +108,30 @@ def main() -> None:
     write_png16(SEEDS / "heights.png", z, grid)
     write_ply(SEEDS / "points.ply", z, z, z)
     write_npz(SEEDS / "result.npz", {"z": z}, {"z": "m"})
+    cv2.imwrite(str(SEEDS / "levels.png"), (1000 * z).astype(np.uint16))
+    (SEEDS / "surface.csv").write_text(_SURFACE)
+    write_npz(SEEDS / "map.npz", {"map_x": grid.x, "map_y": grid.y, "map_z": z}, dict.fromkeys(_MAP, "m"))
     _write_light(z)
     (SEEDS / "points.csv").write_text("0.5,1.0\n-0.5,2e-1\n0.0,0.3\n")
     (SEEDS / "encoder.csv").write_text("count\n0\n12\n25.5\n")
     np.savez_compressed(SEEDS / "encoder.npz", count=np.arange(5))
     np.save(SEEDS / "points.npy", z.reshape(-1, 2))
     (SEEDS / "mask.txt").write_text("# lower, upper end\n0.0, 1.0\n0.5, 2.0\n")
+
+
+_MAP = ("map_x", "map_y", "map_z")
+_SURFACE = """Info
+CSV Version,Sensor Count
+2,1
+End
+Part
+Frame,Source,Row Count,Column Count
+0,0,2,3
+Y,0.0,0.5,1.0
+0.0,0.1,,0.3
+0.5,0.4,0.5,0.6
+End
+"""
 
 
 def _write_tables() -> None:

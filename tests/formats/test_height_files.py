@@ -1,0 +1,141 @@
+"""Height maps of other programs and sensors."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from gpuvision.formats.height_files import ImageScale, read_gocator, read_heights
+from gpuvision.formats.range_image import write_npz, write_png16, write_tiff
+from gpuvision.ranging.regrid import Grid
+
+GRID = Grid(left=-2e-3, top=5e-3, cell_x=20e-6, cell_y=30e-6, columns=4, rows=3)
+HEAD = """Info
+CSV Version,Sensor Count,Trigger Mode
+2,1,0
+End
+DeviceInfo
+ID,Model,Version
+13434,311320-2M-01,4.8.2.29
+End
+"""
+SURFACE = (
+    HEAD
+    + """{section}
+Frame,Source,Time,Encoder,Z Encoder,Inputs,Row Count,Column Count,X Offset,Y Offset,Z Offset
+12,0,104,0,0,0,3,4,-2.0,4.94,0
+Y,-2.000,-1.980,-1.960,-1.940
+4.940,0.010,0.020,,0.040
+4.970,0.110,NaN,0.130
+5.000,0.210,0.220,0.230,-0.240
+End
+"""
+)
+EXPECTED = np.array([[0.21, 0.22, 0.23, -0.24], [0.11, np.nan, 0.13, np.nan], [0.01, 0.02, np.nan, 0.04]]) * 1e-3
+PROFILE = (
+    HEAD
+    + """Profile
+Frame Count,Column Count,X Offset,Y Offset,Z Offset
+2,3,0,0,0
+Frame,Source,Time,Encoder,Z Encoder,Inputs,Exposure,Y,Axis,1.0,1.5,2.0
+0,0,1,0,0,0,20,7.0,Z,0.1,,0.3
+0,0,1,0,0,0,20,7.0,I,200,201,202
+1,0,2,0,0,0,20,7.5,Z,0.4,0.5,0.6
+1,0,2,0,0,0,20,7.5,I,200,201,202
+End
+"""
+)
+
+
+@pytest.fixture
+def write(tmp_path):
+    def written(text):
+        (tmp_path / "part.csv").write_text(text)
+        return tmp_path / "part.csv"
+
+    return written
+
+
+@pytest.mark.parametrize("section", ["Surface", "Part"])
+def test_a_surface_of_a_gocator(write, section):
+    z, grid, sigma = read_heights(write(SURFACE.format(section=section)))
+    np.testing.assert_allclose(z, EXPECTED, rtol=1e-12)
+    np.testing.assert_allclose([grid.left, grid.top, grid.cell_x, grid.cell_y], [-2e-3, 5e-3, 20e-6, 30e-6], rtol=1e-9)
+    assert grid.shape == z.shape
+    assert sigma is None
+
+
+def test_profiles_of_a_gocator_without_their_intensity(write):
+    z, grid = read_gocator(write(PROFILE))
+    np.testing.assert_allclose(z, np.array([[0.4, 0.5, 0.6], [0.1, np.nan, 0.3]]) * 1e-3)
+    np.testing.assert_allclose([grid.left, grid.top, grid.cell_x, grid.cell_y], [1e-3, 7.5e-3, 0.5e-3, 0.5e-3])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("\nPart\n", "\nRange\n", "no section Surface, Part or Profile"),
+        ("0.210,", "0.210,9,", "a row of 5 heights, expected 4"),
+        ("4.970,", "4.980,", "positions in y are not evenly spaced"),
+        ("-1.980", "-1.970", "positions in x are not evenly spaced"),
+        ("-1.980", "left", "not a readable CSV file of a Gocator: could not convert string to float: 'left'"),
+        ("4.970,", "nan,", "a position is not a finite number"),
+        ("Y,-2.000,-1.980,-1.960,-1.940\n", "End\n", "0 rows of 0 heights, expected a height map"),
+    ],
+)
+def test_damaged_gocator_files_are_refused(write, old, new, message):
+    text = SURFACE.format(section="Part")
+    assert text.count(old) == 1
+    path = write(text.replace(old, new))
+    with pytest.raises(ValueError, match=message) as raised:
+        read_gocator(path)
+    assert str(path) in str(raised.value)
+
+
+def test_a_gocator_file_beyond_a_limit_is_refused(write, monkeypatch):
+    monkeypatch.setenv("GPUVISION_MAX_PIXELS", "8")
+    with pytest.raises(ValueError, match="4 x 3 pixels, expected at most 8"):
+        read_gocator(write(SURFACE.format(section="Part")))
+    with pytest.raises(ValueError, match="a line of 4194304 characters or more"):
+        read_gocator(write("," * (1 << 23)))
+
+
+def test_a_16_bit_image_with_a_scale(tmp_path):
+    levels = np.array([[0, 1, 2], [3, 40000, 65535]], np.uint16)
+    cv2.imwrite(str(tmp_path / "map.png"), levels)
+    z, grid, _ = read_heights(tmp_path / "map.png", ImageScale(cell_x=10e-6, cell_y=20e-6, step=-1e-7, offset=5e-3))
+    np.testing.assert_allclose(z, [[np.nan, 5e-3 - 1e-7, 5e-3 - 2e-7], [5e-3 - 3e-7, 1e-3, 5e-3 - 6.5535e-3]])
+    assert grid == Grid(left=0.0, top=20e-6, cell_x=10e-6, cell_y=20e-6, columns=3, rows=2)
+    z, _, _ = read_heights(tmp_path / "map.png", ImageScale(cell_x=1.0, cell_y=1.0, step=1.0, hole=float("nan")))
+    np.testing.assert_array_equal(z, levels)
+    cv2.imwrite(str(tmp_path / "colour.png"), np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(ValueError, match="a colour image"):
+        read_heights(tmp_path / "colour.png", ImageScale(cell_x=1.0, cell_y=1.0, step=1.0))
+    with pytest.raises(ValueError, match=r"ImageScale\.step is 0"):
+        ImageScale(cell_x=1.0, cell_y=1.0, step=0.0)
+
+
+def test_the_files_of_a_scan(tmp_path, rng):
+    z = rng.normal(size=GRID.shape)
+    z[1, 1] = np.nan
+    write_tiff(tmp_path / "map.tiff", z, GRID)
+    write_png16(tmp_path / "map.png", z, GRID)
+    held = {"map_x": GRID.x, "map_y": GRID.y, "map_z": z}
+    write_npz(tmp_path / "map.npz", held | {"map_sigma": abs(z)}, dict.fromkeys([*held, "map_sigma"], "m"))
+    for name, error in (("map.tiff", 1e-6), ("map.png", 1e-4), ("map.npz", 0.0)):
+        found = read_heights(tmp_path / name)
+        np.testing.assert_allclose(found.z, z, atol=error)
+        np.testing.assert_allclose([found.grid.left, found.grid.top], [GRID.left, GRID.top])
+        np.testing.assert_allclose([found.grid.cell_x, found.grid.cell_y], [GRID.cell_x, GRID.cell_y])
+        assert (found.sigma is not None) == (name == "map.npz")
+    write_tiff(tmp_path / "bare.tiff", z)
+    with pytest.raises(ValueError, match="states no grid"):
+        read_heights(tmp_path / "bare.tiff")
+    write_npz(tmp_path / "bad.npz", held | {"map_x": GRID.y}, dict.fromkeys(held, "m"))
+    with pytest.raises(ValueError, match="one row per map_y"):
+        read_heights(tmp_path / "bad.npz")
+    with pytest.raises(ValueError, match="states its scale"):
+        read_heights(tmp_path / "map.npz", ImageScale(cell_x=1.0, cell_y=1.0, step=1.0))
+    with pytest.raises(ValueError, match="a folder"):
+        read_heights(tmp_path)

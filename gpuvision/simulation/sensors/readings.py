@@ -13,9 +13,11 @@ import numpy.typing as npt
 from gpuvision.host import Device
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
+from gpuvision.status import Status
 from gpuvision.validation import finite
 
 Float64 = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
 
 PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse", "multi-bounce")
 """Light paths from the sheet of light to the lens. The sensor receives the sum of all paths."""
@@ -339,3 +341,30 @@ def _front(triangulation: Triangulation) -> float:
     """Return the sign of the homography's third coordinate in front of the sensor."""
     middle = np.mean(np.array(triangulation.region), axis=1)
     return float(np.sign(np.array(triangulation.homography)[2] @ [*middle, 1.0]))
+
+
+def strongest_points(
+    samples: int,
+    sample: Integers,
+    places: Float64,
+    on: npt.NDArray[np.bool_],
+    in_view: npt.NDArray[np.bool_],
+    light: Float64,
+    same: float,
+) -> GroundTruth:
+    """Return for each sample the position (G, H) with the most light on the sensor, with status flags.
+
+    A sample without a position on the sensor gets the position in the view with the most light.
+    """
+    order = np.lexsort((-light, ~in_view, ~on, sample))
+    sample, places, on, in_view = sample[order], places[order], on[order], in_view[order]
+    best = np.flatnonzero(np.diff(sample, prepend=-1))
+    group = np.repeat(best, np.diff(best, append=len(sample)))
+    other = on & (np.abs(places - places[group]).max(axis=1, initial=0.0) > same * np.abs(places).max(initial=0.0))
+    g, h = np.full(samples, np.nan), np.full(samples, np.nan)
+    status = np.full(samples, Status.LOW_SIGNAL, np.uint8)
+    status[sample[best]] = np.where(on[best], Status.OK, Status.OUT_OF_RANGE)
+    status[sample[other]] |= np.uint8(Status.AMBIGUOUS)
+    given = best[in_view[best]]
+    g[sample[given]], h[sample[given]] = places[given].T
+    return GroundTruth(g, h, status)

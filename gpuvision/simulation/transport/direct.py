@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
 
 from gpuvision.host import Device
 from gpuvision.simulation.scene.material import Material
-from gpuvision.simulation.scene.reflectance import Brdf, Ggx, Lambert, Phong, Ward
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.sensors.readings import UNIFORM, UNIFORM_UNOCCLUDED, UNOCCLUDED, GroundTruth
+from gpuvision.simulation.sensors.readings import (
+    UNIFORM,
+    UNIFORM_UNOCCLUDED,
+    UNOCCLUDED,
+    GroundTruth,
+    strongest_points,
+)
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.simulation.sensors.view_rays import check_materials
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
@@ -30,26 +34,23 @@ from gpuvision.simulation.transport.line_parts import (
 )
 from gpuvision.simulation.transport.sheet_cut import SheetIndex, concatenated_ranges
 from gpuvision.simulation.transport.slab_edges import (
+    Levels,
     LineScale,
     Pieces,
-    Runs,
     SlantedLimits,
     find_runs,
     intervals_to_divide,
     slanted_limits,
 )
+from gpuvision.simulation.transport.slabs import SlabImage, Slabs, concatenated_slabs, read_sub_sheets
 from gpuvision.simulation.transport.specular_highlights import find_specular_highlights
-from gpuvision.status import Status
+from gpuvision.simulation.transport.surface_reflection import ReflectedPower, SurfaceReflection, mirrored_power
 
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
-# Function from light that arrives at points of segments [W] to power on the sensor [W], by kind of reflection.
-ReflectedPower = Callable[[LitLine, Integers, Float64, Float64], dict[str, Float64]]
 
 # Nodes of the two-point Gauss-Legendre rule on [0, 1].
 _NODES = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
-# Least distance of an outer slab from the last division [sigmas]; chosen.
-_OUTER_GAP = 0.05
 # Sheets that are computed together: bounds the memory.
 _SHEETS = 36
 
@@ -100,50 +101,6 @@ class DirectLimits:
     same_point: float = 1e-9
 
 
-class Slabs(NamedTuple):
-    """Slabs across a sheet with a Gaussian profile, in units of its sigma.
-
-    Attributes
-    ----------
-    low, high
-        float64 (n,): ends of each slab; the first begins at -inf, the last ends at inf.
-    share
-        float64 (n,): share of the sheet's light.
-    middle
-        float64 (n,): mean position of the light in the slab.
-    """
-
-    low: Float64
-    high: Float64
-    share: Float64
-    middle: Float64
-
-    @classmethod
-    def from_cuts(cls, cuts: npt.ArrayLike) -> Slabs:
-        """Return the slabs between ascending cuts (n - 1,), in sigmas."""
-        cuts = np.asarray(cuts, np.float64)
-        low, high = np.append(-np.inf, cuts), np.append(cuts, np.inf)
-        share = _normal_share(low, high)
-        return cls(low, high, share, np.clip((_normal_density(low) - _normal_density(high)) / share, low, high))
-
-    @classmethod
-    def uniform(cls, count: int) -> Slabs:
-        """Return ``count`` slabs; all but the outer two have the same width."""
-        # With this range the light in the outer slabs falls with the number of slabs as the inner slabs' width does.
-        reach = math.sqrt(2.0 * math.log(count)) if count > 2 else 0.0
-        return cls.from_cuts(np.linspace(-reach, reach, count - 1))
-
-    def with_outer(self, place: float) -> Slabs:
-        """Return the slabs with the light beyond +-``place`` [sigmas] as two more; the levels of the others stay."""
-        cuts = self.high[:-1]
-        first = min(-place, float(cuts[0]) - _OUTER_GAP)
-        last = max(place, float(cuts[-1]) + _OUTER_GAP)
-        outer = Slabs.from_cuts([first, last])
-        low, high = np.maximum(self.low, first), np.minimum(self.high, last)
-        inner = Slabs(low, high, _normal_share(low, high), self.middle)
-        return Slabs(*(np.concatenate([a[:1], b, a[2:]]) for a, b in zip(outer, inner, strict=True)))
-
-
 class _LitSheets(NamedTuple):
     """Lit segments of several sheets, moved to the sensor at transport 0; index of the sheet, and the motion [m]."""
 
@@ -155,68 +112,6 @@ class _LitSheets(NamedTuple):
         """Return the segments of the sheets that ``kept`` (sheets,) marks, with new numbers of the sheets."""
         which = kept[self.sheet]
         return _LitSheets(self.line.select(which), (np.cumsum(kept) - 1)[self.sheet[which]], self.moved[which])
-
-
-class _SlabImage(NamedTuple):
-    """Deposit of the slabs' light on the sensor; each slab belongs to one of ``profiles`` profiles."""
-
-    view: SensorView
-    slabs: Slabs
-    profile: Integers
-    profiles: int
-    tail_sigmas: float
-
-    def deposit(
-        self,
-        uv: Float64,
-        spread: Float64,
-        slab: Integers,
-        lights: Mapping[str, Float64],
-        limits: tuple[Float64, Float64] | None = None,
-    ) -> dict[str, Exposure]:
-        """Return the exposures by points of the slabs' light.
-
-        Parameters
-        ----------
-        uv
-            (n, 2): image of the slab's mean.
-        spread
-            (n,): displacement along u per sigma of the sheet [sensor unit].
-        slab
-            (n,): index of the slab.
-        lights
-            Power (n,) [W] by name, if all of the slab arrives.
-        limits
-            Lower and upper limit of the light across the sheet (n,), (n,) [sigmas]. Default: the limits of the slab.
-        """
-        view, slabs = self.view, self.slabs
-        sample = view.sample_of(uv[:, 1])
-        on = np.flatnonzero(sample >= 0)
-        sample, u, slab = sample[on], uv[on, 0], slab[on]
-        least = 1e-9 * float(np.diff(view.u_edges).min())
-        spread = np.where(np.abs(spread[on]) < least, least, spread[on])
-        low, high = (slabs.low[slab], slabs.high[slab]) if limits is None else (limits[0][on], limits[1][on])
-        middle = slabs.middle[slab]
-        reach = u + spread * (np.clip([low, high], -self.tail_sigmas, self.tail_sigmas) - middle)
-        first = np.maximum(np.searchsorted(view.u_edges, reach.min(axis=0), side="right") - 1, 0)
-        last = np.minimum(np.searchsorted(view.u_edges, reach.max(axis=0), side="left"), view.bins)
-        count = np.maximum(last - first, 0)
-        of, place = np.repeat(np.arange(len(u)), count), concatenated_ranges(first, count)
-        # Edges of the bins in sigmas of the sheet.
-        ends = middle[of] + (np.stack([view.u_edges[place], view.u_edges[place + 1]]) - u[of]) / spread[of]
-        ends = np.clip(np.sort(ends, axis=0), low[of], high[of])
-        share = _normal_share(*ends)
-        moment = (u - spread * middle)[of] - view.u_centres[place]
-        moment = moment * share + spread[of] * (_normal_density(ends[0]) - _normal_density(ends[1]))
-        row = self.profile[slab] * view.samples + sample
-        at, per = row[of] * view.bins + place, 1.0 / slabs.share[slab[of]]
-        shape = (self.profiles, view.samples, view.bins)
-        made = {}
-        for name, power in lights.items():
-            part_power = power[on][of] * per
-            sums = [np.bincount(at, part_power * each, minlength=math.prod(shape)) for each in (share, moment)]
-            made[name] = Exposure(*(np.asarray(each, np.float64).reshape(shape) for each in sums))
-        return made
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -286,13 +181,16 @@ class DirectLight:
     _slabs: Slabs = field(init=False, repr=False)
     _visibility: LensVisibility = field(init=False, repr=False)
     _projector: LineProjector = field(init=False, repr=False)
+    _reflection: SurfaceReflection = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         check_materials(self.scene, self.materials)
         if self.sheet.transport != self.view.transport:
             raise ValueError("DirectLight: sheet and view have different transports, expected the same one")
-        object.__setattr__(self, "_slabs", _slabs(self.sub_sheets if self.sheet.sigma > 0.0 else 1))
+        object.__setattr__(self, "_slabs", read_sub_sheets(self.sub_sheets if self.sheet.sigma > 0.0 else 1))
         object.__setattr__(self, "_projector", LineProjector(self.view))
+        reflection = SurfaceReflection(view=self.view, scene=self.scene, materials=self.materials, sheet=self.sheet)
+        object.__setattr__(self, "_reflection", reflection)
         device = Device.best() if self.device is None else self.device
         object.__setattr__(self, "_visibility", LensVisibility(scene=self.scene, device=device))
 
@@ -328,8 +226,8 @@ class DirectLight:
     def _expose_profiles(self, places: Float64, causes: bool) -> dict[str, Exposure]:
         slabs, profile, lit, parts, changes = self._divided_sheets(places, causes)
         lit = lit._replace(line=lit.line._replace(power=lit.line.power * slabs.share[lit.sheet]))
-        image = _SlabImage(self.view, slabs, profile, len(places), self.limits.tail_sigmas)
-        found = self._expose(lit, image, parts, self._reflected_power, causes=causes)
+        image = SlabImage(self.view, slabs, profile, len(places), self.limits.tail_sigmas)
+        found = self._expose(lit, image, parts, self._reflection.power, causes=causes)
         if changes:
             found |= self._expose_slanted(lit, image, parts, causes)
         if any(each.mirror > 0.0 for each in self.materials):
@@ -339,7 +237,7 @@ class DirectLight:
     def _expose(
         self,
         lit: _LitSheets,
-        image: _SlabImage,
+        image: SlabImage,
         parts: Parts,
         reflect: ReflectedPower,
         *,
@@ -368,16 +266,16 @@ class DirectLight:
             at_nodes = (low, np.maximum(low, high))
         return image.deposit(uv, spread, lit.sheet[segment], powers, at_nodes)
 
-    def _expose_highlights(self, lit: _LitSheets, image: _SlabImage) -> Exposure:
+    def _expose_highlights(self, lit: _LitSheets, image: SlabImage) -> Exposure:
         """Return the exposure by light that mirrors reflect straight into the lens."""
         line = lit.line
-        shares = np.array([each.mirror for each in self.materials])[self._material(line)]
+        shares = np.array([each.mirror for each in self.materials])[self._reflection.material_numbers(line)]
         parts = find_specular_highlights(line, self.sheet, self.view, 0.0)
         parts = parts.select(shares[parts.segment] > 0.0)
         of = parts.segment
         line = LitLine(parts.ends(line), line.normals[of], line.triangle[of], line.power[of] * shares[of])
         lit = _LitSheets(line, lit.sheet[of], lit.moved[of])
-        return self._expose(lit, image, self._visible_parts(lit), _mirrored_power)["specular"]
+        return self._expose(lit, image, self._visible_parts(lit), mirrored_power)["specular"]
 
     def slabs(self, L: float) -> Slabs:
         """Return the slabs of the sheet at a transport L [m]."""
@@ -433,12 +331,12 @@ class DirectLight:
         """
         by_profile = [self.slabs(float(L)) for L in places]
         if not (self._divides_at_edges and by_profile):
-            slabs, profile = _concatenated(by_profile)
+            slabs, profile = concatenated_slabs(by_profile)
             return slabs, profile, *self._light_sheets(places, profile, slabs.middle, causes), False
         extended = [each.with_outer(self.limits.outer_slab) for each in by_profile]
-        slabs, profile = _concatenated(extended)
+        slabs, profile = concatenated_slabs(extended)
         lit, parts = self._light_sheets(places, profile, slabs.middle, causes)
-        levels = _Levels(slabs.middle, profile, self._lines(lit, parts, causes))
+        levels = Levels(slabs.middle, profile, self._lines(lit, parts, causes))
         moving, jumps = self._changes(places, levels, by_profile, causes)
         if not any(len(each) for each in jumps):
             # The levels of the slabs are known; where nothing moves, the outer slabs are not needed.
@@ -448,17 +346,17 @@ class DirectLight:
             segment = np.cumsum(kept[lit.sheet]) - 1
             parts = parts.select(kept[lit.sheet[parts.segment]])
             parts = parts._replace(segment=segment[parts.segment])
-            return *_concatenated(used), lit.select(kept), parts, bool(moving.any())
+            return *concatenated_slabs(used), lit.select(kept), parts, bool(moving.any())
         divided = []
         for slabs, found in zip(extended, jumps, strict=True):
             cuts = slabs.high[:-1]
             far = np.abs(cuts[:, None] - found).min(axis=1, initial=np.inf) > self.limits.edge_gap
             divided.append(Slabs.from_cuts(np.sort(np.append(cuts[far], found))))
-        slabs, profile = _concatenated(divided)
+        slabs, profile = concatenated_slabs(divided)
         return slabs, profile, *self._light_sheets(places, profile, slabs.middle, causes), True
 
     def _changes(
-        self, places: Float64, levels: _Levels, by_profile: list[Slabs], causes: bool
+        self, places: Float64, levels: Levels, by_profile: list[Slabs], causes: bool
     ) -> tuple[npt.NDArray[np.bool_], list[Float64]]:
         """Return whether ends of runs move within each profile's sheet, and where runs begin or end at once [sigmas].
 
@@ -488,7 +386,7 @@ class DirectLight:
             new_place, new_profile = np.concatenate(place), np.concatenate(profile)
             added += np.bincount(new_profile, minlength=len(places))
             lines = self._lines(*self._light_sheets(places, new_profile, new_place, causes), causes)
-            levels = levels.joined(_Levels(new_place, new_profile, lines))
+            levels = levels.joined(Levels(new_place, new_profile, lines))
         step = np.append(np.diff(levels.place), np.inf)
         open_ = np.max([each.open_length for each in runs], axis=0) > 0.0
         found = np.flatnonzero(open_ & (step > 0.0) & (step <= smallest))
@@ -513,10 +411,10 @@ class DirectLight:
         x, height = np.where(backward, x[:, ::-1], x), np.where(backward, height[:, ::-1], height)
         shift = self._shift_per_sigma(lit.line.normals[parts.segment], ends.mean(axis=1))
         rate = self._across_transport(ends[:, 0] + shift)[:, 1] - place[:, 0, 1]
-        kind = self._material(lit.line)[parts.segment].astype(np.int64)
+        kind = self._reflection.material_numbers(lit.line)[parts.segment].astype(np.int64)
         return Pieces(lit.sheet[parts.segment], x, height, rate, kind)
 
-    def _expose_slanted(self, lit: _LitSheets, image: _SlabImage, parts: Parts, causes: bool) -> dict[str, Exposure]:
+    def _expose_slanted(self, lit: _LitSheets, image: SlabImage, parts: Parts, causes: bool) -> dict[str, Exposure]:
         """Return the exposures that change because ends of runs move from slab to slab; empty if there are none."""
         found: dict[str, Exposure] = {}
         slabs, scale = image.slabs, self._scale
@@ -531,7 +429,7 @@ class DirectLight:
             if not len(slanted.piece):
                 continue
             lit_parts, limits, all_parts = self._with_limits(lit, mine, slanted, slabs)
-            exposed = self._expose(lit_parts, image, all_parts, self._reflected_power, causes=causes, limits=limits)
+            exposed = self._expose(lit_parts, image, all_parts, self._reflection.power, causes=causes, limits=limits)
             found |= {name: exposed[name] for name in names}
         return found
 
@@ -601,7 +499,7 @@ class DirectLight:
         light = (line.power * line.lengths)[mine.segment] * (mine.end - mine.start) / (high - low)[owner]
         slot = lit.sheet[mine.segment] * view.samples + sample
         positions, same = view.sheet_coordinates(points), self.limits.same_point
-        found = _strongest_points(len(places) * view.samples, slot, positions, on, in_view, light, same)
+        found = strongest_points(len(places) * view.samples, slot, positions, on, in_view, light, same)
         return GroundTruth(*(each.reshape(len(places), view.samples) for each in found))
 
     def _illuminate(self, sheets: Float64, transports: Float64) -> _LitSheets:
@@ -625,96 +523,15 @@ class DirectLight:
             # A thick sheet spreads light onto the sensor from points that are imaged beyond its ends.
             u_edges = np.concatenate([[-np.inf], u_edges, [np.inf]])
         parts = images.split_at_edges(images.split_at_edges(parts, self.view.v_edges, 1), u_edges, 0)
-        return self._split_lobes(parts, line)
-
-    def _split_lobes(self, parts: Parts, line: LitLine) -> Parts:
-        """Split parts on glossy surfaces until the half vector turns little within each."""
-        widths = np.array([math.inf if each.gloss is None else _lobe_width(each.gloss) for each in self.materials])
-        if np.isinf(widths).all():
-            return parts
-        width = widths[self._material(line)][parts.segment]
-        ends = parts.ends(line)
-        half_way = _unit(self.sheet.direction_to_light(ends) + _unit(np.array(self.view.lens) - ends))
-        angle = np.linalg.norm(half_way[:, 1] - half_way[:, 0], axis=1) / width
-        count = np.clip(np.ceil(angle / self.limits.lobe_turn), 1, self.limits.max_lobe_parts).astype(np.int64)
-        owner, number = np.repeat(np.arange(len(count)), count), concatenated_ranges(np.zeros_like(count), count)
-        size = ((parts.end - parts.start) / count)[owner]
-        start = parts.start[owner] + number * size
-        return parts.select(owner)._replace(start=start, end=start + size)
-
-    def _material(self, line: LitLine) -> npt.NDArray[np.int32]:
-        assert self.scene.material is not None  # set by Scene itself
-        return self.scene.material[line.triangle]
-
-    def _reflected_power(
-        self, line: LitLine, segment: Integers, points: Float64, arriving: Float64
-    ) -> dict[str, Float64]:
-        """Return the power on the sensor [W] by kind of reflection, from light that arrives at points [W]."""
-        normal = line.normals[segment]
-        eye = _unit(np.array(self.view.lens) - points)
-        arriving = arriving * np.maximum(np.sum(normal * eye, axis=1), 0.0) * self.view.aperture_solid_angle(points)
-        sent = {"even": arriving / math.pi, "diffuse": np.zeros(len(points)), "gloss": np.zeros(len(points))}
-        material = self._material(line)[segment]
-        for number in np.unique(material):
-            mine, made_of = np.flatnonzero(material == number), self.materials[number]
-            if isinstance(made_of.diffuse, Lambert):
-                sent["diffuse"][mine] = made_of.albedo * sent["even"][mine]
-                if made_of.gloss is None:
-                    continue
-            directions = _to_surface_frames(normal[mine], self.sheet.direction_to_light(points[mine]), eye[mine])
-            if not isinstance(made_of.diffuse, Lambert):
-                sent["diffuse"][mine] = arriving[mine] * made_of.diffuse.value(directions)
-            if made_of.gloss is not None:
-                sent["gloss"][mine] = arriving[mine] * made_of.gloss.value(directions)
-        return sent
+        return self._reflection.split_lobes(
+            parts, line, lobe_turn=self.limits.lobe_turn, max_parts=self.limits.max_lobe_parts
+        )
 
     def _shift_per_sigma(self, normal: Float64, points: Float64) -> Float64:
         """Return the motion of lit points over their planes (n, 3) [m] as the sheet moves by one sigma."""
         direction, light = np.array(self.sheet.transport.direction), self.sheet.direction_to_light(points)
         slope = (normal @ direction) / np.sum(normal * light, axis=1)
         return np.asarray(self.sheet.sigma * (direction - light * slope[:, None]))
-
-
-class _Levels(NamedTuple):
-    """Levels across the sheets of profiles, in order, with their lines.
-
-    Attributes
-    ----------
-    place
-        float64 (levels,): place across the sheet [sigmas].
-    profile
-        int64 (levels,): index of the profile.
-    lines
-        Pieces of the visible line, of the lit line.
-    """
-
-    place: Float64
-    profile: Integers
-    lines: tuple[Pieces, ...]
-
-    def joined(self, more: _Levels) -> _Levels:
-        """Return these levels and others in order."""
-        place, profile = np.append(self.place, more.place), np.append(self.profile, more.profile)
-        order = np.lexsort((place, profile))
-        rank = np.empty_like(order)
-        rank[order] = np.arange(len(order))
-        lines = []
-        for one, two in zip(self.lines, more.lines, strict=True):
-            both = Pieces(*(np.concatenate(each) for each in zip(one, two, strict=True)))
-            level = np.concatenate([one.level, two.level + len(self.place)])
-            lines.append(both._replace(level=rank[level]))
-        return _Levels(place[order], profile[order], tuple(lines))
-
-    def runs(self, scale: LineScale) -> list[Runs]:
-        """Return the runs of each kind of line."""
-        return [find_runs(pieces, self.place, self.profile, scale) for pieces in self.lines]
-
-
-def _concatenated(by_profile: Sequence[Slabs]) -> tuple[Slabs, Integers]:
-    """Return the slabs of all profiles, and the profile of each."""
-    columns = zip(*by_profile, strict=True) if by_profile else ([], [], [], [])
-    slabs = Slabs(*(np.concatenate([*each, np.zeros(0)]) for each in columns))
-    return slabs, np.repeat(np.arange(len(by_profile)), [len(each.share) for each in by_profile])
 
 
 def _whole(line: LitLine) -> Parts:
@@ -729,75 +546,3 @@ def _between(ends: Float64, share: Float64) -> Float64:
     same = start == end
     change = np.subtract(end, start, out=np.zeros_like(start), where=~same)
     return np.asarray(np.where(same, start, np.where(same, 0.0, start) + share * change))
-
-
-def _mirrored_power(line: LitLine, segment: Integers, points: Float64, arriving: Float64) -> dict[str, Float64]:
-    return {"diffuse": np.zeros(len(arriving)), "gloss": arriving}
-
-
-def _slabs(given: int | Sequence[float]) -> Slabs:
-    if isinstance(given, int):
-        if given < 1:
-            raise ValueError(f"DirectLight.sub_sheets is {given}, expected 1 or more")
-        return Slabs.uniform(given)
-    cuts = np.asarray(given, np.float64)
-    if cuts.ndim != 1 or not np.isfinite(cuts).all() or np.any(np.diff(cuts) <= 0.0):
-        raise ValueError("DirectLight.sub_sheets: expected a number of slabs, or ascending places in sigmas")
-    return Slabs.from_cuts(cuts)
-
-
-def _strongest_points(
-    samples: int,
-    sample: Integers,
-    places: Float64,
-    on: npt.NDArray[np.bool_],
-    in_view: npt.NDArray[np.bool_],
-    light: Float64,
-    same: float,
-) -> GroundTruth:
-    """Return for each sample the position (G, H) with the most light on the sensor, with status flags.
-
-    A sample without a position on the sensor gets the position in the view with the most light.
-    """
-    order = np.lexsort((-light, ~in_view, ~on, sample))
-    sample, places, on, in_view = sample[order], places[order], on[order], in_view[order]
-    best = np.flatnonzero(np.diff(sample, prepend=-1))
-    group = np.repeat(best, np.diff(best, append=len(sample)))
-    other = on & (np.abs(places - places[group]).max(axis=1, initial=0.0) > same * np.abs(places).max(initial=0.0))
-    g, h = np.full(samples, np.nan), np.full(samples, np.nan)
-    status = np.full(samples, Status.LOW_SIGNAL, np.uint8)
-    status[sample[best]] = np.where(on[best], Status.OK, Status.OUT_OF_RANGE)
-    status[sample[other]] |= np.uint8(Status.AMBIGUOUS)
-    given = best[in_view[best]]
-    g[sample[given]], h[sample[given]] = places[given].T
-    return GroundTruth(g, h, status)
-
-
-def _lobe_width(lobe: Brdf) -> float:
-    """Return the approximate width of a lobe as an angle of the half vector [rad]."""
-    if isinstance(lobe, Ggx):
-        return lobe.alpha
-    if isinstance(lobe, Ward):
-        return min(lobe.alpha_x, lobe.alpha_y)
-    return 0.5 / math.sqrt(lobe.exponent + 1.0) if isinstance(lobe, Phong) else math.inf
-
-
-def _to_surface_frames(normal: Float64, light: Float64, eye: Float64) -> Float64:
-    """Return the directions to the light and to the eye, (n, 6), in frames whose z axis is the normal."""
-    axis = np.where((np.abs(normal[:, 0]) < 0.9)[:, None], (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    x = _unit(axis - np.sum(axis * normal, axis=1, keepdims=True) * normal)
-    frame = np.stack([x, np.cross(normal, x), normal], axis=1)
-    return np.concatenate([np.einsum("nij,nj->ni", frame, each) for each in (light, eye)], axis=1)
-
-
-def _unit(vectors: Float64) -> Float64:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-
-
-def _normal_density(x: Float64) -> Float64:
-    return np.asarray(np.exp(-0.5 * x * x) / math.sqrt(math.tau))
-
-
-def _normal_share(low: Float64, high: Float64) -> Float64:
-    """Return the share of a Gaussian between two positions; accurate in both tails."""
-    return np.asarray(np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low)))

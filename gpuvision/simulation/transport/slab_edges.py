@@ -333,3 +333,38 @@ def intervals_to_divide(
     order = np.lexsort((-weight, sheet))
     rank = np.arange(len(order)) - np.searchsorted(sheet, sheet[order])
     return np.sort(order[(rank < most) & (weight[order] > 0.0)])
+
+
+class Levels(NamedTuple):
+    """Levels across the sheets of profiles, in order, with their lines.
+
+    Attributes
+    ----------
+    place
+        float64 (levels,): place across the sheet [sigmas].
+    profile
+        int64 (levels,): index of the profile.
+    lines
+        Pieces of the visible line, of the lit line.
+    """
+
+    place: Float64
+    profile: Integers
+    lines: tuple[Pieces, ...]
+
+    def joined(self, more: Levels) -> Levels:
+        """Return these levels and others in order."""
+        place, profile = np.append(self.place, more.place), np.append(self.profile, more.profile)
+        order = np.lexsort((place, profile))
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        lines = []
+        for one, two in zip(self.lines, more.lines, strict=True):
+            both = Pieces(*(np.concatenate(each) for each in zip(one, two, strict=True)))
+            level = np.concatenate([one.level, two.level + len(self.place)])
+            lines.append(both._replace(level=rank[level]))
+        return Levels(place[order], profile[order], tuple(lines))
+
+    def runs(self, scale: LineScale) -> list[Runs]:
+        """Return the runs of each kind of line."""
+        return [find_runs(pieces, self.place, self.profile, scale) for pieces in self.lines]

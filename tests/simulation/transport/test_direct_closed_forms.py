@@ -14,8 +14,8 @@ from gpuvision.host import Device
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.readings import UNOCCLUDED
 from gpuvision.simulation.sensors.sensor_view import SensorView
-from gpuvision.simulation.transport.direct import Slabs
 from gpuvision.simulation.transport.sheet_cut import SheetIndex
+from gpuvision.simulation.transport.slabs import Slabs
 from light_of_a_sheet import GREY, TRANSPORT, light_of, plate, quad, sensor_view, two_plates, u_of
 
 FAR, SIGMA = 1e4, 1e-4

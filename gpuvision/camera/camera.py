@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -32,6 +32,7 @@ from gpuvision.validation import check_keys, numbers
 Matrix = tuple[tuple[float, float, float], ...]
 Float64 = npt.NDArray[np.float64]
 Direction = Literal["undistort", "distort"]
+Region = tuple[tuple[float, float], tuple[float, float]]
 
 COEFFICIENT_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 _COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
@@ -40,6 +41,8 @@ _MAX_SQUARE = 1e12
 # Factor on the largest squared distorted radius of the sampled fold points: the fold of a decentred lens can lie
 # farther out between the sampled directions.
 _FOLD_SAMPLING = 1.05
+# Fitted starting polynomials that are kept, each some kilobytes.
+_KEPT_STARTS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,8 +129,43 @@ class Camera:
             One-dimensional, of type ``real``.
         """
         measured, ideal = np.array(self.matrix), np.array(self._ideal_matrix(matrix))
+        source, target = (measured, ideal) if direction == "undistort" else (ideal, measured)
+        return self._table(real, direction, source, target, self._principal_region)
+
+    def packed_correction(
+        self, real: npt.DTypeLike, first: npt.ArrayLike, pitch: npt.ArrayLike, unit: npt.ArrayLike, region: Region
+    ) -> npt.NDArray[Any]:
+        """Return the table of ``camera_correction`` in ``kernels/common/camera.h`` for other coordinates than pixels.
+
+        Parameters
+        ----------
+        real : dtype
+            float32 or float64, the kernel's real type.
+        first, pitch : (2,) array_like
+            Measured coordinates of the kernel: ``(column, row) = first + pitch * coordinate``.
+        unit : (2,) array_like
+            Units of the corrections that the focal lengths of the table give, columns and rows [px].
+        region : ((column, column), (row, row))
+            Region of the sensor that is measured [px].
+
+        Returns
+        -------
+        numpy.ndarray
+            One-dimensional, of type ``real``.
+        """
+        matrix = np.array(self.matrix)
+        source, target = matrix.copy(), matrix.copy()
+        first, pitch, unit = (np.asarray(each, dtype=np.float64) for each in (first, pitch, unit))
+        source[:2] /= pitch[:, None]
+        source[:2, 2] -= first / pitch
+        target[:2] /= unit[:, None]
+        return self._table(real, "undistort", source, target, region)
+
+    def _table(
+        self, real: npt.DTypeLike, direction: Direction, source: Float64, target: Float64, region: Region
+    ) -> npt.NDArray[Any]:
+        """Return the kernels' table from input pixels with the matrix `source` to output pixels with `target`."""
         inverse = direction == "undistort"
-        source, target = (measured, ideal) if inverse else (ideal, measured)
         focal, target_focal = np.diag(source)[:2], np.diag(target)[:2]
         # Round the centre first and compute the other entries from the rounded value, so that they compensate.
         centre = source[:2, 2].astype(real).astype(np.float64)
@@ -135,20 +173,28 @@ class Camera:
         shift = target[:2, 2] - source[:2, 2] + relative_focal_change * (centre - source[:2, 2])
         tilt = self._untilt if inverse else self._tilt
         (p1, p2), (s1, s2, s3, s4) = self._tangential, self._prism
-        parts = [
+        parts: list[Any] = [
             *(centre, 1.0 / focal, target_focal, shift, relative_focal_change),
             *((tilt - np.eye(3))[:2, :2].ravel(), tilt[2, :2]),
             *(self._radial, (p1, p2, p2 + s1, s2, p1 + s3, s4)),
             (self._invertible_region.safe, self._invertible_region.limit),
         ]
         if inverse:
-            parts += [(min(self._max_distorted_square, _MAX_SQUARE),), self._inverse_start.packed(real)]
+            parts += [(min(self._max_distorted_square, _MAX_SQUARE),), _inverse_start(self, region).packed(real)]
         with np.errstate(over="ignore"):
             return np.concatenate(parts).astype(real)
 
-    def newton_steps(self, real: npt.DTypeLike) -> int:
-        """Return CAMERA_STEPS for ``camera_undistort``: Newton steps after which most pixels have converged."""
-        return self._inverse_start.newton_steps(real)
+    def newton_steps(self, real: npt.DTypeLike, region: Region | None = None) -> int:
+        """Return CAMERA_STEPS for ``camera_undistort``: Newton steps after which most pixels have converged.
+
+        Parameters
+        ----------
+        real : dtype
+            float32 or float64, the kernel's real type.
+        region : ((column, column), (row, row)), optional
+            Region of the sensor that is measured [px]. Default: a sensor that the principal point halves.
+        """
+        return _inverse_start(self, region or self._principal_region).newton_steps(real)
 
     # ---- host computation in float64 -----------------------------------------------------------------------
 
@@ -276,11 +322,16 @@ class Camera:
             else math.inf
         )
 
-    @cached_property
-    def _inverse_start(self) -> InverseStart:
-        """Starting polynomials, fitted for a sensor that the principal point halves; larger sensors need more steps."""
+    @property
+    def _principal_region(self) -> Region:
+        """Region of a sensor that the principal point halves [px]."""
+        (_, _, cx), (_, _, cy), _ = self.matrix
+        return (0.0, 2.0 * cx), (0.0, 2.0 * cy)
+
+    def inverse_start(self, region: Region) -> InverseStart:
+        """Fit the starting polynomials of the kernels' inversion to a region ((column, column), (row, row)) [px]."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix
-        corners = np.array([[a, b] for a in (-cx / fx, cx / fx) for b in (-cy / fy, cy / fy)])
+        corners = np.array([[(a - cx) / fx, (b - cy) / fy] for a in region[0] for b in region[1]])
         distorted = _apply_tilt(self._untilt, corners)
         farthest = float(np.nanmax(np.sum(distorted**2, axis=-1), initial=0.0))
         k1, k2, k3, k4, k5, k6 = self._radial
@@ -395,6 +446,12 @@ class Camera:
         """
         values = check_keys(table, ("matrix", *COEFFICIENT_NAMES), ("matrix",), "camera")
         return cls(matrix=values["matrix"], distortion=tuple(values.get(name, 0.0) for name in COEFFICIENT_NAMES))
+
+
+@lru_cache(maxsize=_KEPT_STARTS)
+def _inverse_start(camera: Camera, region: Region) -> InverseStart:
+    """Return `Camera.inverse_start`; a bound operation needs it twice."""
+    return camera.inverse_start(region)
 
 
 def _checked_matrix(matrix: Any, what: str) -> Matrix:

@@ -51,7 +51,7 @@ def read_lens(path: str | Path) -> Lens | Camera:
     if lens is not None and camera is None:
         return radial_lens(lens)
     if camera is not None and lens is None:
-        return _camera(camera)
+        return camera_of(camera)
     raise top.error("expected one table, [lens] or [camera]")
 
 
@@ -124,6 +124,15 @@ def radial_lens(table: Section) -> Lens:
         return Lens(k1=k1, k2=k2, k3=k3, k4=k4, centre=(column, row))
 
 
+def camera_of(table: Section) -> Camera:
+    """Return the camera of a table ``[camera]``; refuse unknown keys."""
+    matrix = table.rows("matrix", "pixel", 3)
+    distortion = tuple(table.number(name, "", 0.0) for name in COEFFICIENT_NAMES)
+    table.finish()
+    with table.checking():
+        return Camera(matrix=matrix, distortion=distortion)
+
+
 def write_lens(
     path: str | Path, model: Lens | Camera, documentation: Mapping[str, Mapping[str, Any]], *, overwrite: bool = False
 ) -> None:
@@ -143,14 +152,6 @@ def write_lens(
     table = {"lens" if isinstance(model, Lens) else "camera": model.to_dict(), **documentation}
     with atomic_write(path, overwrite=overwrite) as file:
         tomli_w.dump(table, file)
-
-
-def _camera(table: Section) -> Camera:
-    matrix = table.rows("matrix", "pixel", 3)
-    distortion = tuple(table.number(name, "", 0.0) for name in COEFFICIENT_NAMES)
-    table.finish()
-    with table.checking():
-        return Camera(matrix=matrix, distortion=distortion)
 
 
 def read_mounted(path: str | Path, shape: tuple[int, int]) -> MountedCamera | None:

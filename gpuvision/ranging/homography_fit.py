@@ -19,7 +19,7 @@ import numpy.typing as npt
 import scipy.optimize
 import scipy.special
 
-from gpuvision.camera.lens import Lens
+from gpuvision.camera.distortion import Distortion
 from gpuvision.ranging.homography import (
     DEFAULT_LIMITS,
     MODELS,
@@ -81,7 +81,7 @@ def fit_models(
     models: Sequence[Model] | None = None,
     symmetry: float = 0.0,
     region: Region | None = None,
-    lens: Lens | None = None,
+    distortion: Distortion | None = None,
     limits: HomographyLimits = DEFAULT_LIMITS,
 ) -> tuple[ModelFit, ...]:
     """Fit every model that the points determine; test each against the largest of them.
@@ -101,8 +101,8 @@ def fit_models(
     region : ((u_min, u_max), (v_min, v_max)), optional
         Region that defines the parameters of the covariance (`to_displacement`). Default: the bounding box of the
         points.
-    lens : Lens, optional
-        Distortion that is removed before the fit; its centre in (u, v) order.
+    distortion : Distortion, optional
+        Distortion that is removed before the fit, for points in (u, v) order.
     limits : HomographyLimits, optional
         Limits of rank and rounding.
 
@@ -114,7 +114,7 @@ def fit_models(
     Raises
     ------
     ValueError
-        Shapes differ, a point is not finite or lies beyond the fold of the lens polynomial, or the points determine no
+        Shapes differ, a point is not finite or lies beyond the fold of the lens, or the points determine no
         model.
 
     Notes
@@ -125,7 +125,7 @@ def fit_models(
     sensor, sheet = _points(sensor_points, "sensor_points"), _points(sheet_points, "sheet_points")
     if len(sensor) != len(sheet):
         raise ValueError(f"got {len(sensor)} sensor points and {len(sheet)} sheet points, expected pairs")
-    data = _calibration(sensor, sheet, sigma, symmetry, lens)
+    data = _calibration(sensor, sheet, sigma, symmetry, distortion)
     frame = shift_and_scale(*centre_and_half_extent(bounding_box(sensor) if region is None else region))
     fits: list[tuple[ModelFit, float]] = []
     reasons: list[DegenerateError] = []
@@ -159,16 +159,16 @@ class _Calibration(NamedTuple):
 
 
 def _calibration(
-    sensor: Float64, sheet: Float64, sigma: npt.ArrayLike | None, symmetry: float, lens: Lens | None
+    sensor: Float64, sheet: Float64, sigma: npt.ArrayLike | None, symmetry: float, distortion: Distortion | None
 ) -> _Calibration:
     """Return the undistorted points with the factors of their covariances."""
-    undistorted = sensor if lens is None else lens.undistort(sensor)
+    undistorted = sensor if distortion is None else distortion.undistort(sensor)
     if not np.all(np.isfinite(undistorted)):
         raise ValueError("a sensor point lies beyond the fold of the lens polynomial; check the lens, or drop it")
     deviation = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, dtype=np.float64), sensor.shape)
     if not np.all(deviation > 0.0):
         raise ValueError("sigma must be positive everywhere, got a value that is not")
-    undistortion = np.eye(2) if lens is None else lens.jacobian(sensor)
+    undistortion = np.eye(2) if distortion is None else distortion.jacobian(sensor)
     return _Calibration(undistorted, sheet, undistortion * deviation[:, None, :], symmetry)
 
 

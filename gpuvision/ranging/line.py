@@ -288,7 +288,7 @@ class LineReadout(VisionOperation[LineReading]):
             work=work,
             more_inputs=[(of_samples, build.real)] if self.peak_selection == "nearest" else [],
             outputs=build.outputs({name: of_samples if name in chosen else None for name in LineReading._fields}),
-            defines=self._defines(dtype, length) | flags(PREFETCH=device.is_cpu),
+            defines=self._defines(dtype, length, build.real) | flags(PREFETCH=device.is_cpu),
             arguments=[
                 np.int32(rows),
                 np.int32(columns),
@@ -331,7 +331,7 @@ class LineReadout(VisionOperation[LineReading]):
                 raise ValueError(f"LineReadout.{name} is {level}, expected 0 to {top} for {dtype} frames")
         return [dtype.type(level) for level in (self.threshold, saturation, weakest)]
 
-    def _defines(self, dtype: np.dtype[Any], length: int) -> dict[str, Define]:
+    def _defines(self, dtype: np.dtype[Any], length: int, real: np.dtype[Any]) -> dict[str, Define]:
         bits = 8 * dtype.itemsize
         defines = type_defines("CODE", dtype, 4, 8, 16) | {"CODE_BITS": bits}
         defines |= flags(**{f"METHOD_{self.method.upper()}": True, f"SELECT_{self.peak_selection.upper()}": True})
@@ -342,7 +342,7 @@ class LineReadout(VisionOperation[LineReading]):
         chosen = self.outputs or ()
         defines |= flags(**{f"WITH_{name.upper()}": True for name in chosen})
         if self.triangulation is not None:
-            defines |= {"WITH_SHEET": None} | self.triangulation.defines
+            defines |= {"WITH_SHEET": None} | self.triangulation.defines(real)
         return defines | flags(
             ALONG_ROWS=self.along == "rows",
             AMBIGUITY=self.ambiguity is not None,

@@ -340,7 +340,7 @@ class PsdReadout(VisionOperation[PsdReading]):
             "psd_readout",
             work=work,
             outputs=build.outputs({name: batch if name in chosen else None for name in PsdReading._fields}),
-            defines=self._defines(dtype),
+            defines=self._defines(dtype, build.real),
             arguments=[
                 self._packed(build.real, dtype),
                 np.int32(samples),
@@ -354,11 +354,11 @@ class PsdReadout(VisionOperation[PsdReading]):
             streams=True,
         )
 
-    def _defines(self, dtype: np.dtype[Any]) -> dict[str, Define]:
+    def _defines(self, dtype: np.dtype[Any], real: np.dtype[Any]) -> dict[str, Define]:
         defines = type_defines("INPUT", dtype, 16)
         defines |= flags(**{f"WITH_{name.upper()}": True for name in self.outputs or ()})
         if self.triangulation is not None:
-            defines |= {"WITH_SHEET": None} | self.triangulation.defines
+            defines |= {"WITH_SHEET": None} | self.triangulation.defines(real)
         return defines | flags(
             PLANAR=self.layout == "planar",
             DARK_LEVEL=any(self.dark),

@@ -20,8 +20,8 @@ class SheetPoints(NamedTuple):
         Coordinates along the sheet and up in the sheet [m]; NaN where the status is not OK.
     status
         uint8 `Status` flags: NOT_FINITE (u or v is not finite, or lies more than 1e6 half extents of the region away),
-        NOT_INVERTIBLE (beyond the fold of the lens polynomial), HORIZON (the ray does not meet the sheet in front of
-        the sensor, or meets it too far away).
+        NOT_INVERTIBLE (beyond the fold of the lens, or behind the tilted sensor), HORIZON (the ray does not meet the
+        sheet in front of the sensor, or meets it too far away).
     sigma_g, sigma_h
         Standard deviations of g and h [m]; ``None`` unless the triangulation has the ``sigma`` of the sensor.
     """
@@ -34,7 +34,7 @@ class SheetPoints(NamedTuple):
 
 
 class SheetTable(NamedTuple):
-    """Parameters of ``kernels/common/sheet.h``, in the order of its struct ``SheetTable``."""
+    """Parameters of ``kernels/common/sheet.h``, in the order of its struct ``SheetTable``; ``camera`` only with one."""
 
     position_origin: float
     position_scale: float
@@ -47,6 +47,7 @@ class SheetTable(NamedTuple):
     lens: npt.ArrayLike
     factor_g: npt.ArrayLike
     factor_h: npt.ArrayLike
+    camera: npt.ArrayLike = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,8 +18,11 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.distortion import Distortion, ExchangedAxes
 from gpuvision.camera.lens import Lens
 from gpuvision.host import (
+    Define,
     Device,
     Launch,
     LaunchBuilder,
@@ -44,15 +47,15 @@ _LANES, _GROUP = 16, 256
 # Points of a strip in the vector variant. Long strips keep the hardware prefetchers running; several strips per core
 # balance the load.
 _SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
-_KEYS = ("homography", "region", "model", "along", "lens", "covariance", "sigma", "horizon")
+_KEYS = ("homography", "region", "model", "along", "lens", "camera", "covariance", "sigma", "horizon")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Triangulation(VisionOperation[SheetPoints]):
-    """Triangulation of sensor coordinates (u, v) to sheet coordinates (G, H), with lens correction.
+    """Triangulation of sensor coordinates (u, v) to sheet coordinates (G, H), with correction of the distortion.
 
     ``(G, H, 1) ~ homography (u, v, 1)``. Sensor and sheet of light are planes, so the plane-to-plane homography holds
-    for every pinhole sensor, tilted ones included (Scheimpflug).
+    for every pinhole sensor, tilted ones included (Scheimpflug). Before it, a lens or a calibrated camera is undone.
 
     Called as ``triangulation(u, v)`` with float32 or float64 arrays of one shape; returns `SheetPoints`.
 
@@ -66,9 +69,12 @@ class Triangulation(VisionOperation[SheetPoints]):
     model : {"C3", "C4", "D6", "H8"}
         Model that the homography was fitted as, default ``"H8"``; see `fit`.
     along : {"columns", "rows"}
-        Sensor axis of v, default ``"columns"``. Only a lens needs it, since its centre is (column, row).
+        Sensor axis of v, default ``"columns"``. A lens or a camera needs it, since their points are (column, row).
     lens : Lens, optional
         Radial lens distortion, corrected before the homography.
+    camera : Camera, optional
+        Calibrated camera, instead of a lens: its lens terms and the tilt of its sensor are corrected before the
+        homography, which then starts from ideal pixels (of the same camera matrix). u and v are pixels.
     covariance : (8, 8) array_like, optional
         Covariance of (g0, gx, gy, h0, hx, hy, dx, dy), the parameters of the displacement form over ``region`` (see
         `conditioned`). It is added to the sigmas.
@@ -85,13 +91,14 @@ class Triangulation(VisionOperation[SheetPoints]):
     Raises
     ------
     ValueError
-        The homography is singular (the sensor sees the sheet edge-on), the middle of the region lies on the horizon, or
-        a parameter is out of range.
+        The homography is singular (the sensor sees the sheet edge-on), the middle of the region lies on the horizon,
+        both a lens and a camera are given, or a parameter is out of range.
 
     Notes
     -----
     Error: a few roundings of the size of the measuring range, since the arithmetic uses displacements from the middle
-    of the region.
+    of the region. A camera adds 1e-6 of its correction (4e-15 in double precision), see
+    `gpuvision.camera.undistort_points.UndistortPoints`.
 
     References
     ----------
@@ -106,6 +113,7 @@ class Triangulation(VisionOperation[SheetPoints]):
     model: Model = "H8"
     along: Along = "columns"
     lens: Lens | None = None
+    camera: Camera | None = None
     covariance: tuple[tuple[float, ...], ...] | None = None
     sigma: tuple[float, float] | None = None
     horizon: float = 1e-3
@@ -129,6 +137,8 @@ class Triangulation(VisionOperation[SheetPoints]):
             raise ValueError(f"Triangulation.model is {self.model!r}, expected one of {', '.join(homography.MODELS)}")
         if self.along not in ("columns", "rows"):
             raise ValueError(f"Triangulation.along is {self.along!r}, expected 'columns' or 'rows'")
+        if self.lens is not None and self.camera is not None:
+            raise ValueError("Triangulation has a lens and a camera; the camera includes a lens, give one of them")
         if not 0.0 < self.horizon < 1.0:
             raise ValueError(f"Triangulation.horizon is {self.horizon}, expected a number between 0 and 1")
         if self.sigma is not None and min(self.sigma) < 0.0:
@@ -137,11 +147,15 @@ class Triangulation(VisionOperation[SheetPoints]):
 
     # ---- parameters of the kernels -------------------------------------------------------------------------
 
-    @property
-    def defines(self) -> dict[str, None]:
-        """Build options of ``kernels/common/sheet.h`` for this triangulation."""
-        lens = {} if self.lens is None else self.lens.defines
-        return lens if self.covariance is None else {**lens, "SHEET_COVARIANCE": None}
+    def defines(self, real: npt.DTypeLike) -> dict[str, Define]:
+        """Return the build options of ``kernels/common/sheet.h`` for a kernel with the real type ``real``."""
+        options: dict[str, Define] = {} if self.covariance is None else {"SHEET_COVARIANCE": None}
+        if self.lens is not None:
+            options |= self.lens.defines
+        if self.camera is not None and any(self.camera.distortion):
+            steps = self.camera.newton_steps(real, self._image_region)
+            options |= {**self.camera.defines(), "CAMERA_STEPS": steps, **flags(SHEET_ROWS=self.along == "rows")}
+        return options
 
     def packed(self, real: npt.DTypeLike, axes: SampleAxes | None = None) -> npt.NDArray[Any]:
         """Return the parameter table of the device functions of ``kernels/common/sheet.h`` (`SheetTable`).
@@ -162,10 +176,15 @@ class Triangulation(VisionOperation[SheetPoints]):
         scale = (pitch / half).astype(real).astype(np.float64)
         start = first + pitch * origin
         terms = self._displacement(start, pitch / scale)
-        lens = np.zeros(Lens.TABLE_SIZE)
+        lens, camera = np.zeros(Lens.TABLE_SIZE), np.zeros(0)
         if self.sensor_lens is not None:
             # The two scales differ by a rounding only, which moves a distorted point by less than a rounding.
             lens = self.sensor_lens.packed(start, 1.0 / half[0])
+        if self.camera is not None and any(self.camera.distortion):
+            to_image = [1, 0] if self.along == "columns" else [0, 1]
+            camera = self.camera.packed_correction(
+                real, first[to_image], pitch[to_image], (pitch / scale)[to_image], self._image_region
+            )
         g0, gx, gy, h0, hx, hy, dx, dy = terms
         factor_g, factor_h = self._factors()
         table = SheetTable(
@@ -180,6 +199,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             lens=lens,
             factor_g=factor_g,
             factor_h=factor_h,
+            camera=camera,
         )
         with np.errstate(over="ignore"):
             return np.hstack(table).astype(real)
@@ -192,6 +212,12 @@ class Triangulation(VisionOperation[SheetPoints]):
         of the region.
         """
         return self._displacement(*self._centre_and_half_extent())
+
+    @property
+    def _image_region(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Region of the sensor as ranges of columns and rows."""
+        u, v = self.region
+        return (v, u) if self.along == "columns" else (u, v)
 
     def _centre_and_half_extent(self) -> tuple[Float64, Float64]:
         return homography.centre_and_half_extent(self.region)
@@ -227,7 +253,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             more_inputs=[(shape, dtype)],
             outputs=build.outputs({"g": shape, "h": shape, "status": shape, "sigma_g": spread, "sigma_h": spread}),
             defines={
-                **self.defines,
+                **self.defines(build.real),
                 **type_defines("INPUT", dtype, 16),
                 **flags(SHEET_SIGMAS=self.sigma is not None),
             },
@@ -259,13 +285,13 @@ class Triangulation(VisionOperation[SheetPoints]):
         middle = inverse @ matrix[:, 2]
         lifted[lifted[..., 2] * middle[2] <= 0.0] = np.nan
         straight: Float64 = origin + unit * lifted[..., :2] / lifted[..., 2:]
-        return straight if self.sensor_lens is None else self.sensor_lens.distort(straight)
+        return straight if self.distortion is None else self.distortion.distort(straight)
 
     def covariance_at(self, points: npt.ArrayLike) -> Float64:
         """Compute the covariance (..., 2, 2) of (G, H) at measured points (u, v) (..., 2); NaN beyond the horizon.
 
-        ``J diag(sigma_u^2, sigma_v^2) J'`` with the Jacobian J of lens and homography, plus the contribution of the
-        covariance of the parameters.
+        ``J diag(sigma_u^2, sigma_v^2) J'`` with the Jacobian J of distortion and homography, plus the contribution of
+        the covariance of the parameters.
 
         Raises
         ------
@@ -276,15 +302,15 @@ class Triangulation(VisionOperation[SheetPoints]):
             raise ValueError("Triangulation knows neither sigma nor covariance; give it one of them")
         points = np.asarray(points, dtype=np.float64)
         origin, unit = self._centre_and_half_extent()
-        x = ((points if self.sensor_lens is None else self.sensor_lens.undistort(points)) - origin) / unit
+        x = ((points if self.distortion is None else self.distortion.undistort(points)) - origin) / unit
         _, gx, gy, _, hx, hy, dx, dy = self.conditioned()
         w = 1.0 + x @ np.array([dx, dy])
         w = np.where(w > self.horizon, w, np.nan)
         p = x / w[..., None]
         values = p @ np.array([[gx, hx], [gy, hy]])
         slopes = np.array([[gx, gy], [hx, hy]]) - values[..., None] * np.array([dx, dy])
-        lens_slopes = np.eye(2) if self.sensor_lens is None else self.sensor_lens.jacobian(points)
-        slopes = (slopes / w[..., None, None]) @ lens_slopes / unit
+        distortion_slopes = np.eye(2) if self.distortion is None else self.distortion.jacobian(points)
+        slopes = (slopes / w[..., None, None]) @ distortion_slopes / unit
         scaled = slopes * np.array(self.sigma or (0.0, 0.0))
         total: Float64 = scaled @ np.swapaxes(scaled, -1, -2)
         if self.covariance is not None:
@@ -295,7 +321,12 @@ class Triangulation(VisionOperation[SheetPoints]):
     @property
     def sensor_lens(self) -> Lens | None:
         """Lens for points in (u, v) order; None without a lens."""
-        return _in_sensor_order(self.lens, self.along)
+        return self.lens.swapped() if self.lens is not None and self.along == "columns" else self.lens
+
+    @property
+    def distortion(self) -> Distortion | None:
+        """Lens or camera for points in (u, v) order; None without both."""
+        return _in_sensor_order(self.camera if self.lens is None else self.lens, self.along)
 
     # ---- construction --------------------------------------------------------------------------------------
 
@@ -312,6 +343,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         region: tuple[tuple[float, float], tuple[float, float]] | None = None,
         along: Along = "columns",
         lens: Lens | None = None,
+        camera: Camera | None = None,
         limits: HomographyLimits = DEFAULT_LIMITS,
     ) -> Triangulation:
         """Calibrate: fit calibration points, and select the smallest sufficient model of the family.
@@ -334,7 +366,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             v of the plane of symmetry for C4 [sensor unit], default 0.
         region : ((u_min, u_max), (v_min, v_max)), optional
             Region of the sensor; ``None``: the bounding box of the points.
-        along, lens
+        along, lens, camera
             As in the class.
         limits : HomographyLimits, optional
             Limits of rank and rounding.
@@ -342,8 +374,8 @@ class Triangulation(VisionOperation[SheetPoints]):
         Raises
         ------
         ValueError
-            Shapes differ, a point is not finite or lies beyond the fold of the lens, or the points do not determine
-            the model.
+            Shapes differ, a point is not finite or lies beyond the fold of the lens, the points do not determine the
+            model, or both a lens and a camera are given.
         """
         sensor = np.asarray(sensor_points, dtype=np.float64)
         fits = fit_models(
@@ -353,7 +385,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             models=None if model is None else (model,),
             symmetry=symmetry,
             region=region,
-            lens=_in_sensor_order(lens, along),
+            distortion=_in_sensor_order(camera if lens is None else lens, along),
             limits=limits,
         )
         chosen = next(each for each in fits if each.p_value >= significance or each is fits[-1])
@@ -367,15 +399,16 @@ class Triangulation(VisionOperation[SheetPoints]):
             model=chosen.model,
             along=along,
             lens=lens,
+            camera=camera,
             sigma=(float(known[0]), float(known[-1])) if known.size in (1, 2) else None,
         )
 
     @classmethod
     def from_camera(
         cls,
-        camera_matrix: npt.ArrayLike,
-        rotation: npt.ArrayLike,
-        translation: npt.ArrayLike,
+        camera: Camera | npt.ArrayLike,
+        rotation: npt.ArrayLike | None = None,
+        translation: npt.ArrayLike = (0.0, 0.0, 0.0),
         *,
         g_axis: npt.ArrayLike = (1.0, 0.0, 0.0),
         h_axis: npt.ArrayLike = (0.0, 0.0, 1.0),
@@ -383,24 +416,42 @@ class Triangulation(VisionOperation[SheetPoints]):
         along: Along = "columns",
         **more: Any,
     ) -> Triangulation:
-        """Build a triangulation from the matrix and the pose of a camera and the pose of the sheet of light.
+        """Build a triangulation from a camera, its pose, and the pose of the sheet of light.
 
         Parameters
         ----------
-        camera_matrix : (3, 3) array_like
-            ``(column, row, 1) ~ camera_matrix (X, Y, Z)``; any invertible matrix, also of a tilted sensor.
+        camera : Camera or (3, 3) array_like
+            Calibrated camera, with its distortion and the tilt of its sensor; or the matrix of a camera without
+            distortion, ``(column, row, 1) ~ camera (X, Y, Z)``, any invertible matrix.
         rotation, translation : (3, 3) and (3,) array_like
-            World to camera; the translation in metres.
+            World to camera; the translation in metres. Default: the world is the camera frame.
         g_axis, h_axis, origin : (3,) array_like
             Sheet in the world: directions of G and H, and the point G = H = 0 [m].
         along, **more
             Other parameters of the class; ``region`` is required.
+
+        Examples
+        --------
+        A sheet of light in the frame of a tilted camera (x right, y down, z forward):
+
+        >>> camera = Camera(
+        ...     matrix=((1700, 0, 640), (0, 1700, 400), (0, 0, 1)), distortion=(-0.1, *(0.0,) * 11, 0.25, 0.0)
+        ... )
+        >>> sheet = Triangulation.from_camera(
+        ...     camera,
+        ...     origin=(0, 0, 0.3),
+        ...     g_axis=(1, 0, 0),
+        ...     h_axis=(0, -0.6, -0.8),
+        ...     region=((0, 799), (0, 1279)),
+        ... )
         """
-        to_sensor = homography.camera_homography(camera_matrix, rotation, translation, (g_axis, h_axis, origin))
+        calibrated, matrix = (camera, camera.matrix) if isinstance(camera, Camera) else (None, camera)
+        rotation = np.eye(3) if rotation is None else rotation
+        to_sensor = homography.camera_homography(matrix, rotation, translation, (g_axis, h_axis, origin))
         if along == "columns":
             to_sensor = to_sensor[[1, 0, 2]]
-        matrix = numbers(homography.inverse(to_sensor), (3, 3), "Triangulation.homography")
-        return cls(homography=matrix, along=along, **more)
+        inverse = numbers(homography.inverse(to_sensor), (3, 3), "Triangulation.homography")
+        return cls(homography=inverse, along=along, camera=calibrated, **more)
 
     @classmethod
     def from_stand_off(
@@ -476,6 +527,8 @@ class Triangulation(VisionOperation[SheetPoints]):
             table["sigma"] = list(self.sigma)
         if self.lens is not None:
             table["lens"] = self.lens.to_dict()
+        if self.camera is not None:
+            table["camera"] = self.camera.to_dict()
         return table
 
     @classmethod
@@ -490,8 +543,13 @@ class Triangulation(VisionOperation[SheetPoints]):
         values = dict(check_keys(table, _KEYS, ("homography", "region"), "triangulation"))
         if "lens" in values:
             values["lens"] = Lens.from_dict(values["lens"])
+        if "camera" in values:
+            values["camera"] = Camera.from_dict(values["camera"])
         return cls(**values, precision=precision)
 
 
-def _in_sensor_order(lens: Lens | None, along: Along) -> Lens | None:
-    return lens.swapped() if lens is not None and along == "columns" else lens
+def _in_sensor_order(model: Lens | Camera | None, along: Along) -> Distortion | None:
+    """Return a distortion model for points in (u, v) order."""
+    if along == "rows" or model is None:
+        return model
+    return model.swapped() if isinstance(model, Lens) else ExchangedAxes(model)

@@ -13,10 +13,14 @@ Tables of the file (the files in ``gpuvision/presets/sensors`` are commented exa
 ``[lens]``            radial distortion in sensor coordinates, see `Lens`; or ``file``, a lens that ``gpuvision
                       calibrate`` wrote, with ``window``, the column and row of a frame's first pixel in the
                       calibrated images
+``[camera]``          calibrated camera: ``matrix`` and OpenCV's coefficients ``k1`` ... ``tauY`` as in the file of
+                      ``gpuvision calibrate``, or ``file``, such a file; ``window`` as for a lens. Excludes ``[lens]``
+                      and ``[axes]``
 ``[triangulation]``   sensor to sheet, for a straight transport: ``baseline``, ``stand_off`` and so on (see
-                      `Triangulation.from_stand_off`); or a camera's ``focal_length_px``, ``principal_point_px`` and the
-                      sheet in its frame, ``sheet_origin``, ``g_axis``, ``h_axis``; or ``homography``; or ``constants``
-                      (`Triangulation.from_constants`); or ``points``: calibration points (u, v, G, H) to fit
+                      `Triangulation.from_stand_off`); or the sheet in the frame of a camera, ``sheet_origin``,
+                      ``g_axis``, ``h_axis``, with a table ``[camera]``, or without it with ``focal_length_px`` and
+                      ``principal_point_px``; or ``homography``; or ``constants`` (`Triangulation.from_constants`); or
+                      ``points``: calibration points (u, v, G, H) to fit
 ``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`;
                       with an encoder ``encoder``, a file with a count for each profile, and ``metres_per_count`` or
                       ``radians_per_count`` instead of a step
@@ -32,13 +36,11 @@ import math
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.lens import Lens
-from gpuvision.formats.camera_file import radial_lens, read_calibrated_size, read_lens
 from gpuvision.host.recordings import CHANNELS, Channel
 from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
@@ -47,6 +49,8 @@ from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Along, Triangulation
 from gpuvision.schema import DescriptionError, Section, read_toml
 from gpuvision.sensor.light_source import Light, read_light
+from gpuvision.sensor.optics import read_optics
+from gpuvision.sensor.sheet import read_triangulation
 from gpuvision.sensor.transports import Encoder, Transport, read_transport
 
 Background = Literal["none", "median", "previous", "dark_after", "dark_before"]
@@ -198,11 +202,13 @@ class Sensor:
             moving.choice("kind", ("straight", "rotating") if kind == "camera" else ("straight",)) == "rotating"
         )
         axes = SampleAxes() if is_rotating else _axes(top.optional_section("axes"))
-        lens = _lens(top.optional_section("lens"), frame, along, axes)
-        transport, encoder = read_transport(moving, lens, along, is_rotating=is_rotating)
+        optics = read_optics(top, kind, frame, along, axes)
+        if is_rotating and optics.camera is not None:
+            raise top.error("[camera] goes with a straight transport; a rotating sheet takes [lens]")
+        transport, encoder = read_transport(moving, optics.lens, along, is_rotating=is_rotating)
         if not is_rotating:
             region = _region(kind, top, frame, along, axes, readout)
-            sheet = _triangulation(top.section("triangulation"), {"region": region, "along": along, "lens": lens})
+            sheet = read_triangulation(top.section("triangulation"), optics, region, along)
         output = _output(top.section("output"))
         light = _light(top, transport)
         top.finish()
@@ -284,37 +290,6 @@ def _axes(table: Section | None) -> SampleAxes:
     return SampleAxes(**values)
 
 
-def _lens(table: Section | None, frame: tuple[int, int] | None, along: Along, axes: SampleAxes) -> Lens | None:
-    """Read a lens in sensor coordinates, or a file with a lens in pixels."""
-    if table is None or "file" not in table:
-        return None if table is None else radial_lens(table)
-    path = table.file("file")
-    column, row = table.numbers("window", "pixel", (2,), (0.0, 0.0))
-    table.finish()
-    lens, size = read_lens(path), read_calibrated_size(path)
-    if not isinstance(lens, Lens):
-        raise table.error(f"{path} has a table [camera], expected [lens]: calibrate with --method lines")
-    if frame is not None and size is not None and size != frame[::-1] and "window" not in table:
-        raise table.error(
-            f"{path} is for images of {size[0]} x {size[1]} pixels, the frames have {frame[1]} x {frame[0]}; "
-            "give lens.window, the column and row of a frame's first pixel in those images"
-        )
-    with table.checking():
-        return _in_sensor_coordinates(lens.in_window((column, row)), along, axes)
-
-
-def _in_sensor_coordinates(lens: Lens, along: Along, axes: SampleAxes) -> Lens:
-    """Return a lens in pixels (column, row) as a lens in the sensor coordinates of these axes."""
-    position, sample = (axes.position_origin, axes.position_pitch), (axes.sample_origin, axes.sample_pitch)
-    column, row = (sample, position) if along == "columns" else (position, sample)
-    scale = abs(column[1])
-    if scale != abs(row[1]):
-        raise ValueError("a lens of a file needs pitches of equal size in [axes]: its pixels are square")
-    centre = tuple(origin + pitch * each for (origin, pitch), each in zip((column, row), lens.centre, strict=True))
-    terms = {f"k{order}": value / scale ** (2 * order) for order, value in enumerate(lens.coefficients, 1)}
-    return Lens(**terms, centre=(centre[0], centre[1]))
-
-
 def _region(
     kind: str, top: Section, frame: tuple[int, int] | None, along: Along, axes: SampleAxes, readout: Section
 ) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -330,67 +305,6 @@ def _region(
     u = sorted(axes.position_origin + axes.position_pitch * each for each in positions)
     v = sorted(axes.sample_origin + axes.sample_pitch * each for each in (0.0, samples - 1.0))
     return (u[0], u[1]), (v[0], v[1])
-
-
-def _triangulation(table: Section, common: dict[str, Any]) -> Triangulation:
-    """Read a triangulation: a homography, constants, calibration points, a setup in metres, or a camera's pose."""
-    common = common | {"horizon": table.number("horizon", "", 1e-3, above=0.0, below=1.0)}
-    given = [method for method in _WAYS if method in table]
-    if len(given) != 1:
-        problem = f"has {' and '.join(given)} at once" if given else "has no geometry"
-        raise table.error(f"[{table.name}] {problem}, expected one of {', '.join(_WAYS)}")
-    made = _WAYS[given[0]](table, common)
-    table.finish()
-    return made
-
-
-def _from_homography(table: Section, common: dict[str, Any]) -> Triangulation:
-    return Triangulation(homography=table.rows("homography", "m per sensor unit", 3), **common)
-
-
-def _from_constants(table: Section, common: dict[str, Any]) -> Triangulation:
-    return Triangulation.from_constants(table.numbers("constants", "", (3, 4, 6, 8)), **common)
-
-
-def _from_points(table: Section, common: dict[str, Any]) -> Triangulation:
-    """Fit rows of (u, v, G, H)."""
-    points = np.array(table.rows("points", "u, v in sensor units, G, H in m", 4))
-    horizon = common.pop("horizon")
-    fitted = Triangulation.fit(points[:, :2], points[:, 2:], **common)
-    return replace(fitted, horizon=horizon)
-
-
-def _from_stand_off(table: Section, common: dict[str, Any]) -> Triangulation:
-    return Triangulation.from_stand_off(
-        baseline=table.number("baseline", "m", above=0.0),
-        stand_off=table.number("stand_off", "m", above=0.0),
-        focal_distance=table.number("focal_distance", "sensor unit", above=0.0),
-        tilt=table.number("tilt", "rad", None, above=-math.pi / 2, below=math.pi / 2),
-        **common,
-    )
-
-
-def _from_camera(table: Section, common: dict[str, Any]) -> Triangulation:
-    focal = table.number("focal_length_px", "pixel", above=0.0)
-    column, row = table.numbers("principal_point_px", "pixel", (2,))
-    return Triangulation.from_camera(
-        [[focal, 0.0, column], [0.0, focal, row], [0.0, 0.0, 1.0]],
-        np.eye(3),
-        np.zeros(3),
-        origin=table.numbers("sheet_origin", "m", (3,)),
-        g_axis=table.numbers("g_axis", "", (3,)),
-        h_axis=table.numbers("h_axis", "", (3,)),
-        **common,
-    )
-
-
-_WAYS = {
-    "homography": _from_homography,
-    "constants": _from_constants,
-    "points": _from_points,
-    "baseline": _from_stand_off,
-    "focal_length_px": _from_camera,
-}
 
 
 def _line(table: Section, along: Along, sheet: Triangulation | None, axes: SampleAxes) -> LineReadout:

@@ -45,8 +45,11 @@
 #define CAMERA_BENT 30       // q of bent points from which no inverse is searched: beyond the fold's image, or 1e6 f
 #define CAMERA_PER_REACH 31  // 1 / (q of bent points up to which the start polynomials hold)
 #define CAMERA_FIRST 32      // squared length of a virtual step before the first one, relative to q
-#define CAMERA_GUESS 33
+#define CAMERA_GUESS 33      // start polynomials of camera_approach, 30 entries
 #define CAMERA_GUESS_TERMS 8
+#if CAMERA_RADIAL || CAMERA_RATIONAL || defined(CAMERA_DECENTRED)
+#define CAMERA_BENDS         // the lens has distortion terms; otherwise only the sensor is tilted
+#endif
 
 // Convergence of camera_approach. Its steps shrink linearly: a step of length s after one of length t leaves an error
 // of about s (s / t) = s^2 / t. CAMERA_LEFT is the accepted error and CAMERA_NOISE a step that is rounding, both
@@ -286,14 +289,14 @@ static inline __attribute__((always_inline)) masks LANED(camera_approach)(reals 
     return ~(within & settled);
 }
 
-// Move measured pixels to their ideal positions; return the mask of pixels without one: beyond the image of the fold, a
-// million focal lengths away, or not finite. Points that camera_approach does not solve take Newton's method
-// (newton.h).
-static inline __attribute__((always_inline)) masks LANED(camera_undistort)(reals *column, reals *row,
-                                                                           constant real *camera) {
-    reals x = (*column - camera[CAMERA_CENTRE_X]) * camera[CAMERA_PER_X];
-    reals y = (*row - camera[CAMERA_CENTRE_Y]) * camera[CAMERA_PER_Y];
-    reals back_x, back_y;
+// Compute the normalised displacement that moves measured pixels to their ideal positions; return the mask of pixels
+// without one: beyond the image of the fold, a million focal lengths away, or not finite. Points that camera_approach
+// does not solve take Newton's method (newton.h).
+static inline __attribute__((always_inline)) masks LANED(camera_correction)(reals column, reals row,
+                                                                            constant real *camera, reals *back_x,
+                                                                            reals *back_y) {
+    reals x = (column - camera[CAMERA_CENTRE_X]) * camera[CAMERA_PER_X];
+    reals y = (row - camera[CAMERA_CENTRE_Y]) * camera[CAMERA_PER_Y];
     masks folded = 0;
 #ifdef CAMERA_TILTED
     reals tilt_x, tilt_y;
@@ -301,19 +304,65 @@ static inline __attribute__((always_inline)) masks LANED(camera_undistort)(reals
     x += tilt_x;
     y += tilt_y;
 #endif
-    const masks open = LANED(camera_approach)(x, y, camera, &back_x, &back_y) & ~folded;
+#ifdef CAMERA_BENDS
+    const masks open = LANED(camera_approach)(x, y, camera, back_x, back_y) & ~folded;
+#else
+    *back_x = *back_y = 0;
+    const masks open = ~folded;
+#endif
     if (any_lane(open)) {
         // The bit patterns of non-negative reals have the order of the reals, and the patterns of infinity and NaN are
         // larger: one comparison of bits finds points that are too far or not finite.
         const masks far = mask_of(as_masks(x * x + y * y) >= as_bits(camera[CAMERA_BENT]));
-        folded |= far | LANED(newton_back)(x, y, open & ~far, camera, &back_x, &back_y);
+#ifdef CAMERA_BENDS
+        folded |= far | LANED(newton_back)(x, y, open & ~far, camera, back_x, back_y);
+#else
+        folded |= far;
+#endif
     }
 #ifdef CAMERA_TILTED
-    back_x += tilt_x;
-    back_y += tilt_y;
+    *back_x += tilt_x;
+    *back_y += tilt_y;
 #endif
+    return folded;
+}
+
+// Move measured pixels to their ideal positions; return the mask of pixels without one, as camera_correction.
+static inline __attribute__((always_inline)) masks LANED(camera_undistort)(reals *column, reals *row,
+                                                                           constant real *camera) {
+    reals back_x, back_y;
+    const masks folded = LANED(camera_correction)(*column, *row, camera, &back_x, &back_y);
     LANED(camera_move)(column, row, back_x, back_y, camera);
     return folded;
+}
+
+// Convert a gradient over ideal normalised coordinates to the gradient over the measured ones: multiply by the
+// transposed Jacobian of the correction, (lens Jacobian)^-1 times the Jacobian of the inverse tilt. (back_x, back_y) is
+// the displacement of camera_correction at the measured pixel.
+static inline void LANED(camera_pull_back)(reals column, reals row, reals back_x, reals back_y, constant real *camera,
+                                           reals *slope_x, reals *slope_y) {
+    const reals x = (column - camera[CAMERA_CENTRE_X]) * camera[CAMERA_PER_X];
+    const reals y = (row - camera[CAMERA_CENTRE_Y]) * camera[CAMERA_PER_Y];
+#ifdef CAMERA_BENDS
+    reals xx, xy, yx, yy;
+    const reals per = 1 / LANED(camera_slopes)(x + back_x, y + back_y, camera, &xx, &xy, &yx, &yy);
+    const reals along_x = (*slope_x * yy - *slope_y * yx) * per;
+    const reals along_y = (*slope_y * xx - *slope_x * xy) * per;
+    *slope_x = along_x;
+    *slope_y = along_y;
+#endif
+#ifdef CAMERA_TILTED
+    constant real *tilt = camera + CAMERA_TILT;
+    reals tilt_x, tilt_y;
+    masks behind;
+    LANED(camera_tilt)(x, y, tilt, &tilt_x, &tilt_y, &behind);
+    const reals per_w = 1 / (1 + (tilt[4] * x + tilt[5] * y));
+    const reals far = *slope_x * (x + tilt_x) + *slope_y * (y + tilt_y);
+    const reals across_x = *slope_x + (*slope_x * tilt[0] + *slope_y * tilt[2]) - far * tilt[4];
+    const reals across_y = *slope_y + (*slope_x * tilt[1] + *slope_y * tilt[3]) - far * tilt[5];
+    *slope_x = across_x * per_w;
+    *slope_y = across_y * per_w;
+#endif
 }
 #endif
 

@@ -3,17 +3,19 @@
 // A plane-to-plane homography in displacement form (F. de Jong, sections 2.3.3 and 3.3.2; Triangulation in
 // gpuvision/ranging/triangulation.py):
 //
-//     x = (position - x0) sx,  y = (sample - y0) sy           about -1 .. 1; then the lens is undone, if there is one
+//     x = (position - x0) sx,  y = (sample - y0) sy           about -1 .. 1; then the distortion is undone
 //     w = 1 + dx x + dy y                                     denominator, 1 in the middle of the sensor
 //     G = g0 + gx p + gy q,  H = h0 + hx p + hy q             with p = x/w, q = y/w
 //
 // The host folds all other constants into these numbers in double precision. Origins and scales are rounded to the
 // kernel's real type before that, so a single-precision result is within a few roundings of the double-precision one.
-// Build options: LENS, LENS_K2, LENS_K3, LENS_K4 (lens.h); SHEET_COVARIANCE adds the covariance of the parameters to
-// the sigmas.
+// Build options: the distortion: LENS, LENS_K2, LENS_K3, LENS_K4 (lens.h), or CAMERA and its options (camera.h) with
+// SHEET_ROWS where the samples run along the rows axis of the image (positions are columns); SHEET_COVARIANCE adds the
+// covariance of the parameters to the sigmas.
 #ifndef SHEET_H
 #define SHEET_H
 
+#include "common/camera.h"
 #include "common/lanes.h"
 #include "common/lens.h"
 #include "common/status.h"
@@ -28,6 +30,9 @@ typedef struct {
     real lens[7];                          // table of lens.h, for x and y
     real factor_g[15], factor_h[15];       // triangular factors of the covariance of (g0, gx, gy, dx, dy) and of
                                            // (h0, hx, hy, dx, dy), column by column
+#ifdef CAMERA
+    real camera[63];                       // table of camera.h: pixels are positions and samples, the output is x and y
+#endif
 } SheetTable;
 
 // Bits of the squared distance, in half extents of the sensor region, from which a coordinate counts as not finite.
@@ -35,35 +40,66 @@ typedef struct {
 // ascending order, so one comparison finds all of them.
 #define SHEET_REACH as_bits((real)1e12)
 
-// Compute the undistorted, scaled place (x, y) of a light position; return its squared distance from the centre of the
-// lens, or without a lens from the middle of the sensor region.
-static inline reals sheet_place(reals position, reals sample, constant SheetTable *sheet, reals *x, reals *y) {
+#ifdef CAMERA
+// Entry of the camera's table for the axis of the positions, and for the axis of the samples.
+#ifdef SHEET_ROWS
+#define SHEET_OF_POSITION(entry) entry##_X
+#define SHEET_OF_SAMPLE(entry) entry##_Y
+#else
+#define SHEET_OF_POSITION(entry) entry##_Y
+#define SHEET_OF_SAMPLE(entry) entry##_X
+#endif
+
+// Compute the normalised correction of the camera along position and sample; return the mask of positions without one.
+static inline __attribute__((always_inline)) masks sheet_correction(reals position, reals sample,
+                                                                    constant SheetTable *sheet, reals *back_position,
+                                                                    reals *back_sample) {
+#ifdef SHEET_ROWS
+    return LANED(camera_correction)(position, sample, sheet->camera, back_position, back_sample);
+#else
+    return LANED(camera_correction)(sample, position, sheet->camera, back_sample, back_position);
+#endif
+}
+#endif
+
+// Compute the undistorted, scaled place (x, y) of a light position, and the mask of positions without one: beyond the
+// fold of the lens, or behind the tilted sensor. Return the squared distance of the measured place from the centre of
+// the lens, or without a lens from the middle of the sensor region.
+static inline reals sheet_place(reals position, reals sample, constant SheetTable *sheet, reals *x, reals *y,
+                                masks *folded) {
     *x = (position - sheet->position_origin) * sheet->position_scale;
     *y = (sample - sheet->sample_origin) * sheet->sample_scale;
-#ifdef LENS
-    return LANED(lens_straighten)(x, y, sheet->lens);
+#if defined(LENS)
+    const reals square = LANED(lens_straighten)(x, y, sheet->lens);
+    *folded = mask_of(square >= sheet->lens[LENS_FOLD_SQUARE]);
+    return square;
+#elif defined(CAMERA)
+    const reals square = *x * *x + *y * *y;
+    reals back_x, back_y;
+    *folded = sheet_correction(position, sample, sheet, &back_x, &back_y);
+    *x += back_x * sheet->camera[SHEET_OF_POSITION(CAMERA_FOCAL)];
+    *y += back_y * sheet->camera[SHEET_OF_SAMPLE(CAMERA_FOCAL)];
+    return square;
 #else
+    *folded = 0;
     return *x * *x + *y * *y;
 #endif
 }
 
 // Compute G and H (NaN where the status is not 0) and return the status: NOT_FINITE; NOT_INVERTIBLE: beyond the fold of
-// the lens; HORIZON: the ray does not meet the sheet in front of the sensor, or meets it too far away.
+// the lens or behind the tilted sensor; HORIZON: the ray does not meet the sheet in front of the sensor, or meets it too
+// far away.
 static inline bytes sheet_point(reals position, reals sample, constant SheetTable *sheet, reals *g, reals *h) {
     constant real *in_w = sheet->w_terms, *in_g = sheet->g_terms, *in_h = sheet->h_terms;
     reals x, y;
-    const reals square = sheet_place(position, sample, sheet, &x, &y);
+    masks folded;
+    const reals square = sheet_place(position, sample, sheet, &x, &y, &folded);
     const reals w = 1 + in_w[0] * x + in_w[1] * y;
     const reals p = x / w, q = y / w;
     *g = in_g[0] + (in_g[1] * p + in_g[2] * q);
     *h = in_h[0] + (in_h[1] * p + in_h[2] * q);
     const masks lost = mask_of(as_masks(square) >= SHEET_REACH);
     const masks hidden = mask_of(w <= sheet->horizon);
-#ifdef LENS
-    const masks folded = mask_of(square >= sheet->lens[LENS_FOLD_SQUARE]);
-#else
-    const masks folded = 0;
-#endif
     const masks flagged = lost | hidden | folded;
     bytes status = STATUS_OK;
     // Flags are rare, and computing them takes half as long as the geometry: skip it where no lane has a flag.
@@ -86,17 +122,39 @@ static inline reals sheet_parameter_variance(constant real *factor, reals p, rea
     return first * first + second * second + third * third + fourth * fourth + fifth * fifth;
 }
 
+// Convert a gradient over the undistorted (x, y) to the gradient over the measured (x, y).
+static inline void sheet_pull_back(reals position, reals sample, constant SheetTable *sheet, reals *slope_x,
+                                   reals *slope_y) {
+#if defined(LENS)
+    const reals measured_x = (position - sheet->position_origin) * sheet->position_scale;
+    const reals measured_y = (sample - sheet->sample_origin) * sheet->sample_scale;
+    LANED(lens_pull_back)(measured_x, measured_y, sheet->lens, slope_x, slope_y);
+#elif defined(CAMERA)
+    // The gradient over normalised coordinates is the gradient over (x, y) times the focal lengths.
+    const real focal_x = sheet->camera[SHEET_OF_POSITION(CAMERA_FOCAL)];
+    const real focal_y = sheet->camera[SHEET_OF_SAMPLE(CAMERA_FOCAL)];
+    reals back_x, back_y;
+    sheet_correction(position, sample, sheet, &back_x, &back_y);
+    *slope_x *= focal_x;
+    *slope_y *= focal_y;
+#ifdef SHEET_ROWS
+    LANED(camera_pull_back)(position, sample, back_x, back_y, sheet->camera, slope_x, slope_y);
+#else
+    LANED(camera_pull_back)(sample, position, back_y, back_x, sheet->camera, slope_y, slope_x);
+#endif
+    *slope_x /= focal_x;
+    *slope_y /= focal_y;
+#endif
+}
+
 // Compute the standard deviation of G or H, given its terms and factor, at (p, q) with denominator w, for the standard
 // deviations sigma_x and sigma_y of the measured x and y.
-static inline reals sheet_sigma_of(constant real *terms, constant real *factor, reals measured_x, reals measured_y,
-                                   reals p, reals q, reals w, reals sigma_x, reals sigma_y,
-                                   constant SheetTable *sheet) {
+static inline reals sheet_sigma_of(constant real *terms, constant real *factor, reals position, reals sample, reals p,
+                                   reals q, reals w, reals sigma_x, reals sigma_y, constant SheetTable *sheet) {
     const reals offset = terms[1] * p + terms[2] * q;
     reals slope_x = (terms[1] - offset * sheet->w_terms[0]) / w;
     reals slope_y = (terms[2] - offset * sheet->w_terms[1]) / w;
-#ifdef LENS
-    LANED(lens_pull_back)(measured_x, measured_y, sheet->lens, &slope_x, &slope_y);
-#endif
+    sheet_pull_back(position, sample, sheet, &slope_x, &slope_y);
     slope_x *= sigma_x;
     slope_y *= sigma_y;
     reals variance = slope_x * slope_x + slope_y * slope_y;
@@ -111,17 +169,14 @@ static inline reals sheet_sigma_of(constant real *terms, constant real *factor, 
 static inline void sheet_sigma(reals position, reals sample, reals sigma_position, reals sigma_sample,
                                constant SheetTable *sheet, reals *sigma_g, reals *sigma_h) {
     reals x, y;
-    sheet_place(position, sample, sheet, &x, &y);
+    masks folded;
+    sheet_place(position, sample, sheet, &x, &y, &folded);
     const reals w = 1 + sheet->w_terms[0] * x + sheet->w_terms[1] * y;
     const reals p = x / w, q = y / w;
-    const reals measured_x = (position - sheet->position_origin) * sheet->position_scale;
-    const reals measured_y = (sample - sheet->sample_origin) * sheet->sample_scale;
     const reals sigma_x = sigma_position * sheet->position_scale;
     const reals sigma_y = sigma_sample * sheet->sample_scale;
-    *sigma_g =
-        sheet_sigma_of(sheet->g_terms, sheet->factor_g, measured_x, measured_y, p, q, w, sigma_x, sigma_y, sheet);
-    *sigma_h =
-        sheet_sigma_of(sheet->h_terms, sheet->factor_h, measured_x, measured_y, p, q, w, sigma_x, sigma_y, sheet);
+    *sigma_g = sheet_sigma_of(sheet->g_terms, sheet->factor_g, position, sample, p, q, w, sigma_x, sigma_y, sheet);
+    *sigma_h = sheet_sigma_of(sheet->h_terms, sheet->factor_h, position, sample, p, q, w, sigma_x, sigma_y, sheet);
 }
 
 #endif

@@ -211,7 +211,7 @@ def test_lens_is_undone_in_the_fit(rng: np.random.Generator) -> None:
     assert fitted.model == "C4"
     np.testing.assert_allclose(fitted.to_sensor(SHEET), seen, rtol=0, atol=1e-14)
     noisy = seen + rng.normal(0.0, 0.01 * SIGMA, seen.shape)
-    without, with_lens = fit_models(noisy, SHEET), fit_models(noisy, SHEET, lens=lens.swapped())
+    without, with_lens = fit_models(noisy, SHEET), fit_models(noisy, SHEET, distortion=lens.swapped())
     assert without[-1].rms > 10.0 * with_lens[-1].rms
 
 

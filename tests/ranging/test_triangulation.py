@@ -36,8 +36,8 @@ def scanner(**more: Any) -> Triangulation:
     down = np.array([[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]])
     turn = np.array([[math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0], [0, 0, 1]])
     upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    options = {"camera": CAMERA, "region": REGION, **more}
-    return Triangulation.from_camera(options.pop("camera"), turn @ down @ upright, [0.01, 0.02, 0.3], **options)
+    options = {"matrix": CAMERA, "region": REGION, **more}
+    return Triangulation.from_camera(options.pop("matrix"), turn @ down @ upright, [0.01, 0.02, 0.3], **options)
 
 
 def oracle(operation: Triangulation, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -140,7 +140,7 @@ def test_single_precision_stays_near_rounding_far_from_the_origin(device: Device
     # accuracy.
     region = ((3000.0, 3255.0), (4000.0, 4063.0))
     moved = np.array([[1.0, 0.0, 3400.0], [0.0, 1.0, 2600.0], [0.0, 0.0, 1.0]]) @ CAMERA
-    operation = scanner(region=region, camera=moved)
+    operation = scanner(region=region, matrix=moved)
     # Quarter pixels near 4000 are exact in single precision.
     u = (rng.integers(12000, 13020, 4000) / 4.0).astype(np.float32)
     v = (rng.integers(16000, 16252, 4000) / 4.0).astype(np.float32)
@@ -272,7 +272,11 @@ def test_fused_strips_take_positions_and_sample_numbers(
     axes = SampleAxes(sample_origin=1100.0, sample_pitch=-4.0, position_origin=40.0, position_pitch=0.5)
     covariance = np.diag(rng.uniform(1e-12, 1e-10, 8))
     operation = scanner(lens=lens, covariance=tuple(map(tuple, covariance)), sigma=(0.05, 0.2))
-    defines = {**operation.defines, "VECTOR_VARIANT": None, **({"REAL_IS_DOUBLE": None} if dtype == np.float64 else {})}
+    defines = {
+        **operation.defines(dtype),
+        "VECTOR_VARIANT": None,
+        **({"REAL_IS_DOUBLE": None} if dtype == np.float64 else {}),
+    }
     program = cl.Program(device.context, FUSED).build([*options(defines), "-I", str(KERNEL_FOLDER)])
     position = rng.uniform(0.0, 1800.0, 256).astype(dtype)
     position[[17, 200]] = math.nan

@@ -70,3 +70,42 @@ def fold_radius(angle: float, distortion: ArrayLike, farthest: float, steps: int
     radii = np.linspace(0.0, farthest, steps).astype(np.longdouble)
     negative = determinant(radii * np.cos(angle), radii * np.sin(angle), distortion) <= 0
     return float(radii[np.argmax(negative)]) if negative.any() else np.inf
+
+
+def undistort_pixels(points: ArrayLike, matrix: ArrayLike, distortion: ArrayLike, steps: int = 32) -> Points:
+    """Return the ideal pixels (same camera matrix) of measured pixels (n, 2); NaN where there is none.
+
+    The target moves from the centre to the measured point in ``steps`` parts; Newton steps with derivatives by complex
+    steps follow it, so that the solution stays on the branch of the centre. Pixels behind the tilted sensor, and pixels
+    whose path meets a determinant that is not positive, have no ideal pixel.
+    """
+    coefficients = np.asarray(distortion, np.longdouble)
+    (fx, _, cx), (_, fy, cy), _ = np.asarray(matrix, np.longdouble)
+    u, v = np.asarray(points, np.longdouble).T
+    a, b, behind = _untilt((u - cx) / fx, (v - cy) / fy, *coefficients[12:])
+    x, y = np.zeros_like(a), np.zeros_like(b)
+    lost, tiny = behind.copy(), np.longdouble(1e-30)
+    with np.errstate(all="ignore"):
+        for share in np.linspace(0.0, 1.0, steps + 1)[1:]:
+            for _ in range(4 if share < 1.0 else 8):
+                at = distort(x, y, coefficients)
+                by_x = [each.imag / tiny for each in distort(x + 1j * tiny, y + 0j, coefficients)]
+                by_y = [each.imag / tiny for each in distort(x + 0j, y + 1j * tiny, coefficients)]
+                area = by_x[0] * by_y[1] - by_y[0] * by_x[1]
+                p, q = share * a - at[0], share * b - at[1]
+                x, y = x + (by_y[1] * p - by_y[0] * q) / area, y + (by_x[0] * q - by_x[1] * p) / area
+                lost |= ~(area > 0)
+        at = distort(x, y, coefficients)
+        lost |= ~(np.hypot(at[0] - a, at[1] - b) <= 1e-15 * (1 + np.hypot(a, b)))
+    return np.stack([np.where(lost, np.nan, fx * x + cx), np.where(lost, np.nan, fy * y + cy)], -1)
+
+
+def _untilt(x: Points, y: Points, tau_x: Any, tau_y: Any) -> tuple[Points, Points, NDArray[np.bool_]]:
+    """Return the inverse of `tilt`, and where the ray through the sensor's point does not meet the untilted plane."""
+    cx, sx, cy, sy = (f(np.longdouble(t)) for t in (tau_x, tau_y) for f in (np.cos, np.sin))
+    # R = Ry(tauY) Rx(tauX); the sensor's plane lies at distance r22 along its own axis, shifted by (r02, r12).
+    r = [[cy, sy * sx, -sy * cx], [0, cx, sx], [sy, -cy * sx, cy * cx]]
+    s, t, w = x + r[0][2], y + r[1][2], r[2][2]
+    back = [r[0][i] * s + r[1][i] * t + r[2][i] * w for i in range(3)]
+    with np.errstate(all="ignore"):
+        return back[0] / back[2], back[1] / back[2], ~(back[2] > 0)

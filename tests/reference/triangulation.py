@@ -1,4 +1,4 @@
-"""Reference of the triangulation: undo the lens, multiply by the homography, divide.
+"""Reference of the triangulation: undo the lens or the camera, multiply by the homography, divide.
 
 References
 ----------
@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from gpuvision.reference.camera import undistort_pixels
 
 Float64 = NDArray[np.float64]
 NOT_FINITE, HORIZON, NOT_INVERTIBLE = 8, 32, 128
@@ -44,6 +46,7 @@ def triangulate(
     *,
     horizon: float = 1e-3,
     lens: tuple[float, float, tuple[float, float]] | None = None,
+    camera: tuple[Any, Any] | None = None,
     along: str = "columns",
 ) -> tuple[Float64, Float64, NDArray[np.uint8]]:
     """Return the coordinates in the sheet of light, and the status.
@@ -60,6 +63,8 @@ def triangulate(
         Smallest denominator, as a fraction of that in the middle of the region; below it the status is HORIZON.
     lens : tuple, optional
         k1, k2, (C_c, R_c).
+    camera : tuple, optional
+        Camera matrix (3, 3) and OpenCV's 14 coefficients, instead of a lens.
     along : str
         "columns" or "rows": direction of a profile in the image.
 
@@ -81,6 +86,12 @@ def triangulate(
             column, row = (v, u) if along == "columns" else (u, v)
             status = np.where(is_beyond_fold(column, row, k1, k2, centre), NOT_INVERTIBLE, status)
             column, row = undistort(column, row, k1, k2, centre)
+            straight_u, straight_v = (row, column) if along == "columns" else (column, row)
+        if camera is not None:
+            column, row = (v, u) if along == "columns" else (u, v)
+            pixels = np.stack([column.ravel(), row.ravel()], -1)
+            column, row = undistort_pixels(pixels, *camera).T.reshape(2, *u.shape)
+            status = np.where(np.isnan(column), NOT_INVERTIBLE, status)
             straight_u, straight_v = (row, column) if along == "columns" else (column, row)
         g, h, w = (line[0] * straight_u + line[1] * straight_v + line[2] for line in matrix)
         hidden = w / (matrix[2] @ middle) <= horizon

@@ -452,3 +452,79 @@ def test_the_lens_of_a_calibration_for_other_images_is_refused(tmp_path: Path) -
         with_lens_file(tmp_path, lens=Camera(matrix=((900.0, 0.0, 240.0), (0.0, 900.0, 32.0), (0.0, 0.0, 1.0))))
     with pytest.raises(DescriptionError, match=r"unknown key 'lens\.k1'"):
         sensor_of(changed("camera_line", lens={"file": "lens.toml", "k1": 0.1}))
+
+
+# ---- calibrated camera --------------------------------------------------------------------------------------
+
+
+TILTED_CAMERA = Camera(
+    matrix=((905.0, 0.0, 251.0), (0.0, 900.0, 36.0), (0.0, 0.0, 1.0)),
+    distortion=(-0.1, 0.05, 1e-3, -2e-3, *(0.0,) * 8, 0.3, -0.05),
+)
+SHEET_POSE = {"sheet_origin": [0.001, 0.0, 0.3], "g_axis": [1.0, 0.0, 0.0], "h_axis": [0.0, -0.6, -0.8]}
+
+
+def with_camera(camera: dict[str, Any], folder: Path = Path(), **values: Any) -> Sensor:
+    """Return the shipped camera sensor with a table [camera] and the pose of the sheet in the camera frame."""
+    table = changed("camera_line", **{"axes": None, "lens": None, "triangulation": SHEET_POSE, **values})
+    return Sensor.from_section(Section(table | {"camera": camera}, "sensor.toml", folder=folder))
+
+
+def test_a_calibrated_camera_by_its_keys_and_by_its_file(tmp_path: Path) -> None:
+    """Both ways project a point of the sheet onto the pixel that the camera projects it to."""
+    write_lens(tmp_path / "camera.toml", TILTED_CAMERA, {"image": {"size": [480, 64]}, "fit": {"rms_px": 0.1}})
+    inline = with_camera(TILTED_CAMERA.to_dict())
+    assert with_camera({"file": "camera.toml"}, tmp_path) == inline
+    triangulation = inline.readout.triangulation
+    assert triangulation is not None
+    assert triangulation.camera == TILTED_CAMERA
+    assert triangulation.region == ((0.0, 63.0), (0.0, 479.0))
+    sheet = np.random.default_rng(1).uniform((-0.05, -0.005), (0.05, 0.005), (50, 2))
+    scene = np.array(SHEET_POSE["sheet_origin"]) + sheet @ np.array([SHEET_POSE["g_axis"], SHEET_POSE["h_axis"]])
+    np.testing.assert_allclose(triangulation.to_sensor(sheet), TILTED_CAMERA.project(scene)[:, ::-1], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("way", ["inline", "file"])
+def test_the_window_of_a_calibrated_camera(tmp_path: Path, way: str) -> None:
+    write_lens(tmp_path / "camera.toml", TILTED_CAMERA, {"image": {"size": [1920, 1080]}})
+    camera: dict[str, Any] = {"file": "camera.toml"} if way == "file" else TILTED_CAMERA.to_dict()
+    sensor = with_camera({**camera, "window": [12.0, 7.0]}, tmp_path)
+    assert sensor.readout.triangulation is not None
+    assert sensor.readout.triangulation.camera == TILTED_CAMERA.in_window((12.0, 7.0))
+
+
+def test_other_ways_to_give_the_sheet_of_a_calibrated_camera() -> None:
+    by_pose = with_camera(TILTED_CAMERA.to_dict()).readout.triangulation
+    assert by_pose is not None
+    sheet = np.random.default_rng(1).uniform((-0.05, -0.005), (0.05, 0.005), (50, 2))
+    sensor = by_pose.to_sensor(sheet)
+    ways = {
+        "homography": {"homography": [list(row) for row in by_pose.homography]},
+        "points": {"points": np.column_stack([sensor, sheet]).tolist()},
+    }
+    for name, table in ways.items():
+        found = with_camera(TILTED_CAMERA.to_dict(), triangulation=table).readout.triangulation
+        assert found is not None
+        np.testing.assert_allclose(found.to_sensor(sheet), sensor, rtol=0, atol=1e-6, err_msg=name)
+
+
+def test_errors_of_a_calibrated_camera(tmp_path: Path) -> None:
+    camera = TILTED_CAMERA.to_dict()
+    write_lens(tmp_path / "camera.toml", TILTED_CAMERA, {"image": {"size": [1920, 1080]}})
+    write_lens(tmp_path / "lens.toml", PIXEL_LENS, {})
+    with pytest.raises(DescriptionError, match=r"images of 1920 x 1080 pixels, .* give camera\.window"):
+        with_camera({"file": "camera.toml"}, tmp_path)
+    with pytest.raises(DescriptionError, match=r"has a table \[lens\], expected \[camera\]"):
+        with_camera({"file": "lens.toml"}, tmp_path)
+    with pytest.raises(DescriptionError, match=r"unknown key 'camera\.k1'"):
+        with_camera({"file": "camera.toml", "k1": 0.1}, tmp_path)
+    with pytest.raises(DescriptionError, match=r"\[lens\] and \[camera\] exclude each other"):
+        with_camera(camera, lens={"k1": 1e-8})
+    with pytest.raises(DescriptionError, match=r"\[axes\] and \[camera\] exclude each other"):
+        with_camera(camera, axes={"sample_pitch": 2.0})
+    with pytest.raises(DescriptionError, match=r"has no geometry, expected one of homography, points, sheet_origin"):
+        with_camera(camera, triangulation={"baseline": 0.1, "stand_off": 0.2, "focal_distance": 900.0})
+    with pytest.raises(DescriptionError, match=r"unknown key 'camera'"):
+        sensor_of(changed("psd_line") | {"camera": camera})
+    with pytest.raises(DescriptionError, match=r"camera: Camera.matrix has focal lengths -1"):
+        with_camera({"matrix": [[-1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]})

@@ -308,7 +308,7 @@ def height_secant(triangulation: Triangulation, u: npt.ArrayLike, other_u: npt.A
     other, _ = _lifted(triangulation, other_u, v)
     distance = other_u - u
     move = np.zeros((*u.shape, 2))
-    lens = triangulation.sensor_lens
+    lens = triangulation.distortion
     if lens is None:
         move[..., 0] = 1.0
     else:
@@ -332,7 +332,7 @@ def height_slope(view: SensorView, truth: GroundTruth) -> tuple[Float64, Float64
 def _lifted(triangulation: Triangulation, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Float64, Float64]:
     """Return undistorted positions in homogeneous coordinates, (..., 3), and the distorted ones, (..., 2)."""
     sensor = np.stack(np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64)), axis=-1)
-    lens = triangulation.sensor_lens
+    lens = triangulation.distortion
     straight = sensor if lens is None else lens.undistort(sensor)
     return np.concatenate([straight, np.ones((*straight.shape[:-1], 1))], axis=-1), sensor
 

@@ -1,0 +1,135 @@
+"""Poses of a calibrated camera's views: their noise for a known camera, and their dependence on the camera.
+
+A bundle adjustment couples the poses of all views through the camera's parameters. To first order the pose of a view is
+
+    pose = (noise of the view's own points) + derivative @ (error of the camera's parameters),
+
+where ``derivative = -H_pp^-1 H_pc`` follows from the blocks of the normal equations, and ``sigma^2 H_pp^-1`` is the
+covariance of the first part. The errors of the first part are independent between views. The second part is common to
+all views, so quantities that combine several views (a laser plane, a transport direction) need both parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.camera.camera import COEFFICIENT_NAMES, Camera
+from gpuvision.camera.tilted_projection import Floats
+from gpuvision.camera.views.camera_fit import CameraFit, Pose
+
+# Length of a residual [standard deviations of a coordinate] above which a point is an outlier, which a robust loss has
+# not used. Derived: one of 1e5 points at normal noise.
+_OUTLIER = 5.0
+# Columns of OpenCV's Jacobian of projected points: rotation 3, translation 3, fx, fy, cx, cy, coefficients.
+_TRANSLATION, _FX, _COEFFICIENTS = 3, 6, 10
+
+
+class PoseResponse(NamedTuple):
+    """Pose of a target for a known camera, and its dependence on the camera.
+
+    A change of a pose is a rotation vector [rad], applied from the left in the camera's frame, and a translation [m].
+
+    Attributes
+    ----------
+    pose : Pose
+        Pose of the target in the camera's frame.
+    covariance : numpy.ndarray
+        (6, 6): covariance of the pose if the camera is known exactly.
+    by_camera : numpy.ndarray
+        (6, m): derivative of the pose by the m camera parameters `CameraFit.names`.
+    """
+
+    pose: Pose
+    covariance: Floats
+    by_camera: Floats
+
+
+def pose_responses(fit: CameraFit, views: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]) -> tuple[PoseResponse, ...]:
+    """Return noise and camera dependence of the pose of every view of a calibration.
+
+    Parameters
+    ----------
+    fit : CameraFit
+        Result of `fit_camera`.
+    views : sequence of View
+        Views that `fit_camera` got, in the same order.
+
+    Returns
+    -------
+    tuple of PoseResponse
+        One per view.
+    """
+    responses = []
+    for pose, (target, _), errors in zip(fit.poses, views, fit.residuals, strict=True):
+        used = np.linalg.norm(errors, axis=1) < _OUTLIER * max(fit.sigma_px, np.finfo(float).tiny)
+        points = np.zeros((np.count_nonzero(used), 3))
+        points[:, :2] = np.asarray(target, dtype=np.float64)[used, :2]
+        by_pose, by_camera = _projection_derivatives(fit.camera, fit.names, pose, points)
+        inverse: Floats = np.linalg.inv(by_pose.T @ by_pose).astype(np.float64)
+        responses.append(PoseResponse(pose, fit.sigma_px**2 * inverse, -inverse @ by_pose.T @ by_camera))
+    return tuple(responses)
+
+
+def _projection_derivatives(camera: Camera, names: Sequence[str], pose: Pose, points: Floats) -> tuple[Floats, Floats]:
+    """Return the derivatives (2 n, 6) and (2 n, m) of projected points by the pose and by camera parameters."""
+    rotated = points @ pose.rotation.T
+    vector = cv2.Rodrigues(pose.rotation)[0]
+    matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
+    slopes = np.asarray(cv2.projectPoints(points, vector, pose.translation, matrix, distortion)[1], dtype=np.float64)
+    by_place = slopes[:, _TRANSLATION : _TRANSLATION + 3].reshape(-1, 2, 3)
+    # A rotation vector w from the left moves a point by w x (R X).
+    by_rotation = np.cross(rotated[:, None, :], by_place)
+    by_pose = np.concatenate([by_rotation, by_place], axis=2).reshape(-1, 6)
+    return by_pose, np.column_stack([_column(slopes, name) for name in names])
+
+
+def _column(slopes: Floats, name: str) -> Floats:
+    if name == "f":
+        return np.asarray(slopes[:, _FX] + slopes[:, _FX + 1])
+    place = ("fx", "fy", "cx", "cy").index(name) + _FX if name[0] in "fc" else _COEFFICIENTS + _place(name)
+    return np.asarray(slopes[:, place])
+
+
+def _place(name: str) -> int:
+    return COEFFICIENT_NAMES.index(name)
+
+
+def change_camera(camera: Camera, name: str, change: float) -> Camera:
+    """Return a camera with one parameter changed, by its name in `CameraFit.names`."""
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix
+    numbers = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **dict(zip(COEFFICIENT_NAMES, camera.distortion, strict=True))}
+    for each in ("fx", "fy") if name == "f" else (name,):
+        numbers[each] += change
+    return Camera(
+        matrix=((numbers["fx"], 0.0, numbers["cx"]), (0.0, numbers["fy"], numbers["cy"]), (0.0, 0.0, 1.0)),
+        distortion=tuple(numbers[each] for each in COEFFICIENT_NAMES),
+    )
+
+
+def ray_derivatives(camera: Camera, names: Sequence[str], points: npt.ArrayLike) -> Floats:
+    """Return the derivatives (n, 3, m) of the unit viewing directions of measured points by camera parameters.
+
+    Central differences. The step is 1e-3 px for lengths in pixels and 1e-6 for coefficients and angles; the rounding
+    of the inverse lens (1e-15) leaves a relative error of 1e-8.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera.
+    names : sequence of str
+        Names of the parameters, as in `CameraFit.names`.
+    points : array_like
+        (n, 2): measured (column, row) [px].
+    """
+    measured = np.asarray(points, dtype=np.float64)
+    columns = []
+    for name in names:
+        step = 1e-3 if name[0] in "fc" else 1e-6
+        ends = [change_camera(camera, name, sign * step).rays(measured) for sign in (1.0, -1.0)]
+        columns.append((ends[0] - ends[1]) / (2.0 * step))
+    return np.stack(columns, axis=-1) if columns else np.zeros((len(measured), 3, 0))

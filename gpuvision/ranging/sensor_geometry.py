@@ -1,0 +1,149 @@
+"""Geometry of a calibrated laser sensor: camera, sheet of light and transport, with their joint covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.views.pose_response import ray_derivatives
+from gpuvision.ranging.sheet_calibration import SheetFit
+from gpuvision.ranging.transport_calibration import TransportFit
+
+Float64 = npt.NDArray[np.float64]
+
+TRANSPORT_PARAMETERS = ("step_g", "step_h", "step_d")
+"""Names of the components of the transport's step along the axes g, h and d = g x h of the sheet [m per profile]."""
+
+# Newton steps from the plane to a bent sheet. Derived: each step squares the error; bends are below 1 % of the range.
+_BEND_STEPS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorGeometry:
+    """Camera, sheet of light and transport of a laser sensor.
+
+    The scene has y along the transport, z up (towards the camera, perpendicular to y, as near to the sheet's h as
+    possible; or the normal of the surface of the stage), and x to the right of both. Its origin is the origin of the
+    sheet, or a point on the surface of the stage.
+
+    Parameters
+    ----------
+    camera : Camera
+        Calibrated camera.
+    camera_names : tuple of str
+        Parameters of the camera with a covariance.
+    camera_covariance : numpy.ndarray
+        (m, m): covariance of these parameters.
+    sheet : SheetFit
+        Sheet of light in the camera's frame.
+    transport : TransportFit or None
+        Measured transport; None if it is assumed to be perpendicular to the sheet.
+    step : float
+        Transport per profile [m]: measured, or given.
+    zero_at_stage : bool
+        Whether z = 0 is the plane of the target in the transport views. Default False.
+    """
+
+    camera: Camera
+    camera_names: tuple[str, ...]
+    camera_covariance: Float64
+    sheet: SheetFit
+    transport: TransportFit | None
+    step: float
+    zero_at_stage: bool = False
+
+    @cached_property
+    def direction(self) -> Float64:
+        """Unit vector of the transport in the camera's frame."""
+        return -self.sheet.normal if self.transport is None else self.transport.direction
+
+    @cached_property
+    def scene_axes(self) -> Float64:
+        """Axes x, y, z of the scene in the camera's frame: the rows of the rotation from camera to scene."""
+        y = self.direction
+        up = self.sheet.h_axis
+        if self.zero_at_stage and self.transport is not None:
+            up = self.transport.normal * np.sign(self.transport.normal @ up)
+        z = up - (up @ y) * y
+        z = z / np.linalg.norm(z)
+        return np.stack([np.cross(y, z), y, z])
+
+    @cached_property
+    def scene_origin(self) -> Float64:
+        """Origin of the scene in the camera's frame [m]."""
+        if not self.zero_at_stage or self.transport is None:
+            return self.sheet.origin
+        z = self.scene_axes[2]
+        return np.asarray(self.sheet.origin + ((self.transport.middle - self.sheet.origin) @ z) * z)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters of `covariance`: camera, sheet, then the transport if it was measured."""
+        return (*self.camera_names, *self.sheet.names, *(() if self.transport is None else TRANSPORT_PARAMETERS))
+
+    @cached_property
+    def covariance(self) -> Float64:
+        """Joint covariance of camera, sheet and transport, in the order of `names`."""
+        m, parts = len(self.camera_names), [np.eye(len(self.camera_names)), self.sheet.by_camera]
+        noises = [np.zeros((m, m)), self.sheet.noise_covariance]
+        if self.transport is not None:
+            to_sheet = np.stack([self.sheet.g_axis, self.sheet.h_axis, self.sheet.normal])
+            parts.append(to_sheet @ self.transport.by_camera)
+            noises.append(to_sheet @ self.transport.noise_covariance @ to_sheet.T)
+        by_camera = np.concatenate(parts)
+        total: Float64 = by_camera @ self.camera_covariance @ by_camera.T
+        first = 0
+        for each in noises:
+            total[first : first + len(each), first : first + len(each)] += each
+            first += len(each)
+        return total
+
+    def in_sheet(self, points: npt.ArrayLike) -> Float64:
+        """Return (G, H) [m] of points (..., 3) in the camera's frame."""
+        offset = np.asarray(points) - self.sheet.origin
+        return np.asarray(offset @ np.stack([self.sheet.g_axis, self.sheet.h_axis]).T)
+
+    def points(self, pixels: npt.ArrayLike) -> Float64:
+        """Return the points (..., 3) [m] of the sheet in the camera's frame that measured pixels (..., 2) see.
+
+        For a bent sheet Newton's method from the plane; three steps reach the rounding for bends far below the
+        distance of the camera.
+        """
+        ray = self.camera.rays(pixels)
+        normal = self.sheet.normal
+        point = ray * ((self.sheet.origin @ normal) / (ray @ normal))[..., None]
+        if self.sheet.bend is None:
+            return np.asarray(point)
+        for _ in range(_BEND_STEPS):
+            distance, slope = self._surface(point)
+            point = point - ray * (distance / np.sum(ray * slope, axis=-1))[..., None]
+        return np.asarray(point)
+
+    def derivatives(self, pixels: npt.ArrayLike) -> Float64:
+        """Return the derivatives (n, 3, p) of `points` of measured pixels (n, 2) by camera and sheet.
+
+        The parameters are the first p of `names`. With a part C of `covariance` for them and the noise of the readings,
+        the covariance of a point is ``D C D'`` plus the noise.
+        """
+        points = self.points(pixels)
+        ray = points / np.linalg.norm(points, axis=-1, keepdims=True)
+        slope = self._surface(points)[1]
+        steep = np.sum(ray * slope, axis=-1)[:, None, None]
+        change = ray_derivatives(self.camera, self.camera_names, pixels)
+        by_camera = change - ray[:, :, None] * (np.einsum("ni,nim->nm", slope, change)[:, None] / steep)
+        g, h = self.in_sheet(points).T
+        surface = np.stack([np.ones_like(g), g, h, g * g, g * h, h * h], axis=1)[:, : len(self.sheet.names)]
+        by_sheet = ray[:, :, None] * surface[:, None] / steep
+        return np.concatenate([np.linalg.norm(points, axis=-1)[:, None, None] * by_camera, by_sheet], axis=2)
+
+    def _surface(self, points: Float64) -> tuple[Float64, Float64]:
+        """Return the distances of points (..., 3) from the sheet along its normal, and their gradients (..., 3)."""
+        gg, gh, hh = self.sheet.bend or (0.0, 0.0, 0.0)
+        g, h = np.moveaxis(self.in_sheet(points), -1, 0)
+        distance = (points - self.sheet.origin) @ self.sheet.normal - (gg * g * g + gh * g * h + hh * h * h)
+        slope = self.sheet.normal - (2.0 * gg * g + gh * h)[..., None] * self.sheet.g_axis
+        return distance, slope - (gh * g + 2.0 * hh * h)[..., None] * self.sheet.h_axis

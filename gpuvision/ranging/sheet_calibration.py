@@ -1,0 +1,539 @@
+"""Calibration of a sheet of light: plane, or low-order surface, from laser lines on known planes.
+
+A laser line on a target of known pose gives points of the sheet in the camera's frame: the viewing ray of each reading
+meets the target's plane. `fit_sheet` fits the plane of all points, with the quadratic surface
+
+    d = offset + slope_g G + slope_h H + gg G^2 + gh G H + hh H^2            along g_axis x h_axis,
+
+in the coordinates (G, H) of the sheet. The frame of the sheet is moved until offset and slopes vanish, so that the
+sheet is the plane d = 0, or the surface of the last three terms (a bent sheet). The three terms are kept only if they
+differ significantly from zero.
+
+Three independent errors enter, and the fit weights and propagates each: the noise of the readings (independent), the
+noise of the target's pose (common to a view), and the error of the camera (common to all views). The observations of a
+view have the covariance ``D + B O B'``, with the diagonal D of the readings, the covariance O of the pose and the
+derivatives B of the distances by the pose. The result keeps the derivative by the camera's parameters.
+
+References
+----------
+K. R. Koch, *Parameter Estimation and Hypothesis Testing in Linear Models*, Springer 1999, sections 3.2 (generalised
+least squares) and 4.2 (test of a linear hypothesis).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import fdtrc
+
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.views.pose_response import PoseResponse, ray_derivatives
+
+Along = Literal["columns", "rows"]
+Float64 = npt.NDArray[np.float64]
+
+SHEET_PARAMETERS = ("offset", "slope_g", "slope_h", "gg", "gh", "hh")
+"""Names of the parameters of a sheet [m, -, -, 1/m, 1/m, 1/m]; a plane has the first three."""
+
+# Standard deviation of a normal distribution over its median absolute deviation.
+_SIGMA_OF_MAD = 1.4826
+# Tuning constant of Tukey's loss: 95 % efficiency for normal noise.
+_TUKEY = 4.685
+# Numbers that a view's line adds to the tests of the model: offset, direction and curvature of the line.
+_NUMBERS_PER_VIEW = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class SheetLimits:
+    """Thresholds of `fit_sheet`.
+
+    Attributes
+    ----------
+    significance : float
+        p-value of the F test below which the sheet is bent; as for the lens models.
+    min_readings : int
+        Fewest readings of a view that are used: they must show a line.
+    trials : int
+        Number of random triples of readings that the robust start tries. Derived: with 30 % outliers the chance that
+        every triple has an outlier is 0.66^200 < 1e-36.
+    max_iterations : int
+        Largest number of steps of the robust fit and of the final fit.
+    noise_floor_px : float
+        Least noise of a reading [px] that is assumed: real lines are not read better.
+    max_scatter_px : float
+        Robust standard deviation of the readings about the sheet [px] above which they show no sheet. Chosen: real
+        lines are read within a pixel; a laser image in a wrong pose is off by many.
+    min_spread : float
+        Ratio of the second to the first principal extent of the points below which all lines are one: a plane needs
+        targets at different distances.
+    """
+
+    significance: float = 0.001
+    min_readings: int = 16
+    trials: int = 200
+    max_iterations: int = 30
+    noise_floor_px: float = 1e-4
+    max_scatter_px: float = 2.0
+    min_spread: float = 0.02
+
+
+DEFAULT_LIMITS = SheetLimits()
+
+
+class LaserLine(NamedTuple):
+    """Readings of the laser line on one target.
+
+    Attributes
+    ----------
+    points : numpy.ndarray
+        (n, 2): measured (column, row) of the line [px].
+    target : PoseResponse
+        Pose of the target (its plane is Z = 0), the covariance of the pose, and its derivative by the camera.
+    """
+
+    points: Float64
+    target: PoseResponse
+
+
+class BendTest(NamedTuple):
+    """Test of the bend of a sheet against a plane.
+
+    Attributes
+    ----------
+    bend : (float, float, float)
+        (gg, gh, hh) of the fit with a bend [1/m].
+    sigma : (float, float, float)
+        Standard deviations, with the error of the camera [1/m].
+    f_value, p_value : float
+        F statistic of "no bend", and the probability of at least this value for a plane.
+    significant : bool
+        Whether the sheet keeps the bend.
+    """
+
+    bend: tuple[float, float, float]
+    sigma: tuple[float, float, float]
+    f_value: float
+    p_value: float
+    significant: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class SheetFit:
+    """Sheet of light in the camera's frame.
+
+    Attributes
+    ----------
+    origin, g_axis, h_axis : numpy.ndarray
+        (3,): point G = H = 0 [m], and unit vectors along G and H. G follows the samples of the image, H leads towards
+        the camera.
+    bend : (float, float, float) or None
+        (gg, gh, hh) [1/m]; None for a plane.
+    names : tuple of str
+        Fitted parameters, the first ones of `SHEET_PARAMETERS`.
+    noise_covariance : numpy.ndarray
+        (p, p): covariance of the parameters for a known camera.
+    by_camera : numpy.ndarray
+        (p, m): derivative of the parameters by the camera's parameters.
+    sigma_px : float
+        Noise of a reading across the line [px].
+    view_ratio : float
+        Reduced chi-square of the lines of the views about the sheet; `noise_covariance` includes it if it is above 1.
+    bend_test : BendTest or None
+        Test of the bend; None with too few views.
+    residuals : tuple of numpy.ndarray
+        Per view (n,): distance of each reading from the sheet's line [px]; NaN for outliers.
+    coordinates : tuple of numpy.ndarray
+        Per view (n, 2): G and H of each reading [m].
+    """
+
+    origin: Float64
+    g_axis: Float64
+    h_axis: Float64
+    bend: tuple[float, float, float] | None
+    names: tuple[str, ...]
+    noise_covariance: Float64
+    by_camera: Float64
+    sigma_px: float
+    view_ratio: float
+    bend_test: BendTest | None
+    residuals: tuple[Float64, ...]
+    coordinates: tuple[Float64, ...]
+
+    @property
+    def normal(self) -> Float64:
+        """Direction of d: ``g_axis x h_axis``."""
+        return np.cross(self.g_axis, self.h_axis)
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square residual of the readings that are no outliers [px]."""
+        return float(np.sqrt(np.nanmean(np.concatenate(self.residuals) ** 2)))
+
+    @property
+    def outliers(self) -> int:
+        """Number of readings that the fit rejected."""
+        return int(np.count_nonzero(np.isnan(np.concatenate(self.residuals))))
+
+    def covariance(self, camera: npt.ArrayLike) -> Float64:
+        """Return the covariance (p, p) of the parameters for a camera with a covariance (m, m)."""
+        total: Float64 = self.noise_covariance + self.by_camera @ np.asarray(camera) @ self.by_camera.T
+        return total
+
+
+class _Frame(NamedTuple):
+    """Frame of the sheet: origin and axes g, h (rows of ``axes``: g, h, normal)."""
+
+    origin: Float64
+    axes: Float64
+
+    def moved(self, change: Float64) -> _Frame:
+        """Return the frame whose plane is d = offset + slope_g G + slope_h H of this frame."""
+        offset, slope_g, slope_h = change[:3]
+        g, h, n = self.axes
+        normal = n - slope_g * g - slope_h * h
+        normal /= np.linalg.norm(normal)
+        along = g - (g @ normal) * normal
+        along /= np.linalg.norm(along)
+        return _Frame(self.origin + offset * n, np.stack([along, np.cross(normal, along), normal]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Readings:
+    """Readings of all views, and derivatives of their points.
+
+    ``ray`` are unit viewing directions, ``slope`` the change of a ray by a pixel across the line, and ``by_camera`` the
+    change of a ray by the camera's parameters. ``view`` is the number of the line.
+    """
+
+    lines: tuple[LaserLine, ...]
+    view: npt.NDArray[np.intp]
+    ray: Float64
+    slope: Float64
+    by_camera: Float64
+    point: Float64
+    normal: Float64
+    along: Float64
+    weight: Float64
+
+
+def fit_sheet(
+    camera: Camera,
+    lines: Sequence[LaserLine],
+    *,
+    along: Along = "columns",
+    names: Sequence[str] = (),
+    camera_covariance: npt.ArrayLike | None = None,
+    limits: SheetLimits = DEFAULT_LIMITS,
+) -> SheetFit:
+    """Fit a sheet of light to laser lines on targets of known pose.
+
+    Parameters
+    ----------
+    camera : Camera
+        Calibrated camera.
+    lines : sequence of LaserLine
+        Readings of the laser line, two targets at least.
+    along : {"columns", "rows"}
+        Image axis along which the line runs: its readings are rows ("columns") or columns ("rows").
+    names : sequence of str
+        Parameters of the camera with a covariance, as in `CameraFit.names`.
+    camera_covariance : array_like, optional
+        (m, m): covariance of these parameters. Default: the camera is known.
+    limits : SheetLimits
+        Thresholds.
+
+    Returns
+    -------
+    SheetFit
+
+    Raises
+    ------
+    ValueError
+        The readings do not determine a plane; the message names the missing data.
+    """
+    covariance = np.zeros((len(names), len(names))) if camera_covariance is None else np.asarray(camera_covariance)
+    readings = _triangulated(camera, lines, along, tuple(names), limits)
+    frame = _oriented(_robust_plane(readings, limits), readings)
+    frame, readings, sigma = _robust_fit(frame, readings, limits)
+    plane = _Solution.of(frame, readings, sigma, 3, limits)
+    bent = None
+    if _NUMBERS_PER_VIEW * len(readings.lines) > len(SHEET_PARAMETERS):
+        bent = _Solution.of(plane.frame, readings, sigma, len(SHEET_PARAMETERS), limits)
+    test = None if bent is None else _test_bend(bent, covariance, limits)
+    chosen = bent if bent is not None and test is not None and test.significant else plane
+    return _result(chosen, test, sigma, [len(each.points) for each in lines])
+
+
+def _triangulated(
+    camera: Camera, lines: Sequence[LaserLine], along: Along, names: tuple[str, ...], limits: SheetLimits
+) -> _Readings:
+    """Intersect the viewing rays of all readings with their target's plane."""
+    used = [each for each in lines if len(each.points) >= limits.min_readings]
+    if len(used) < 2:
+        raise ValueError(
+            f"the laser line was read on {len(used)} targets, expected two at least, at different distances"
+        )
+    pixels = np.concatenate([each.points for each in lines])
+    view = np.repeat(np.arange(len(lines)), [len(each.points) for each in lines])
+    across = np.array([0.0, 0.5]) if along == "columns" else np.array([0.5, 0.0])
+    ray = camera.rays(pixels)
+    normal = np.stack([each.target.pose.rotation[:, 2] for each in lines])[view]
+    place = np.stack([each.target.pose.translation for each in lines])[view]
+    distance = np.sum(normal * place, axis=1) / np.sum(normal * ray, axis=1)
+    known = np.isfinite(distance) & (distance > 0.0)
+    return _Readings(
+        lines=tuple(lines),
+        view=view,
+        ray=ray,
+        slope=camera.rays(pixels + across) - camera.rays(pixels - across),
+        by_camera=ray_derivatives(camera, names, pixels),
+        point=ray * distance[:, None],
+        normal=normal,
+        along=pixels[:, 0 if along == "columns" else 1],
+        weight=known.astype(np.float64),
+    )
+
+
+def _robust_plane(readings: _Readings, limits: SheetLimits) -> _Frame:
+    """Return a plane by least median of squares over random triples of points.
+
+    References
+    ----------
+    P. J. Rousseeuw, Least median of squares regression, J. American Statistical Association 79 (1984) 871.
+    """
+    points = readings.point[readings.weight > 0.0]
+    random = np.random.default_rng(0)
+    triples = points[np.stack([random.permutation(len(points))[:3] for _ in range(limits.trials)])]
+    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
+    some = points[:: max(len(points) // 1000, 1)]
+    distances = np.abs(some @ normals.T - np.sum(normals * triples[:, 0], axis=1))
+    best = int(np.argmin(np.median(distances, axis=0)))
+    inside = some[distances[:, best] <= 3.0 * np.median(distances[:, best]) + np.finfo(float).tiny]
+    middle = inside.mean(axis=0)
+    _, extents, axes = np.linalg.svd(inside - middle, full_matrices=False)
+    if extents[1] < limits.min_spread * extents[0]:
+        raise ValueError(
+            "all laser lines lie on one line in space, so that the sheet is not determined; move or tilt the target "
+            "between the images"
+        )
+    return _Frame(middle, axes)
+
+
+def _oriented(frame: _Frame, readings: _Readings) -> _Frame:
+    """Turn g along the samples of the image and h towards the camera; the normal is g x h."""
+    inside = readings.weight > 0.0
+    offset, sample = readings.point[inside] - frame.origin, readings.along[inside]
+    flat = offset @ frame.axes[:2].T
+    # G is the direction in the sheet in which the sample number grows fastest.
+    growth = np.linalg.lstsq(flat, sample - sample.mean(), rcond=None)[0]
+    g = growth @ frame.axes[:2]
+    g /= np.linalg.norm(g)
+    h = np.cross(frame.axes[2], g)
+    h = h if h @ frame.origin < 0.0 else -h
+    return _Frame(frame.origin, np.stack([g, h, np.cross(g, h)]))
+
+
+class _System(NamedTuple):
+    """Distances of the readings from a surface [m], and their derivatives.
+
+    ``design`` (n, p): by the parameters of the surface, with the opposite sign. ``by_pixel`` (n,): by a pixel across
+    the line. ``by_pose`` (n, 6): by the pose of the reading's target. ``by_camera`` (n, m): by the camera, at fixed
+    poses.
+    """
+
+    distance: Float64
+    flat: Float64
+    design: Float64
+    by_pixel: Float64
+    by_pose: Float64
+    by_camera: Float64
+
+
+def _system(frame: _Frame, bend: Float64, readings: _Readings, count: int) -> _System:
+    offset = readings.point - frame.origin
+    g, h, d = (offset @ frame.axes.T).T
+    gg, gh, hh = bend
+    surface = gg * g * g + gh * g * h + hh * h * h
+    normal = (
+        frame.axes[2]
+        - (2.0 * gg * g + gh * h)[:, None] * frame.axes[0]
+        - (gh * g + 2.0 * hh * h)[:, None] * frame.axes[1]
+    )
+    # P = s ray on the plane N . P = N . T: dP = s (dray - ray (N . dray) / (N . ray)), and for the plane
+    # dP = ray (dN . (T - P) + N . dT) / (N . ray) with dN = w x N.
+    steep = np.sum(readings.normal * readings.ray, axis=1)
+    length = np.linalg.norm(readings.point, axis=1)
+    along_ray = np.sum(normal * readings.ray, axis=1) / steep
+    by_ray = length[:, None] * (normal - along_ray[:, None] * readings.normal)
+    place = np.stack([each.target.pose.translation for each in readings.lines])[readings.view]
+    by_turn = np.cross(readings.normal, place - readings.point)
+    return _System(
+        distance=d - surface,
+        flat=np.stack([g, h], axis=1),
+        design=np.stack([np.ones_like(g), g, h, g * g, g * h, h * h], axis=1)[:, :count],
+        by_pixel=np.sum(by_ray * readings.slope, axis=1),
+        by_pose=along_ray[:, None] * np.concatenate([by_turn, readings.normal], axis=1),
+        by_camera=np.einsum("ni,nim->nm", by_ray, readings.by_camera),
+    )
+
+
+def _robust_fit(frame: _Frame, readings: _Readings, limits: SheetLimits) -> tuple[_Frame, _Readings, float]:
+    """Fit the bent sheet with Tukey's loss; return frame, readings with weights 0 or 1, and the noise [px]."""
+    count = len(SHEET_PARAMETERS) if len(readings.lines) > 2 else 3
+    bend, weight, sigma = np.zeros(3), readings.weight, math.inf
+    known = readings.weight > 0.0
+    for _ in range(limits.max_iterations):
+        system = _system(frame, bend, readings, count)
+        scale = np.abs(system.by_pixel)
+        root = np.sqrt(weight) / scale
+        step = np.linalg.lstsq(system.design * root[:, None], system.distance * root, rcond=None)[0]
+        change = step.astype(np.float64)
+        frame = frame.moved(change)
+        bend = bend + (change[3:] if count > 3 else 0.0)
+        pixels = (system.distance - system.design @ change) / scale
+        before, sigma = sigma, max(_SIGMA_OF_MAD * float(np.median(np.abs(pixels[known]))), limits.noise_floor_px)
+        weight = known * np.clip(1.0 - (pixels / (_TUKEY * sigma)) ** 2, 0.0, None) ** 2
+        if abs(before - sigma) <= 1e-6 * sigma:
+            break
+    if sigma > limits.max_scatter_px:
+        raise ValueError(
+            f"the laser readings lie on no common sheet: they scatter by {sigma:.3g} px; check that each laser image "
+            "shows the target in the pose of its target image"
+        )
+    kept = (weight > 0.0).astype(np.float64)
+    readings = replace(readings, weight=kept)
+    return frame, readings, _noise_within_views(pixels, readings, limits)
+
+
+def _noise_within_views(pixels: Float64, readings: _Readings, limits: SheetLimits) -> float:
+    """Return the noise of a reading [px], from residuals about a parabola in each view."""
+    total, freedom = 0.0, 0
+    for number in range(len(readings.lines)):
+        inside = (readings.view == number) & (readings.weight > 0.0)
+        if np.count_nonzero(inside) <= _NUMBERS_PER_VIEW:
+            continue
+        basis = _parabola(readings.along[inside])
+        rest = pixels[inside] - basis @ np.linalg.lstsq(basis, pixels[inside], rcond=None)[0]
+        total, freedom = total + float(rest @ rest), freedom + len(rest) - _NUMBERS_PER_VIEW
+    return max(math.sqrt(total / max(freedom, 1)), limits.noise_floor_px)
+
+
+def _parabola(along: Float64) -> Float64:
+    """Return the columns 1, t, t^2 of positions along the line, scaled to -1 to 1."""
+    t = (along - along.mean()) / max(float(np.ptp(along)) / 2.0, 1.0)
+    return np.stack([np.ones_like(t), t, t * t], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Solution:
+    """Generalised least squares fit of a plane (three parameters) or a bent sheet (six)."""
+
+    frame: _Frame
+    bend: Float64
+    system: _System
+    readings: _Readings
+    noise_covariance: Float64
+    by_camera: Float64
+    view_ratio: float
+
+    @classmethod
+    def of(cls, frame: _Frame, readings: _Readings, sigma: float, count: int, limits: SheetLimits) -> _Solution:
+        """Iterate to the frame in which offset and slopes vanish."""
+        bend = np.zeros(3)
+        for _ in range(limits.max_iterations):
+            system = _system(frame, bend, readings, count)
+            normal, side, by_camera = _normal_equations(system, readings, sigma)
+            inverse: Float64 = np.linalg.inv(normal).astype(np.float64)
+            change = inverse @ side
+            if float(change @ side) <= 1e-12:
+                break
+            frame = frame.moved(change)
+            bend = bend + (change[3:] if count > 3 else 0.0)
+        ratio = _view_ratio(system, readings, sigma, count)
+        return cls(
+            frame=frame,
+            bend=bend,
+            system=system,
+            readings=readings,
+            noise_covariance=max(ratio, 1.0) * inverse,
+            by_camera=inverse @ by_camera,
+            view_ratio=ratio,
+        )
+
+
+def _normal_equations(system: _System, readings: _Readings, sigma: float) -> tuple[Float64, Float64, Float64]:
+    """Return the normal matrix (p, p), the right-hand side (p,), and the right-hand sides (p, m) by the camera."""
+    count, others = system.design.shape[1], system.by_camera.shape[1]
+    total = np.zeros((count, count + 1 + others))
+    for number, line in enumerate(readings.lines):
+        inside = (readings.view == number) & (readings.weight > 0.0)
+        if not inside.any():
+            continue
+        root = 1.0 / (sigma * np.abs(system.by_pixel[inside]))[:, None]
+        design, pose = system.design[inside] * root, system.by_pose[inside] * root
+        by_camera = (system.by_camera[inside] + system.by_pose[inside] @ line.target.by_camera) * root
+        right = np.concatenate([design, system.distance[inside, None] * root, by_camera], axis=1)
+        # Inverse of I + B O B' by the identity of Woodbury; O stays positive definite when it is scaled by its factor.
+        reach = pose @ np.linalg.cholesky(line.target.covariance)
+        inner = np.eye(6) + reach.T @ reach
+        total += design.T @ right - (design.T @ reach) @ np.linalg.solve(inner, reach.T @ right)
+    return total[:, :count], total[:, count], total[:, count + 1 :]
+
+
+def _view_ratio(system: _System, readings: _Readings, sigma: float, count: int) -> float:
+    """Return the reduced chi-square of offset, direction and curvature of every view's line about the sheet."""
+    chi_square, freedom = 0.0, -count
+    for number, line in enumerate(readings.lines):
+        inside = (readings.view == number) & (readings.weight > 0.0)
+        if np.count_nonzero(inside) <= _NUMBERS_PER_VIEW:
+            continue
+        root = 1.0 / (sigma * np.abs(system.by_pixel[inside]))[:, None]
+        basis = _parabola(readings.along[inside]) * root * np.median(1.0 / root)
+        inverse = np.linalg.inv(basis.T @ basis)
+        measured = inverse @ basis.T @ (system.distance[inside] * root[:, 0])
+        by_pose = inverse @ basis.T @ (system.by_pose[inside] * root)
+        covariance = inverse + by_pose @ line.target.covariance @ by_pose.T
+        chi_square += float(measured @ np.linalg.solve(covariance, measured))
+        freedom += _NUMBERS_PER_VIEW
+    return chi_square / freedom if freedom > 0 else 1.0
+
+
+def _test_bend(bent: _Solution, camera: Float64, limits: SheetLimits) -> BendTest:
+    """Test whether the bend differs from zero, with the errors of readings, poses and camera."""
+    covariance = (bent.noise_covariance + bent.by_camera @ camera @ bent.by_camera.T)[3:, 3:]
+    f_value = float(bent.bend @ np.linalg.solve(covariance, bent.bend)) / 3.0
+    freedom = _NUMBERS_PER_VIEW * len(bent.readings.lines) - len(SHEET_PARAMETERS)
+    p_value = float(fdtrc(3, freedom, f_value))
+    sigmas = np.sqrt(np.diag(covariance))
+    return BendTest(_triple(bent.bend), _triple(sigmas), f_value, p_value, p_value < limits.significance)
+
+
+def _triple(values: Float64) -> tuple[float, float, float]:
+    first, second, third = values.tolist()
+    return first, second, third
+
+
+def _result(solution: _Solution, test: BendTest | None, sigma: float, lengths: Sequence[int]) -> SheetFit:
+    system, count = solution.system, solution.system.design.shape[1]
+    pixels = np.where(solution.readings.weight > 0.0, system.distance / np.abs(system.by_pixel), np.nan)
+    ends = np.cumsum(lengths)[:-1]
+    return SheetFit(
+        origin=solution.frame.origin,
+        g_axis=solution.frame.axes[0],
+        h_axis=solution.frame.axes[1],
+        bend=_triple(solution.bend) if count > 3 else None,
+        names=SHEET_PARAMETERS[:count],
+        noise_covariance=solution.noise_covariance,
+        by_camera=solution.by_camera,
+        sigma_px=sigma,
+        view_ratio=solution.view_ratio,
+        bend_test=test,
+        residuals=tuple(np.split(pixels, ends)),
+        coordinates=tuple(np.split(system.flat, ends)),
+    )

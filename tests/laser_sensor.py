@@ -1,0 +1,156 @@
+"""Synthetic laser sensor with known geometry: tilted camera, bent sheet, target poses, and the light on targets.
+
+Points are projected with OpenCV. The light on a target is found by sampling the curve in which the sheet cuts the plane
+of the target, not by intersecting viewing rays as the calibration does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from gpuvision.camera.views.planar_calibration import fit_camera
+from gpuvision.camera.views.pose_response import pose_responses
+from gpuvision.ranging.sensor_geometry import SensorGeometry
+from gpuvision.ranging.sheet_calibration import LaserLine, fit_sheet
+from gpuvision.ranging.transport_calibration import fit_transport
+
+Float64 = npt.NDArray[np.float64]
+SIZE = (640, 480)
+GRID = (11, 8)  # columns and rows of the target's points
+PITCH = 0.01
+STEP = 0.2e-3
+PROFILES_BETWEEN = 40
+
+
+@dataclass(frozen=True)
+class LaserSensor:
+    """Camera (OpenCV's matrix and coefficients), sheet d = bend(G, H) about (origin, g, h), and step per profile."""
+
+    matrix: Float64
+    distortion: Float64
+    origin: Float64
+    g: Float64
+    h: Float64
+    bend: tuple[float, float, float]
+    step: Float64
+
+    @property
+    def normal(self) -> Float64:
+        return np.cross(self.g, self.h)
+
+    def project(self, points: Float64) -> Float64:
+        """Project points (n, 3) of the camera's frame."""
+        none = np.zeros(3)
+        return cv2.projectPoints(points.reshape(-1, 1, 3), none, none, self.matrix, self.distortion)[0].reshape(-1, 2)
+
+    def surface(self, flat: Float64) -> Float64:
+        """Return the points (n, 3) of the sheet at (G, H), (n, 2)."""
+        g, h = flat.T
+        d = self.bend[0] * g * g + self.bend[1] * g * h + self.bend[2] * h * h
+        return self.origin + np.outer(g, self.g) + np.outer(h, self.h) + np.outer(d, self.normal)
+
+    def line(self, normal: Float64, place: Float64) -> Float64:
+        """Return rows of the light on the plane through `place` for all columns, NaN outside: (columns,)."""
+        g = np.linspace(-0.12, 0.12, 241)
+        h = np.zeros_like(g)
+        for _ in range(20):  # Newton for H on the plane; the bend is small
+            points = self.surface(np.stack([g, h], axis=1))
+            slope = (self.h + np.outer(self.bend[1] * g + 2.0 * self.bend[2] * h, self.normal)) @ normal
+            h = h - ((points - place) @ normal) / slope
+        column, row = self.project(self.surface(np.stack([g, h], axis=1))).T
+        order = np.argsort(column)
+        rows = CubicSpline(column[order], row[order], extrapolate=False)(np.arange(float(SIZE[0])))
+        return np.where((rows >= 0.0) & (rows <= SIZE[1] - 1.0), rows, np.nan)
+
+
+def sensor(tilt_degrees: float, bend: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> LaserSensor:
+    """Return a sensor 0.25 m from its sheet, 35 degrees off it, with a sensor tilted by an angle about the columns."""
+    alpha, beta = math.radians(tilt_degrees), math.radians(35.0)
+    f = 1000.0
+    # The virtual principal point stays near the middle of the image, which moves the axis by f tan(alpha).
+    centre = (0.5 * SIZE[0] + 6.0, 0.5 * SIZE[1] + 0.3 * f * math.tan(alpha) - 4.0)
+    distortion = np.zeros(14)
+    distortion[[0, 1, 12, 13]] = -0.15, 0.08, 0.95 * alpha, 0.1 * alpha
+    matrix = np.array([[f, 0.0, centre[0]], [0.0, f, centre[1]], [0.0, 0.0, 1.0]])
+    middle = cv2.undistortPoints(np.array([[SIZE]]) * 0.5, matrix, distortion)[0, 0]
+    ray = np.array([*middle, 1.0])
+    turn = Rotation.from_euler("zyx", [2.0, -3.0, 0.0], degrees=True).as_matrix()
+    g, h = turn @ np.array([1.0, 0.0, 0.0]), turn @ np.array([0.0, math.sin(beta), -math.cos(beta)])
+    normal = np.cross(g, h)
+    step = STEP * Rotation.from_rotvec([0.03, 0.0, 0.02]).as_matrix() @ -normal
+    return LaserSensor(matrix, distortion, 0.25 * ray, g, h, bend, step)
+
+
+def target() -> Float64:
+    """Return the points (n, 3) of the target, its rows one after the other."""
+    row, column = np.indices(GRID[::-1]).reshape(2, -1) * PITCH
+    return np.stack([column, row, np.zeros_like(row)], axis=1)
+
+
+def pose(
+    truth: LaserSensor, tilts: tuple[float, float, float], height: float, shift: float = 0.0
+) -> tuple[Float64, Float64]:
+    """Return rotation and translation of a target about the image's axes, its middle at H = height of the sheet."""
+    rotation = Rotation.from_euler("xyz", tilts, degrees=True).as_matrix()
+    middle = truth.origin + height * truth.h + shift * truth.g
+    return rotation, middle - rotation @ target().mean(axis=0)
+
+
+def poses(truth: LaserSensor, rng: np.random.Generator, count: int = 12) -> list[tuple[Float64, Float64]]:
+    """Return random poses of the target in view of the camera, at heights over the measuring range."""
+    found: list[tuple[Float64, Float64]] = []
+    while len(found) < count:
+        tilts = (*rng.uniform(-32.0, 32.0, 2), rng.uniform(-8.0, 8.0))
+        rotation, translation = pose(truth, tilts, rng.uniform(-0.03, 0.03), rng.uniform(-0.01, 0.01))
+        seen = truth.project(target() @ rotation.T + translation)
+        if (seen > 8.0).all() and (seen < np.array(SIZE) - 9.0).all():
+            found.append((rotation, translation))
+    return found
+
+
+def readings(truth: LaserSensor, rotation: Float64, translation: Float64) -> Float64:
+    """Return the exact (column, row) of the light within the target, one per column."""
+    rows = truth.line(rotation[:, 2], translation)
+    hull = cv2.convexHull(truth.project(target() @ rotation.T + translation).astype(np.float32))
+    columns = np.arange(float(SIZE[0]))
+    inside = [
+        np.isfinite(row) and cv2.pointPolygonTest(hull, (float(column), float(row)), False) > 0
+        for column, row in zip(columns, rows, strict=True)
+    ]
+    return np.stack([columns, rows], axis=1)[inside]
+
+
+def calibrated(
+    truth: LaserSensor, rng: np.random.Generator, *, count: int = 10, sigma: float = 0.05, line_sigma: float = 0.1
+) -> SensorGeometry:
+    """Calibrate from simulated points with normal noise [px]: `count` poses with laser lines, five transport views."""
+    still = poses(truth, rng, count)
+    first = pose(truth, (5.0, -4.0, 1.0), 0.0)
+    moved = [(first[0], first[1] + k * PROFILES_BETWEEN * truth.step) for k in range(-2, 3)]
+    views = [
+        (target(), truth.project(target() @ r.T + t) + rng.normal(0.0, sigma, (len(target()), 2)))
+        for r, t in (*still, *moved)
+    ]
+    fit = fit_camera(views, SIZE, model="tilt")
+    targets = pose_responses(fit, views)
+    lines = [
+        LaserLine(points + rng.normal(0.0, 1.0, points.shape) * [0.0, line_sigma], each)
+        for points, each in zip((readings(truth, r, t) for r, t in still), targets[:count], strict=True)
+    ]
+    sheet = fit_sheet(fit.camera, lines, names=fit.names, camera_covariance=fit.covariance)
+    transport = fit_transport(targets[count:], np.arange(5) * PROFILES_BETWEEN, target().mean(axis=0))
+    return SensorGeometry(
+        camera=fit.camera,
+        camera_names=fit.names,
+        camera_covariance=fit.covariance,
+        sheet=sheet,
+        transport=transport,
+        step=transport.length,
+    )

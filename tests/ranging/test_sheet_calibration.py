@@ -1,0 +1,111 @@
+"""Sheet of light from laser lines on targets: bend test, outliers, noise, and refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.views.camera_fit import Pose
+from gpuvision.camera.views.pose_response import PoseResponse
+from gpuvision.ranging.sheet_calibration import LaserLine, SheetFit, fit_sheet
+from laser_sensor import LaserSensor, poses, readings, sensor
+
+TRUTH = sensor(20.0)
+BENT = sensor(20.0, (0.05, 0.0, -0.03))
+
+
+def camera_of(truth: LaserSensor) -> Camera:
+    rows = tuple(tuple(row) for row in truth.matrix.tolist())
+    return Camera(matrix=rows, distortion=tuple(truth.distortion.tolist()))
+
+
+def lines_of(truth: LaserSensor, rng: np.random.Generator, count: int = 8, sigma: float = 0.1) -> list[LaserLine]:
+    """Return noisy lines on targets of known pose; the poses count as known to 1 um and 10 urad."""
+    known = np.diag([1e-10] * 3 + [1e-12] * 3)
+    lines = []
+    for rotation, translation in poses(truth, rng, count):
+        points = readings(truth, rotation, translation)
+        points[:, 1] += rng.normal(0.0, sigma, len(points))
+        lines.append(LaserLine(points, PoseResponse(Pose(rotation, translation), known, np.zeros((6, 0)))))
+    return lines
+
+
+def errors_of(found: SheetFit, truth: LaserSensor) -> np.ndarray:
+    """Return offset, slopes and, for a bent fit, bends of the true sheet in the frame of the found one."""
+    flat = np.stack(np.meshgrid(np.linspace(-0.05, 0.05, 9), np.linspace(-0.03, 0.03, 9)), axis=-1).reshape(-1, 2)
+    offset = truth.surface(flat) - found.origin
+    g, h, d = (offset @ np.stack([found.g_axis, found.h_axis, found.normal]).T).T
+    gg, gh, hh = found.bend or (0.0, 0.0, 0.0)
+    d = d - (gg * g * g + gh * g * h + hh * h * h)
+    basis = np.stack([np.ones_like(g), g, h, g * g, g * h, h * h], axis=1)[:, : len(found.names)]
+    return np.linalg.lstsq(basis, d, rcond=None)[0]
+
+
+@pytest.mark.parametrize("truth", [TRUTH, BENT], ids=["plane", "bent"])
+def test_sheet_is_found_within_its_sigma(truth: LaserSensor, rng: np.random.Generator) -> None:
+    found = fit_sheet(camera_of(truth), lines_of(truth, rng))
+    assert (found.bend is None) == (truth is TRUTH)
+    error = errors_of(found, truth)
+    assert error @ np.linalg.solve(found.covariance(np.zeros((0, 0))), error) < 23.0  # 0.1 % of six normal numbers
+    assert found.sigma_px == pytest.approx(0.1, rel=0.1)
+    assert found.g_axis @ truth.g > 0.99
+    assert found.h_axis @ truth.h > 0.99
+    assert found.view_ratio < 3.0
+
+
+def test_bend_is_found_and_tested(rng: np.random.Generator) -> None:
+    bent = fit_sheet(camera_of(BENT), lines_of(BENT, rng)).bend_test
+    flat = fit_sheet(camera_of(TRUTH), lines_of(TRUTH, rng)).bend_test
+    assert bent is not None
+    assert flat is not None
+    assert bent.significant
+    assert not flat.significant
+    assert flat.p_value > 1e-3 > bent.p_value
+    # A rotation of the axes in the sheet keeps gg + hh.
+    assert bent.bend[0] + bent.bend[2] == pytest.approx(0.02, abs=4.0 * np.hypot(bent.sigma[0], bent.sigma[2]))
+
+
+def test_reflections_are_rejected(rng: np.random.Generator) -> None:
+    """A tenth of the readings 5 to 40 px off, and one view with a third of them."""
+    lines = lines_of(TRUTH, rng)
+    clean = fit_sheet(camera_of(TRUTH), lines)
+    wrong = 0
+    for number, (points, _) in enumerate(lines):
+        chosen = rng.random(len(points)) < (0.33 if number == 0 else 0.1)
+        points[chosen, 1] -= rng.uniform(5.0, 40.0, np.count_nonzero(chosen))
+        wrong += np.count_nonzero(chosen)
+    found = fit_sheet(camera_of(TRUTH), lines)
+    assert found.bend is None
+    assert wrong <= found.outliers < wrong + 60
+    np.testing.assert_allclose(found.normal, clean.normal, atol=5e-5)
+    assert abs((found.origin - clean.origin) @ clean.normal) < 5e-6
+
+
+def test_wrong_poses_widen_the_uncertainty(rng: np.random.Generator) -> None:
+    """Targets displaced by much more than their covariance: the views disagree, and the sigmas follow."""
+    lines = lines_of(TRUTH, rng)
+    moved = [
+        LaserLine(points, target._replace(pose=Pose(target.pose[0], target.pose[1] + rng.normal(0.0, 1e-4, 3))))
+        for points, target in lines
+    ]
+    known, doubtful = fit_sheet(camera_of(TRUTH), lines), fit_sheet(camera_of(TRUTH), moved)
+    assert doubtful.view_ratio > 10.0 * known.view_ratio
+    assert doubtful.bend is None
+    error = errors_of(doubtful, TRUTH)
+    assert error @ np.linalg.solve(doubtful.covariance(np.zeros((0, 0))), error) < 23.0
+
+
+def test_one_target_or_parallel_lines_in_one_place_are_refused(rng: np.random.Generator) -> None:
+    lines = lines_of(TRUTH, rng, 2)
+    with pytest.raises(ValueError, match="read on 1 targets, expected two"):
+        fit_sheet(camera_of(TRUTH), lines[:1])
+    with pytest.raises(ValueError, match="lie on one line in space"):
+        fit_sheet(camera_of(TRUTH), [lines[0], lines[0]])
+
+
+def test_lines_of_other_targets_are_refused(rng: np.random.Generator) -> None:
+    lines = lines_of(TRUTH, rng)
+    mixed = [LaserLine(line.points, other.target) for line, other in zip(lines, lines[3:] + lines[:3], strict=True)]
+    with pytest.raises(ValueError, match="lie on no common sheet"):
+        fit_sheet(camera_of(TRUTH), mixed)

@@ -1,0 +1,61 @@
+"""Direction and step of a transport from poses of a moved target."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gpuvision.camera.views.camera_fit import Pose
+from gpuvision.camera.views.pose_response import PoseResponse
+from gpuvision.ranging.transport_calibration import fit_transport
+
+STEP = np.array([0.2e-4, -0.3e-3, 0.1e-3])
+MIDDLE = np.array([0.05, 0.035, 0.0])
+
+
+def moved(rng: np.random.Generator, profiles: np.ndarray, scale: float = 1.0) -> list[PoseResponse]:
+    """Return noisy poses of a target: correlated noise of rotation and translation, times `scale`."""
+    root = np.diag([2e-4] * 3 + [1e-5] * 3) + 2e-6 * np.tri(6, k=-1)
+    rotation = Rotation.from_euler("xyz", [0.4, -0.2, 0.1]).as_matrix()
+    made = []
+    for number in profiles:
+        noise = scale * root @ rng.normal(size=6)
+        pose = Pose(
+            Rotation.from_rotvec(noise[:3]).as_matrix() @ rotation, [0.01, 0.02, 0.3] + number * STEP + noise[3:]
+        )
+        made.append(PoseResponse(pose, root @ root.T, np.zeros((6, 0))))
+    return made
+
+
+def test_step_has_its_predicted_covariance(rng: np.random.Generator) -> None:
+    profiles = np.array([0.0, 20.0, 40.0, 60.0, 100.0])
+    chi_squares = []
+    for _ in range(60):
+        found = fit_transport(moved(rng, profiles), profiles, MIDDLE)
+        error = found.step - STEP
+        chi_squares.append(error @ np.linalg.solve(found.covariance(np.zeros((0, 0))), error))
+    # Mean 3 of 60 chi-squares with 3 degrees of freedom, less for views that agree badly by chance: within 4 sigma.
+    assert 2.0 < np.mean(chi_squares) < 3.0 + 4.0 * np.sqrt(6.0 / 60)
+    assert found.length == pytest.approx(np.linalg.norm(STEP), rel=1e-2)
+    np.testing.assert_allclose(found.direction, STEP / np.linalg.norm(STEP), atol=1e-2)
+
+
+def test_uneven_stage_widens_the_uncertainty(rng: np.random.Generator) -> None:
+    profiles = np.arange(8) * 25.0
+    even, uneven = (fit_transport(moved(rng, profiles, scale), profiles, MIDDLE) for scale in (1.0, 10.0))
+    assert uneven.view_ratio > 20.0 * even.view_ratio
+    none = np.zeros((0, 0))
+    assert np.trace(uneven.covariance(none)) > 20.0 * np.trace(even.covariance(none))
+    assert even.residuals.shape == even.rotations.shape == (8, 3)
+
+
+def test_two_views_suffice_and_one_does_not(rng: np.random.Generator) -> None:
+    views = moved(rng, np.array([10.0, 40.0]))
+    found = fit_transport(views, [10.0, 40.0], MIDDLE)
+    np.testing.assert_allclose(found.step, STEP, atol=1e-5)
+    np.testing.assert_allclose(found.middle, views[0].pose.rotation @ MIDDLE + views[0].pose.translation, atol=1e-4)
+    with pytest.raises(ValueError, match="expected two views at least"):
+        fit_transport(views[:1], [0.0])
+    with pytest.raises(ValueError, match="at different profiles"):
+        fit_transport(views, [5.0, 5.0])

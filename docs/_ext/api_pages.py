@@ -60,6 +60,8 @@ MODULES = (
     "gpuvision.operation",
     "gpuvision.ranging.focus",
     "gpuvision.ranging.polygon",
+    "gpuvision.ranging.polygon_scan",
+    "gpuvision.ranging.encoder",
     "gpuvision.camera.calibration",
     "gpuvision.camera.ground_plane",
     "gpuvision.camera.orthographic",

@@ -7,8 +7,8 @@ the hit point to the surface and phi the rotation, 0 where the facet lies at 45 
     x_h = R (1 + sin(psi)/sqrt(2)) / cos(psi),  psi = phi - pi/4
     x = x_h(phi) - x_h(0) + D tan(2 phi)
 
-The difference ``x_h(phi) - x_h(0)`` is due to the motion of the hit point; it makes the scan asymmetric in second
-order.
+An object of height h shortens the drop: the spot moves sideways to ``x_h(phi) - x_h(0) + (D - h) tan(2 phi)``. The
+difference ``x_h(phi) - x_h(0)`` is due to the motion of the hit point; it makes the scan asymmetric in second order.
 
 References
 ----------
@@ -83,22 +83,25 @@ class PolygonMirror:
         """Distance D from the point where the beam hits the facet down to the surface [m]."""
         return self.height - self.apothem * _HALF_ROOT if self.height_from == "centre" else self.height
 
-    def position(self, rotation: npt.ArrayLike) -> Float64:
-        """Return the position x of the beam on the surface [m] for rotations phi [rad]; NaN outside `limits`.
+    def position(self, rotation: npt.ArrayLike, object_height: npt.ArrayLike = 0.0) -> Float64:
+        """Return the position x of the spot [m] for rotations phi [rad]; NaN outside `limits`.
 
         Parameters
         ----------
         rotation : array_like
             Rotations phi [rad], any shape.
+        object_height : array_like
+            Height h of the object above the surface at the spot [m], below `drop`; default 0: the surface.
 
         Returns
         -------
         numpy.ndarray
-            Positions x [m], float64, of the same shape.
+            Positions x [m], float64, of the broadcast shape.
         """
         phi = np.asarray(rotation, dtype=np.float64)
         low, high = self.limits
-        return np.where((phi >= low) & (phi <= high), self._position(phi), np.nan)
+        aside = np.asarray(object_height, dtype=np.float64) * np.tan(2.0 * phi)
+        return np.where((phi >= low) & (phi <= high), self._position(phi) - aside, np.nan)
 
     def slope(self, rotation: npt.ArrayLike) -> Float64:
         """Return the derivative dx/dphi [m/rad] at rotations phi [rad]; it is 2 D in the middle of the scan."""
@@ -194,11 +197,14 @@ class PolygonMirror:
         edge = np.nextafter(0.25 * math.pi, 0.0)
         return max(middle - half, self._fold(), -edge), min(middle + half, edge)
 
+    def hit_shift(self, rotation: npt.ArrayLike) -> Float64:
+        """Return the motion of the hit point towards the light source, ``x_h(phi) - x_h(0)`` [m], 0 or more."""
+        phi = np.asarray(rotation, dtype=np.float64)
+        # As one quotient: the difference itself cancels near phi = 0.
+        return np.asarray(2.0 * self.apothem * np.sin(0.5 * phi) ** 2 / np.cos(0.25 * math.pi - phi))
+
     def _position(self, phi: Float64) -> Float64:
-        facet = 0.25 * math.pi - phi
-        # x_h(phi) - x_h(0) as one quotient, 2 R sin^2(phi/2) (...): the difference itself cancels near phi = 0.
-        hit_point = 2.0 * self.apothem * np.sin(0.5 * phi) ** 2 / np.cos(facet)
-        return np.asarray(hit_point + self.drop * np.tan(2.0 * phi))
+        return np.asarray(self.hit_shift(phi) + self.drop * np.tan(2.0 * phi))
 
     def _fold(self) -> float:
         """Negative phi at which dx/dphi vanishes; -pi/4 where it never does."""

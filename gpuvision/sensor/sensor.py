@@ -24,6 +24,8 @@ Tables of the file (the files in ``gpuvision/presets/sensors`` are commented exa
 ``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`;
                       with an encoder ``encoder``, a file with a count for each profile, and ``metres_per_count`` or
                       ``radians_per_count`` instead of a step
+``[polygon]``         a point sensor behind a polygon mirror: fields of `PolygonMirror`, ``first_rotation``,
+                      ``rotation_step``, ``moving``; the strips of a PSD are then the samples of a sweep
 ``[output]``          see `Output`
 ``[light]``           light source and electronics, for a simulation: see `gpuvision.sensor.light_source`
 ====================  ==================================================================================================
@@ -43,6 +45,7 @@ import numpy.typing as npt
 
 from gpuvision.host.recordings import CHANNELS, Channel
 from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
+from gpuvision.ranging.polygon_scan import PolygonScan
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.range_image import Limits, StraightTransport
 from gpuvision.ranging.sheet import SampleAxes
@@ -50,6 +53,7 @@ from gpuvision.ranging.triangulation import Along, Triangulation
 from gpuvision.schema import DescriptionError, Section, read_toml
 from gpuvision.sensor.light_source import Light, read_light
 from gpuvision.sensor.optics import read_optics
+from gpuvision.sensor.polygon import read_polygon
 from gpuvision.sensor.sheet import read_triangulation
 from gpuvision.sensor.transports import Encoder, Transport, read_transport
 
@@ -134,6 +138,9 @@ class Sensor:
         Light source and electronics for a simulation, if the file has them.
     encoder
         Transport of each profile, if an encoder measured it.
+    polygon
+        Polygon mirror through which a point sensor looks. A frame is then a sweep of one facet, and its strips are
+        the samples of the sweep.
     """
 
     name: str
@@ -145,6 +152,7 @@ class Sensor:
     auto_threshold: bool = False
     light: Light | None = None
     encoder: Encoder | None = None
+    polygon: PolygonScan | None = None
 
     @classmethod
     def load(cls, path: str | Path) -> Sensor:
@@ -209,6 +217,10 @@ class Sensor:
         if not is_rotating:
             region = _region(kind, top, frame, along, axes, readout)
             sheet = read_triangulation(top.section("triangulation"), optics, region, along)
+        polygon = None
+        if kind == "psd":
+            assert frame is not None  # a PSD has strips
+            polygon = read_polygon(top.optional_section("polygon"), frame[0], sheet)
         output = _output(top.section("output"))
         light = _light(top, transport)
         top.finish()
@@ -222,6 +234,7 @@ class Sensor:
             auto_threshold=kind == "camera" and readout.word("threshold", ("auto",)) is not None,
             light=light,
             encoder=encoder,
+            polygon=polygon,
         )
 
     @property

@@ -37,12 +37,16 @@ def require_light(sensor: Sensor) -> Light:
     Raises
     ------
     ValueError
-        The sensor file has no table ``[light]`` or no pinhole position, the transport is not straight, or the
-        threshold is to be estimated from a recording.
+        The sensor file has no table ``[light]`` or no pinhole position, the transport is not straight, a
+        polygon mirror turns the beam, or the threshold is to be estimated from a recording.
     """
     name = sensor.name or "the sensor"
     if not isinstance(sensor.transport, StraightTransport):
         raise ValueError(f"{name}: a simulation needs a straight transport, this one has a sheet that turns")
+    if sensor.polygon is not None:
+        raise ValueError(
+            f"{name}: a simulation needs a sheet of light, this one is a point sensor behind a polygon mirror"
+        )
     if sensor.auto_threshold:
         raise ValueError(f'{name}: [line] threshold = "auto" needs a recording; give a number for a simulation')
     if sensor.light is None:

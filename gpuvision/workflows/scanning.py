@@ -24,7 +24,7 @@ from gpuvision.host.sources import PacedSource, Source
 from gpuvision.host.trace import Trace
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
-from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet
+from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
 from gpuvision.ranging.regrid import Direction, Grid, HeightMap, Regrid
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
@@ -210,10 +210,12 @@ def _read_frames(
 def _points(sensor: Sensor, fields: dict[str, Array], frame_numbers: Array, device: Device) -> RangePoints:
     """Return the organised range image of the readout's outputs, with the transport of each frame number."""
     positions = [fields[name] for name in ("position", "g", "h") if name in fields]
-    profiles = int(frame_numbers[-1]) + 1
-    transports, status = sensor.transports(profiles)[frame_numbers], fields["status"]
+    transports, status = sensor.transports(int(frame_numbers[-1]) + 1), fields["status"]
     if sensor.encoder is not None:
         status[sensor.encoder.not_advancing()[frame_numbers]] |= np.uint8(Status.NOT_INVERTIBLE)
+    if sensor.polygon is not None:
+        transports = sensor.polygon.sample_transports(transports, status.shape[1])
+    transports = transports[frame_numbers]
     return assemble_points(sensor, positions, transports, status, device)
 
 
@@ -229,7 +231,8 @@ def assemble_points(
     positions : sequence of numpy.ndarray
         g and h [m] for a straight transport; the position [px] alone for a rotating sheet. Each (profiles, samples).
     transports : numpy.ndarray
-        Transport of each profile, (profiles,): [m], or the rotation [rad] of a rotating sheet.
+        Transport of each profile, (profiles,): [m], or the rotation [rad] of a rotating sheet. Behind a polygon mirror:
+        of each sample, (profiles, samples).
     status : numpy.ndarray
         `Status` flags of the samples, (profiles, samples), uint8.
     device : Device
@@ -240,9 +243,15 @@ def assemble_points(
     RangePoints
         NumPy arrays (profiles, samples). Ambiguous points are NaN where the sensor drops them.
     """
-    typed_transports = transports.astype(positions[0].dtype)
-    assemble = RangeImage(geometry=sensor.transport, limits=sensor.output.limits)
-    points: RangePoints = assemble(*positions, typed_transports, status, device=device)
+    limits = sensor.output.limits
+    if sensor.polygon is not None:
+        assert isinstance(sensor.transport, StraightTransport)  # a PSD has no other transport
+        points = sensor.polygon.assemble(
+            positions[1], transports, status, transport=sensor.transport, limits=limits, device=device
+        )
+    else:
+        assemble = RangeImage(geometry=sensor.transport, limits=limits)
+        points = assemble(*positions, transports.astype(positions[0].dtype), status, device=device)
     if sensor.output.ambiguous == "drop":
         ambiguous = (to_numpy(points.status) & Status.AMBIGUOUS) != 0
         for coordinate in (points.x, points.y, points.z):

@@ -22,6 +22,7 @@ from gpuvision.camera.undistort_image import UndistortImage
 from gpuvision.host import Device
 from gpuvision.reference import undistort_image as reference
 from gpuvision.status import Status
+from guard_pages import assert_within_pages
 
 ON_DEVICES = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 VARIANTS = ["vector", "work_item"]
@@ -211,6 +212,10 @@ def test_no_window_reads_outside_the_image(
     highest = (last_row * source[1] + column + np.max(starts, axis=0) + taps.after) * channels + loaded
     assert (lowest >= 0).all()
     assert (highest <= source[0] * source[1] * channels).all()
+
+
+def test_no_kernel_reads_outside_the_image() -> None:
+    assert_within_pages("undistort_image")
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

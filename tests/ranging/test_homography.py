@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -226,6 +227,19 @@ def test_sigma_weighs_the_points(rng: np.random.Generator) -> None:
             fitted = Triangulation.fit(noisy, SHEET, sigma=sigma if weighted else None, model="H8", region=REGION)
             errors[weighted].append(float(np.max(np.abs(fitted.conditioned() - truth))))
     assert np.mean(errors[True]) < 0.1 * np.mean(errors[False])
+
+
+def test_p_value_is_that_of_the_textbook(rng: np.random.Generator) -> None:
+    """F = (S1 - S2) / (d1 - d2) / (S2 / d2) for sums of squares S and degrees of freedom d of two nested models."""
+    seen = psd().to_sensor(SHEET)
+    fits = fit_models(seen + rng.normal(0.0, SIGMA, seen.shape), SHEET, sigma=SIGMA)
+    full = fits[-1]
+    assert [each.model for each in fits] == ["C4", "D6", "H8"]
+    for each in fits[:-1]:
+        more = each.degrees_of_freedom - full.degrees_of_freedom
+        ratio = (each.rms**2 / full.rms**2 - 1.0) * full.degrees_of_freedom / more
+        assert each.p_value == pytest.approx(scipy.stats.f.sf(ratio, more, full.degrees_of_freedom), rel=1e-6)
+        assert 0.01 < each.p_value < 0.99
 
 
 def test_residuals_are_told_in_sigmas(rng: np.random.Generator) -> None:

@@ -19,6 +19,7 @@ from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.reference.line import AMBIGUOUS, LOW_SIGNAL, NOT_FINITE, OUT_OF_RANGE, SATURATED, read_lines
 from gpuvision.reference.triangulation import triangulate
 from gpuvision.status import Status
+from guard_pages import assert_within_pages
 
 TOP = {"uint8": 180.0, "uint16": 40_000.0, "float32": 100.0}
 LEVEL = {"uint8": 20, "uint16": 4000, "float32": 8.5}
@@ -153,6 +154,10 @@ def test_writes_nothing_else(device, rng, method, variant, along):
     assert readout(frames, device=device, out=guarded.out) is guarded.out
     guarded.assert_intact()
     assert_same(guarded.out, read_lines(frames, method=method, along=along, threshold=20, window=WINDOW), slack=4.0)
+
+
+def test_reads_within_its_frames():
+    assert_within_pages("line")
 
 
 def test_outputs(device, rng):

@@ -111,6 +111,7 @@ def test_values_reach_the_operations() -> None:
         ("camera_line", "light__read_noise", 0.0),
         ("corner_scene", "transport__sheet_offset", 0.0),
         ("corner_scene", "transport__horizon", 1e-4),
+        ("corner_scene", "transport__scene_axes", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
     ],
 )
 def test_a_key_that_is_left_out_has_its_default(name: str, key: str, value: Any) -> None:

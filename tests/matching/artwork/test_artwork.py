@@ -112,6 +112,13 @@ def land_at(board: Artwork, x: float, y: float) -> Pad:
     return found
 
 
+def test_a_filled_outline_is_cut_along_its_contour(tmp_path: Path) -> None:
+    """A line of the outline has its width on both sides of the cut; the contour of a filled region is the cut."""
+    corners = at(18, 0, "D01") + at(18, 9, "D01") + at(0, 9, "D01") + at(0, 0, "D01")
+    board = read(tmp_path, outline="G36*\n" + at(0, 0, "D02") + corners + "G37*\n")
+    assert board.bounds == pytest.approx(np.array([[0, 0], [18e-3, 9e-3]]), abs=1e-9)
+
+
 def test_says_what_each_spot_is_for(tmp_path: Path) -> None:
     board = read(tmp_path)
     assert len(board.pads) == 5

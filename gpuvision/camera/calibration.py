@@ -215,7 +215,7 @@ class Calibration:
             "skipped_images": {path.name: reason for path, reason in self.skipped_images},
         }
         if isinstance(fit, LensFit):
-            lack_of_fit = {"error_model": fit.error_model, "lack_of_fit": asdict(fit.lack_of_fit)}
+            lack_of_fit = {"error_model": fit.error_model, "lack_of_fit": fit.lack_of_fit and asdict(fit.lack_of_fit)}
             return table | {"sigma_px": fit.sigma_px, "lines": fit.lines} | lack_of_fit
         tilt = {"alpha_rad": fit.sensor.alpha, "alpha_sigma_rad": fit.alpha_sigma}
         poses = [{"rotation": p.rotation.tolist(), "translation": p.translation.tolist()} for p in fit.poses]

@@ -15,14 +15,17 @@ from gpuvision.profiling import calibration, calibration_tables
 @pytest.fixture(autouse=True)
 def _without_recordings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     monkeypatch.setattr(calibration, "_DATA", tmp_path)
-    calibration.case_of.cache_clear()
+    for cached in (calibration.case_of, calibration._measured):
+        cached.cache_clear()
     yield
     calibration.case_of.cache_clear()
 
 
 def test_cases_without_recordings(device: Device) -> None:
     cases = list(calibration.cases(device))
-    assert [case.name for case in cases] == ["fit/66x96", "fit/33x39", "fit/lines"]
+    assert [case.name for case in cases] == [
+        f"{start}fit/{target}" for target in ("66x96", "33x39", "lines") for start in ("", "tested-")
+    ]
     for case in cases:
         assert set(case.peers) == {"discorpy"}
         assert case.metadata["data"] == "synthetic"

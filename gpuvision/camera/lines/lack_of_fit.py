@@ -33,7 +33,7 @@ from numpy.polynomial import legendre
 
 from gpuvision.camera.lines.line_families import Float64, Index, PackedLines
 from gpuvision.camera.lines.line_statistics import image_normals, p_value_of_gain
-from gpuvision.camera.lines.straightness import ResidualJacobian, normal_equations, projected_columns
+from gpuvision.camera.lines.straightness import ResidualJacobian, line_coefficients, projected_columns
 from gpuvision.camera.lines.variable_projection import Minimum
 
 # Degrees of the smooth field. Lines absorb the linear part. Degree 7 resolves a third of the image.
@@ -206,10 +206,10 @@ def _field(packed: PackedLines, found: Minimum, most: int) -> tuple[Float64, npt
             rows += [normals[0] * shape, normals[1] * shape]
             degree += [n, n]
     field = np.array(rows)
-    slopes = ResidualJacobian(np.concatenate([field, found.evaluation.residual[None]]), found.slopes.line)
-    lines = normal_equations(packed, found.parameters, found.evaluation, slopes).line_coefficients
-    for column, part in zip(slopes.line, lines, strict=True):
-        field -= column * part[:-1, packed.line]
+    slopes = ResidualJacobian(field, found.slopes.line)
+    coefficients = line_coefficients(packed, found.parameters, found.evaluation, slopes)
+    for column, part in zip(slopes.line, coefficients, strict=True):
+        field -= column * np.repeat(part, packed.counts, axis=1)
     return field, np.array(degree)
 
 
@@ -254,8 +254,8 @@ def _jackknife(columns: Float64, normal: Float64, residual: Float64, cluster: In
     starts = np.flatnonzero(np.diff(cluster[order], prepend=-1))
     ordered = columns[:, order]
     scores = np.add.reduceat(ordered * residual[order], starts, axis=1)
-    pieces = np.split(ordered, starts[1:], axis=1)
-    left = normal - np.array([piece @ piece.T for piece in pieces])
+    products = np.add.reduceat(ordered[:, None] * ordered, starts, axis=2)
+    left = normal - products.transpose(2, 0, 1)
     # The pseudoinverse: a cluster may hold all points that determine a parameter.
     shifts = np.einsum("cij,jc->ci", np.linalg.pinv(left, hermitian=True), scores)
     return np.asarray(shifts.T @ shifts * ((len(shifts) - 1) / len(shifts)))

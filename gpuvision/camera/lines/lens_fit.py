@@ -124,6 +124,10 @@ class LensFit:
         Standard deviation of a coordinate [px]: given, or estimated from the residuals and the degrees of freedom.
     degrees_of_freedom : int
         Degrees of freedom: residuals minus parameters, the parameters of the lines included.
+    lack_of_fit : LackOfFit or None
+        Test of the residuals for a smooth field; None without the test.
+    error_model : {"independent", "correlated"}
+        Whether the covariance includes a smooth field of the residuals.
     iterations : int
         Number of steps of the minimisation.
     alternatives : tuple of LensAlternative
@@ -143,7 +147,7 @@ class LensFit:
     rms_px: float
     sigma_px: float
     degrees_of_freedom: int
-    lack_of_fit: LackOfFit
+    lack_of_fit: LackOfFit | None
     error_model: Literal["independent", "correlated"]
     iterations: int
     alternatives: tuple[LensAlternative, ...]
@@ -261,7 +265,7 @@ def fit_warnings(
             "there are outliers; use loss='tukey'"
         )
     lack = fit.lack_of_fit
-    if lack.p_value < limits.lack_of_fit_significance and lack.rms_px > limits.max_lack_of_fit * lack.noise_px:
+    if lack and lack.p_value < limits.lack_of_fit_significance and lack.rms_px > limits.max_lack_of_fit * lack.noise_px:
         yield (
             f"the residuals form a smooth pattern of {lack.rms_px:.3g} pixels rms over the image, beside "
             f"{lack.noise_px:.3g} pixels of noise: the target is not flat, or the lens is not of model {fit.model}; "

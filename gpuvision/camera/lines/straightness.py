@@ -396,17 +396,7 @@ def normal_equations(
     packed: PackedLines, parameters: Parameters, evaluation: Evaluation, slopes: ResidualJacobian
 ) -> NormalEquations:
     """Return the normal equations of lens and vanishing points, with the lines' columns projected out."""
-    cross = np.array([packed.sums(line * slopes.lens) for line in slopes.line])
-    line_blocks = packed.sums(np.array([slopes.line[i] * slopes.line[j] for i, j in ((0, 0), (0, 1), (1, 1))]))
-    line_coefficients = np.empty_like(cross)
-    np.subtract(line_blocks[2] * cross[0], line_blocks[1] * cross[1], out=line_coefficients[0])
-    np.subtract(line_blocks[0] * cross[1], line_blocks[1] * cross[0], out=line_coefficients[1])
-    line_coefficients /= line_blocks[0] * line_blocks[2] - line_blocks[1] ** 2
-    bound = constrained_lines(packed, parameters)
-    sideways = None
-    if parameters.vanishing is not None and bound.any():
-        sideways = _pencils(packed, parameters.vanishing, evaluation.lines, line_blocks, cross, bound)
-        line_coefficients[..., bound] = sideways.line_coefficients
+    cross, line_coefficients, sideways = _project_lines(packed, parameters, evaluation, slopes)
     product = inner_products(slopes.lens, slopes.lens) - sum(
         inner_products(a, b) for a, b in zip(line_coefficients, cross, strict=True)
     )
@@ -424,6 +414,31 @@ def normal_equations(
             matrix[:lens, inside] = with_lens[:, :-1].T
             matrix[inside, inside], gradient[inside] = square, with_lens[:, -1]
     return NormalEquations(matrix, gradient, line_coefficients)
+
+
+def line_coefficients(
+    packed: PackedLines, parameters: Parameters, evaluation: Evaluation, slopes: ResidualJacobian
+) -> Float64:
+    """Return the coefficients of the projection onto the lines' columns, as in `NormalEquations`."""
+    return _project_lines(packed, parameters, evaluation, slopes)[1]
+
+
+def _project_lines(
+    packed: PackedLines, parameters: Parameters, evaluation: Evaluation, slopes: ResidualJacobian
+) -> tuple[Float64, Float64, _Pencils | None]:
+    """Return products with the lines' columns (2, order + 3, lines), coefficients of the projection, and pencils."""
+    cross = np.array([packed.sums(line * slopes.lens) for line in slopes.line])
+    line_blocks = packed.sums(np.array([slopes.line[i] * slopes.line[j] for i, j in ((0, 0), (0, 1), (1, 1))]))
+    coefficients = np.empty_like(cross)
+    np.subtract(line_blocks[2] * cross[0], line_blocks[1] * cross[1], out=coefficients[0])
+    np.subtract(line_blocks[0] * cross[1], line_blocks[1] * cross[0], out=coefficients[1])
+    coefficients /= line_blocks[0] * line_blocks[2] - line_blocks[1] ** 2
+    bound = constrained_lines(packed, parameters)
+    if parameters.vanishing is None or not bound.any():
+        return cross, coefficients, None
+    sideways = _pencils(packed, parameters.vanishing, evaluation.lines, line_blocks, cross, bound)
+    coefficients[..., bound] = sideways.line_coefficients
+    return cross, coefficients, sideways
 
 
 class _Pencils(NamedTuple):

@@ -61,6 +61,19 @@ def test_a_bent_target_is_said(rng: np.random.Generator) -> None:
     assert not any("smooth pattern" in each for each in plain.warnings)
 
 
+def test_errors_that_are_taken_as_independent_are_not_tested(rng: np.random.Generator) -> None:
+    """The lens is the same; the covariance is smaller by what the smooth field adds."""
+    ideal = LENS.distort(plane_grid(rng, 20.0))
+    points = grid_lines(ideal + smooth_field(rng, ideal, 0.1) + rng.normal(0.0, 0.02, ideal.shape))
+    tested = fit_lens(points, model="k1,k2", lines="free")
+    quick = fit_lens(points, model="k1,k2", lines="free", error_model="independent")
+    assert (quick.lack_of_fit, quick.error_model) == (None, "independent")
+    assert quick.lens == tested.lens
+    assert np.all(np.diag(quick.covariance) < 0.25 * np.diag(tested.covariance))
+    with pytest.raises(ValueError, match="error_model is 'white', expected one of 'auto', 'independent'"):
+        fit_lens(points, error_model="white")
+
+
 def test_a_wide_angle_lens_of_two_coefficients_is_said_to_be_too_small(rng: np.random.Generator) -> None:
     wide = radial_lens(0.0)
     wide = type(wide)(k1=-0.14 / HALF**2, k2=0.06 / HALF**4, k3=0.1 / HALF**6, centre=(530.0, 500.0))

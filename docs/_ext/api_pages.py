@@ -59,6 +59,7 @@ PACKAGES = {
 MODULES = (
     "gpuvision.operation",
     "gpuvision.ranging.focus",
+    "gpuvision.ranging.focus_stack",
     "gpuvision.ranging.polygon",
     "gpuvision.ranging.polygon_scan",
     "gpuvision.ranging.encoder",

@@ -3,7 +3,7 @@
 Tables of the file (the files in ``gpuvision/presets/sensors`` are commented examples):
 
 ====================  ==================================================================================================
-``kind``, ``name``    ``"camera"`` or ``"psd"``; a name for the report
+``kind``, ``name``    ``"camera"``, ``"psd"`` or ``"focus"``; a name for the report
 ``[recording]``       see `Recording`
 ``[line]``            camera: fields of `LineReadout`
 ``[psd]``             PSD: number of strips, fields of `PsdReadout`; ``[psd.noise]``: fields of `PsdNoise`, where the
@@ -26,6 +26,8 @@ Tables of the file (the files in ``gpuvision/presets/sensors`` are commented exa
                       ``radians_per_count`` instead of a step
 ``[polygon]``         a point sensor behind a polygon mirror: fields of `PolygonMirror`, ``first_rotation``,
                       ``rotation_step``, ``moving``; the strips of a PSD are then the samples of a sweep
+``[focus]``           depth from focus: fields of `FocusStack` and `LensFocus`, or ``stage_start``, ``stage_step`` and
+                      ``pixel_size``; the file then has no readout and no transport
 ``[output]``          see `Output`
 ``[light]``           light source and electronics, for a simulation: see `gpuvision.sensor.light_source`
 ====================  ==================================================================================================
@@ -44,6 +46,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host.recordings import CHANNELS, Channel
+from gpuvision.ranging.focus_stack import FocusStack
 from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
 from gpuvision.ranging.polygon_scan import PolygonScan
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
@@ -51,6 +54,7 @@ from gpuvision.ranging.range_image import Limits, StraightTransport
 from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Along, Triangulation
 from gpuvision.schema import DescriptionError, Section, read_toml
+from gpuvision.sensor.focus import FOCUS_PLACE, read_focus
 from gpuvision.sensor.light_source import Light, read_light
 from gpuvision.sensor.optics import read_optics
 from gpuvision.sensor.polygon import read_polygon
@@ -125,9 +129,10 @@ class Sensor:
     name
         Name for reports.
     readout
-        `LineReadout` for a camera, `PsdReadout` for a PSD.
+        `LineReadout` for a camera, `PsdReadout` for a PSD, `FocusStack` for depth from focus.
     transport
         `StraightTransport` for a readout with a triangulation, or a `RotatingSheet`, which includes the triangulation.
+        For depth from focus: the directions of columns, height and rows.
     frame
         Shape of a frame if the file gives it: (rows, columns), or (strips, 2).
     recording, output
@@ -144,7 +149,7 @@ class Sensor:
     """
 
     name: str
-    readout: LineReadout | PsdReadout
+    readout: LineReadout | PsdReadout | FocusStack
     transport: Transport
     output: Output
     recording: Recording = Recording()
@@ -197,12 +202,14 @@ class Sensor:
 
     @classmethod
     def _read(cls, top: Section) -> Sensor:
-        kind = top.choice("kind", ("camera", "psd"))
+        kind = top.choice("kind", ("camera", "psd", "focus"))
         name = top.text("name", "")
         recording = _recording(kind, top.optional_section("recording"))
+        if kind == "focus":
+            return cls._read_focus(top, name, recording)
         readout = top.section("line" if kind == "camera" else "psd")
         along: Along = readout.choice("along", ("columns", "rows"), "columns") if kind == "camera" else "columns"
-        frame = _frame(kind, top, readout)
+        frame = _frame(top) if kind == "camera" else (readout.integer("strips", 1, at_least=1), 2)
         moving = top.section("transport")
         sheet = None
         # A PSD does not measure the place of the light in the plane of the beam: it cannot see a rotating sheet.
@@ -237,9 +244,19 @@ class Sensor:
             polygon=polygon,
         )
 
+    @classmethod
+    def _read_focus(cls, top: Section, name: str, recording: Recording) -> Sensor:
+        stack = read_focus(top.section("focus"))
+        frame = _frame(top)
+        output = _output(top.section("output"))
+        top.finish()
+        return cls(name=name, readout=stack, transport=FOCUS_PLACE, output=output, recording=recording, frame=frame)
+
     @property
-    def kind(self) -> Literal["camera", "psd"]:
-        """Kind of the sensor: ``"camera"`` or ``"psd"``."""
+    def kind(self) -> Literal["camera", "psd", "focus"]:
+        """Kind of the sensor: ``"camera"``, ``"psd"`` or ``"focus"``."""
+        if isinstance(self.readout, FocusStack):
+            return "focus"
         return "camera" if isinstance(self.readout, LineReadout) else "psd"
 
     def transports(self, profiles: int) -> npt.NDArray[np.float64]:
@@ -264,7 +281,7 @@ class Sensor:
         ValueError
             The shape differs.
         """
-        words = "(rows, columns)" if self.kind == "camera" else "(strips, 2)"
+        words = "(strips, 2)" if self.kind == "psd" else "(rows, columns)"
         if len(shape) != 2 or shape != (self.frame or shape):
             expected = words if self.frame is None else f"{words} = {self.frame}"
             raise ValueError(f"{what}: frames have shape {shape}, the sensor file expects {expected}")
@@ -283,9 +300,7 @@ def _recording(kind: str, table: Section | None) -> Recording:
     return Recording(channel=channel, key=key, rate=rate, background=background)
 
 
-def _frame(kind: str, top: Section, readout: Section) -> tuple[int, int] | None:
-    if kind == "psd":
-        return readout.integer("strips", 1, at_least=1), 2
+def _frame(top: Section) -> tuple[int, int] | None:
     table = top.optional_section("frame")
     if table is None:
         return None

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.ranging.focus_stack import FocusStack
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import ELECTRON, PsdReadout
 from gpuvision.ranging.range_image import StraightTransport
@@ -41,6 +42,8 @@ def require_light(sensor: Sensor) -> Light:
         polygon mirror turns the beam, or the threshold is to be estimated from a recording.
     """
     name = sensor.name or "the sensor"
+    if isinstance(sensor.readout, FocusStack):
+        raise ValueError(f"{name}: a simulation needs a sheet of light, this one measures depth from focus")
     if not isinstance(sensor.transport, StraightTransport):
         raise ValueError(f"{name}: a simulation needs a straight transport, this one has a sheet that turns")
     if sensor.polygon is not None:
@@ -106,7 +109,7 @@ def make_sensor_view(sensor: Sensor) -> SensorView:
     ValueError
         As `require_light`.
     """
-    light, readout = require_light(sensor), sensor.readout
+    light, readout = require_light(sensor), _readout(sensor)
     assert sensor.frame is not None  # the region of a triangulation is derived from the frame
     assert light.lens is not None  # require_light checked it
     axes = readout.axes
@@ -148,7 +151,7 @@ def minimum_sample_power(sensor: Sensor) -> float:
     ValueError
         As `require_light`.
     """
-    light, readout = require_light(sensor), sensor.readout
+    light, readout = require_light(sensor), _readout(sensor)
     if isinstance(readout, PsdReadout):
         return readout.minimum_total / light.responsivity
     grey = max(readout.minimum_peak or 0.0, readout.threshold)
@@ -175,7 +178,7 @@ def make_simulator(sensor: Sensor, view: SensorView, mask: Mask | None = None) -
     ValueError
         As `require_light`; or the mask does not fit the view.
     """
-    light, readout = require_light(sensor), sensor.readout
+    light, readout = require_light(sensor), _readout(sensor)
     if isinstance(readout, PsdReadout):
         return PsdSimulator(
             view=view,
@@ -197,6 +200,11 @@ def make_simulator(sensor: Sensor, view: SensorView, mask: Mask | None = None) -
         ambient=light.ambient,
         mask=mask,
     )
+
+
+def _readout(sensor: Sensor) -> LineReadout | PsdReadout:
+    assert not isinstance(sensor.readout, FocusStack)  # require_light checked it
+    return sensor.readout
 
 
 def _transport(sensor: Sensor) -> StraightTransport:

@@ -100,7 +100,8 @@ class Scan:
     grid : Grid
         Cells of the height map.
     frame_numbers : numpy.ndarray
-        Number of each profile's frame in the recording, (profiles,); not consecutive where frames were dropped.
+        Number of each profile's frame in the recording, (profiles,); not consecutive where frames were dropped. Of a
+        focus stack: number of the sharpest frame of each pixel, (rows, columns), -1 where there is none.
     device : Device
         Device of the computation.
     stream : StreamReport
@@ -181,7 +182,7 @@ class Scan:
             "precision": "double" if self.points.z.dtype == np.float64 else "single",
             "frames": self.stream.frames,
             "dropped": stream.pop("dropped"),
-            "samples_per_frame": self.points.z.shape[1],
+            "samples_per_frame": self.points.z.size if self.sensor.kind == "focus" else self.points.z.shape[1],
             "valid_fraction": self.valid_fraction,
             "status": self.counts(),
             "throughput": self.throughput,
@@ -248,7 +249,7 @@ class Scan:
 
     def _arrays(self) -> tuple[dict[str, Array], dict[str, str]]:
         """Return the arrays of ``range_image.npz`` and their units, by name."""
-        light = "grey level" if self.sensor.kind == "camera" else "A"
+        light = "A" if self.sensor.kind == "psd" else "grey level"
         held: dict[str, tuple[Any, str]] = {
             **{name: (getattr(self.points, name), "m") for name in ("x", "y", "z")},
             "status": (self.points.status, "flags"),
@@ -283,6 +284,8 @@ def scan_advice(status: npt.NDArray[np.uint8], sensor: Sensor) -> tuple[str, ...
             f"most samples are dark at a threshold of {sensor.readout.threshold:g} grey levels: try {threshold}, "
             "[recording] background in ambient light, another [recording] channel, or a longer exposure"
         )
+    elif Status.LOW_SIGNAL in frequent and sensor.kind == "focus":
+        sentences.append("most pixels have no texture: try a lower [focus] threshold, or project a pattern")
     elif Status.LOW_SIGNAL in frequent:
         sentences.append("most samples are dark: try a lower [psd] minimum_total, or more light")
     if Status.AMBIGUOUS in frequent and camera:
@@ -291,6 +294,11 @@ def scan_advice(status: npt.NDArray[np.uint8], sensor: Sensor) -> tuple[str, ...
             "light, or a higher [line] threshold"
         )
     if frequent & {Status.HORIZON, Status.OUT_OF_RANGE}:
+        if sensor.kind == "focus":
+            return (
+                *sentences,
+                "most pixels are sharpest outside the stack: check its range, and the limits of [output]",
+            )
         step = "the sign of [transport] angle_step and axis_direction" if turning else "the sign of [axes] and baseline"
         sentences.append(f"most samples miss the scene: check {step}, and the limits x, y, z of [output]")
     return tuple(sentences)

@@ -22,12 +22,14 @@ from gpuvision.host.pipeline import Pipeline, Policy
 from gpuvision.host.planning import plan_stream
 from gpuvision.host.sources import PacedSource, Source
 from gpuvision.host.trace import Trace
+from gpuvision.ranging.focus_stack import FocusStack
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
 from gpuvision.ranging.regrid import Direction, Grid, HeightMap, Regrid
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
+from gpuvision.workflows.focus_frames import read_focus_peak
 from gpuvision.workflows.opened_recording import open_for_scan
 from gpuvision.workflows.scan_result import Scan, ScanLimits, scan_advice
 
@@ -90,6 +92,10 @@ def scan(
     OSError
         The timeline cannot be written.
     """
+    if isinstance(sensor.readout, FocusStack):
+        if rate is not None or policy is not None or trace is not None:
+            raise ValueError("a focus stack is one measurement; rate, policy and trace have no effect on it")
+        return _scan_stack(recording, sensor, sensor.readout, device, precision, progress, limits)
     timeline = None if trace is None else _DeferredTrace(trace, overwrite)
     opened = open_for_scan(recording, sensor)
     source, name, sensor = opened.source, opened.name, opened.sensor
@@ -120,6 +126,43 @@ def scan(
     )
 
 
+def _scan_stack(
+    recording: str | Path | Source | Array,
+    sensor: Sensor,
+    stack: FocusStack,
+    device: Device | None,
+    precision: Precision,
+    progress: Progress,
+    limits: ScanLimits,
+) -> Scan:
+    """Compute the range image and the height map of a focus stack: one frame for each focus distance."""
+    opened = open_for_scan(recording, sensor)
+    peak, stream = read_focus_peak(opened.source, stack, progress)
+    assert isinstance(sensor.transport, StraightTransport)  # the reader of [focus] gives no other
+    start = time.perf_counter()
+    points = stack.points(
+        peak, sensor.transport, sensor.output.limits, np.float64 if precision == "double" else np.float32
+    )
+    _drop_ambiguous(sensor, points)
+    intensity = peak.strength.astype(points.z.dtype)
+    middle = time.perf_counter()
+    device = Device.best() if device is None else device
+    heights, grid = resample_heights(sensor, points, intensity, device, max_cells=limits.max_cells)
+    return Scan(
+        sensor=sensor,
+        points=points,
+        intensity=intensity,
+        heights=heights,
+        grid=grid,
+        frame_numbers=np.where(np.isfinite(peak.frame), np.rint(peak.frame), -1.0).astype(np.int64),
+        device=device,
+        stream=stream,
+        seconds={"assemble": middle - start, "resample": time.perf_counter() - middle},
+        metadata=_metadata(opened.name, sensor, None, opened.source),
+        limits=limits,
+    )
+
+
 class _DeferredTrace(Trace):
     """Trace that writes its file after the scan: a scan that fails leaves no file.
 
@@ -145,7 +188,7 @@ def _metadata(name: str, sensor: Sensor, rate: float | None, source: Source) -> 
         "sensor": sensor.name,
         "kind": sensor.kind,
         "background": str(sensor.recording.background),
-        "threshold": sensor.readout.threshold if isinstance(sensor.readout, LineReadout) else None,
+        "threshold": None if isinstance(sensor.readout, PsdReadout) else sensor.readout.threshold,
         "sensor_rate": sensor.recording.rate,
         "rate": rate,
         "encoder": _encoder(sensor),
@@ -166,6 +209,7 @@ def _encoder(sensor: Sensor) -> dict[str, Any] | None:
 
 def _with_range_outputs(sensor: Sensor, precision: Precision) -> LineReadout | PsdReadout:
     """Return the sensor's readout with only the outputs that a range image needs."""
+    assert not isinstance(sensor.readout, FocusStack)  # it has no stream of profiles
     positions = ("position",) if isinstance(sensor.transport, RotatingSheet) else ("g", "h")
     light = "peak" if sensor.kind == "camera" else "total"
     return dataclasses.replace(sensor.readout, outputs=(*positions, light, "status"), precision=precision)
@@ -252,11 +296,16 @@ def assemble_points(
     else:
         assemble = RangeImage(geometry=sensor.transport, limits=limits)
         points = assemble(*positions, transports.astype(positions[0].dtype), status, device=device)
+    _drop_ambiguous(sensor, points)
+    return points
+
+
+def _drop_ambiguous(sensor: Sensor, points: RangePoints) -> None:
+    """Make ambiguous points NaN where the sensor file asks for that."""
     if sensor.output.ambiguous == "drop":
         ambiguous = (to_numpy(points.status) & Status.AMBIGUOUS) != 0
         for coordinate in (points.x, points.y, points.z):
             to_numpy(coordinate)[ambiguous] = np.nan
-    return points
 
 
 def resample_heights(

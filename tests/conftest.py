@@ -1,9 +1,10 @@
 """Devices, tiers and caches of the tests. Without an OpenCL device, tests that need one fail.
 
 The option ``--tier`` selects the tests. ``fast`` runs all tests without the mark ``slow`` on the best device, and a
-smoke set on every other device: one test for each file. Of kernel tests with several parameters it runs a covering
-design, and of hypothesis tests fewer examples, see `tiers`. ``full`` runs all tests on every device. ``nightly`` is
-``full`` with more hypothesis examples.
+smoke set on every other device: one test for each kernel. Of kernel tests with several parameters it runs a covering
+design, of both variants of a kernel a few tests for each file, and of hypothesis tests fewer examples, see `tiers`.
+``full`` runs all tests on the best device; on every other device it runs no slow tests, and a covering design of
+products of three or more parameters. ``nightly`` runs all tests on every device, with more hypothesis examples.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import pytest
 
 from gpuvision.host import Device, debug
 from gpuvision.host.discovery import INSTALL_HINT
-from tiers import LEFT, device_of, select_fast
+from tiers import LEFT, device_of, select_fast, select_full
 
 ROOT = Path(__file__).resolve().parents[1]
 # Compiled kernels of all runtimes, verdicts of devices, fonts of matplotlib: kept in the clone, so that a second run is
@@ -66,9 +67,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Deselect the tests that the tier omits; draw the tier's number of hypothesis examples."""
     tier = config.getoption("tier")
     _set_examples(items, EXAMPLES[tier])
-    if tier != "fast":
+    if tier == "nightly":
         return
-    chosen, left, without_inline = select_fast(items, Device.all()[:1])
+    chosen, left, without_inline = (select_fast if tier == "fast" else select_full)(items, Device.all()[:1])
     for item in without_inline:
         item.stash[WITHOUT_INLINE] = True
     if left:
@@ -150,14 +151,15 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print the number of passed tests for every device, which CI reads, and of the tests of the full tier only."""
+    """Print the number of passed tests for every device, which CI reads, and of the tests that the tier leaves out."""
     config = terminalreporter.config
     passed = terminalreporter.getreports("passed")
     labels = Counter(label for each in passed for name, label in each.user_properties if name == "device")
     terminalreporter.write_line(f"kernel tests passed: {_counts(labels) or 'on no device'}")
     left = config.stash.get(LEFT_COUNTS, {})
     if left:
-        terminalreporter.write_line(f"left to the full tier (make test-full): {_counts(left)}")
+        more = "full tier (make test-full)" if config.getoption("tier") == "fast" else "nightly tier (make nightly)"
+        terminalreporter.write_line(f"left to the {more}: {_counts(left)}")
     if config.getoption("strict_skips"):
         for each in _unexpected_skips(config):
             terminalreporter.write_line(f"unexpected skip: {each}", red=True)

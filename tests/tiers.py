@@ -1,8 +1,10 @@
-"""Selection of the fast tier: tests of the best device, a smoke set of the others, covering designs of products."""
+"""Selection of the fast and of the full tier: what the best device runs, and what the other devices run of it."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
@@ -10,21 +12,27 @@ import pytest
 from designs import covering
 from gpuvision.host import Device
 
-# Folders whose tests run whole tasks with the kernels of other files.
-_COMPOSED = frozenset({"cli", "profiling", "workflows"})
-# Tests of this run that the fast tier leaves to the full tier, for `pytest.Session`.
+_ROOT = Path(__file__).resolve().parents[1]
+# Names of the test files that are about one kernel; other files run whole tasks with kernels of these files.
+_OF_KERNELS = {f"test_{path.parent.name}" for path in (_ROOT / "kernels").glob("*/*.cl")}
+# Folders whose test files are not about a kernel, also where they have the name of one.
+_COMPOSED = frozenset({"cli", "formats", "profiling", "workflows"})
+# Test functions of a file that the fast tier runs in both kernel variants: the variants differ in few functions of a
+# kernel, and each variant is a compilation of its own.
+_IN_BOTH_VARIANTS = 2
+# Tests of this run that the tier leaves out, for `pytest.Session`.
 LEFT = pytest.StashKey[list[pytest.Item]]()
 
 
 class Selection(NamedTuple):
-    """Tests of the fast tier, in their order.
+    """Tests of a tier, in their order.
 
     Attributes
     ----------
     chosen : list of pytest.Item
-        Tests of the fast tier.
+        Tests of the tier.
     left : list of pytest.Item
-        Slow tests, cases beyond a covering design and, on all devices but the best, tests beyond the smoke set.
+        The other tests.
     without_inline : set of pytest.Item
         Chosen tests that run without PoCL's inline device, for which PoCL compiles each kernel once more: all tests
         outside ``tests/host`` that are not in the smoke set.
@@ -35,10 +43,27 @@ class Selection(NamedTuple):
     without_inline: set[pytest.Item]
 
 
+def select_full(items: Sequence[pytest.Item], best: Collection[Device]) -> Selection:
+    """Return the full tier of some tests; `best` has the best device.
+
+    The best device runs all tests, every other device a covering design of each product of three or more parameters,
+    and no slow tests: these measure accuracy, which the comparison of the devices with the references covers.
+    """
+    others = [item for item in items if device_of(item) not in (None, *best)]
+    kept = set(_designed([item for item in others if item.get_closest_marker("slow") is None], pairs=True))
+    left = [item for item in others if item not in kept]
+    omitted = set(left)
+    return Selection([item for item in items if item not in omitted], left, set())
+
+
 def select_fast(items: Sequence[pytest.Item], best: Collection[Device]) -> Selection:
-    """Return the fast tier of some tests; `best` has the best device."""
+    """Return the fast tier of some tests; `best` has the best device.
+
+    It leaves out slow tests, cases of the kernel variant that the device does not use by default beyond the first
+    functions of a file, cases beyond a covering design and, on all devices but the best, tests beyond the smoke set.
+    """
     fast = [item for item in items if item.get_closest_marker("slow") is None]
-    designed = set(_designed(fast))
+    designed = set(_designed(list(_of_variants(fast))))
     selection = Selection([], [], set())
     seen = set()
     for item in items:
@@ -60,12 +85,34 @@ def collected_items(session: pytest.Session) -> list[pytest.Item]:
     return [*session.items, *session.config.stash.get(LEFT, [])]
 
 
-def _designed(items: Sequence[pytest.Item]) -> Iterator[pytest.Item]:
+def _of_variants(items: Sequence[pytest.Item]) -> Iterator[pytest.Item]:
+    """Yield all tests but those of a device's other kernel variant beyond the first functions of each file.
+
+    A function without cases of the device's default variant keeps its cases.
+    """
+    by_function: dict[Any, list[pytest.Item]] = {}
+    for item in items:
+        by_function.setdefault((item.path, device_of(item), item.parent, function_of(item)), []).append(item)
+    functions: Counter[Any] = Counter()
+    for (path, device, *_), cases in by_function.items():
+        usual = [item for item in cases if _has_usual_variant(item)]
+        if len(usual) < len(cases) and not _is_of_host(cases[0]):
+            functions[path, device] += 1
+        yield from usual if usual and functions[path, device] > _IN_BOTH_VARIANTS else cases
+
+
+def _has_usual_variant(item: pytest.Item) -> bool:
+    """Return whether a kernel test has the variant that its device uses by default; True for other tests."""
+    device, variant = device_of(item), _parameters_of(item).get("variant")
+    return device is None or variant != ("work_item" if device.is_cpu else "vector")
+
+
+def _designed(items: Sequence[pytest.Item], *, pairs: bool = False) -> Iterator[pytest.Item]:
     """Yield a covering design of each kernel test, and all cases of other tests.
 
     Most of a kernel test's time is compilation, once for each kernel variant, dtype and option. Of a test with two
     parameters the design holds each value, of a test with more each pair of values; the device is not a parameter.
-    In ``tests/host``, which compiles little, it holds each pair in both cases.
+    With `pairs`, and in ``tests/host``, which compiles little, it holds each pair in both cases.
     """
     functions: dict[Any, list[pytest.Item]] = {}
     for item in items:
@@ -74,8 +121,9 @@ def _designed(items: Sequence[pytest.Item]) -> Iterator[pytest.Item]:
         parameters = [
             {name: value for name, value in _parameters_of(item).items() if name != "device"} for item in cases
         ]
-        strength = 1 if len(parameters[0]) == 2 and not _is_of_host(cases[0]) else 2
-        is_product = device is not None and len(parameters[0]) > 1
+        varying = [name for name in parameters[0] if len({repr(each[name]) for each in parameters}) > 1]
+        strength = 1 if len(varying) == 2 and not (pairs or _is_of_host(cases[0])) else 2
+        is_product = device is not None and len(parameters[0]) > 1 and len(varying) > 1
         yield from (cases[k] for k in (covering(parameters, strength) if is_product else range(len(cases))))
 
 
@@ -83,12 +131,12 @@ def _smoke_case(item: pytest.Item) -> tuple[Any, ...] | None:
     """Return a key: file and device; the smoke set has the first test of each key.
 
     Runtimes differ most in queues and memory: in ``tests/host`` the key also has the test function. ``None``: the smoke
-    set has no test of the file, because it runs whole tasks with the kernels of other files.
+    set has no test of the file, because it runs the kernels of other files.
     """
-    if item.path.parent.name in _COMPOSED:
-        return None
-    function = function_of(item) if _is_of_host(item) else ""
-    return (item.path, function, str(device_of(item)))
+    if _is_of_host(item):
+        return (item.path, function_of(item), str(device_of(item)))
+    is_of_kernel = item.path.stem in _OF_KERNELS and item.path.parent.name not in _COMPOSED
+    return (item.path, "", str(device_of(item))) if is_of_kernel else None
 
 
 def _is_of_host(item: pytest.Item) -> bool:

@@ -32,7 +32,14 @@ def _python_of(page: str) -> list[tuple[int, str]]:
     return [(text.count("\n", 0, each.start(3)) + 1, each[3]) for each in found if each[2].strip() == "python"]
 
 
-@pytest.mark.parametrize("page", [page for page in _pages() if _python_of(page)])
+# Pages with the operations of another page, for which other kernels are compiled.
+SLOW = {"docs/tutorials/first_pose.md"}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=[pytest.mark.slow] if page in SLOW else []) for page in _pages() if _python_of(page)],
+)
 def test_python_on_pages_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of a page run in order, in one namespace, in a folder with the files that the page names."""
     monkeypatch.chdir(tmp_path)

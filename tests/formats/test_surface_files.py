@@ -7,7 +7,6 @@ import zipfile
 
 import numpy as np
 import pytest
-from SurfaceTopography.IO import open_topography
 
 from gpuvision.formats.surface_files import SURFACE_WRITERS, write_sdf, write_sur, write_x3p
 from gpuvision.ranging.regrid import Grid
@@ -25,6 +24,8 @@ def z(rng):
 
 def read(path):
     """Return heights [m] with NaN in holes, as (x, y) from the first stored row, and the size [m]."""
+    from SurfaceTopography.IO import open_topography  # takes seconds; here only the process of these tests imports it
+
     topography = open_topography(str(path)).topography()
     unit = METRES[topography.unit]
     return np.ma.filled(topography.heights(), np.nan) * unit, np.array(topography.physical_sizes) * unit

@@ -79,7 +79,9 @@ def test_centre_of_gravity(device, rng, method, dtype, along, variant):
 )
 def test_fits(device, rng, method, dtype, along, variant):
     noise = {"read_noise": TOP[dtype] * 0.02, "gain": 0.3} if method == "ml" else {}
-    parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": 7, **noise}
+    # More samples for the fit with the noise of uint16, so that it converges in nearly all profiles.
+    window = 7 if dtype == "uint16" else WINDOW
+    parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": window, **noise}
     frames = line_frames(rng, dtype, (40, 83) if along == "columns" else (83, 40), along)
     if dtype == "uint8":
         frames = np.pad(frames, ((5, 5), (0, 0)))
@@ -98,10 +100,12 @@ def test_fits(device, rng, method, dtype, along, variant):
 
 @pytest.mark.parametrize("peak_selection", ["first", "last", "nearest", "strongest"])
 @pytest.mark.parametrize(
-    ("dtype", "along", "variant"),
+    "kernel",
     [("uint8", "columns", "vector"), ("uint16", "rows", "vector"), ("float32", "columns", "work_item")],
+    ids="-".join,
 )
-def test_peak_selection(device, rng, peak_selection, dtype, along, variant):
+def test_peak_selection(device, rng, peak_selection, kernel):
+    dtype, along, variant = kernel
     parameters = {"along": along, "threshold": LEVEL[dtype], "window": WINDOW, "peak_selection": peak_selection}
     parameters |= {"minimum_width": 2, "maximum_width": 9, "minimum_peak": LEVEL[dtype] * 2}
     shape = (2, 90, 50) if along == "columns" else (2, 50, 90)
@@ -132,10 +136,10 @@ def test_double(device, rng, variant):
 
 @given(rows=st.integers(1, 90), columns=st.integers(1, 150), frames=st.integers(1, 3), seed=st.integers(0, 99))
 @settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
-def test_any_shape(rows, columns, frames, seed):
+def test_any_shape(device, rows, columns, frames, seed):
     rng = np.random.default_rng(seed)
     image = line_frames(rng, "uint8", (frames, rows, columns))
-    for device, method, variant in itertools.product(Device.all(), ("centroid", "windowed"), VARIANTS):
+    for method, variant in itertools.product(("centroid", "windowed"), VARIANTS):
         parameters = {"method": method, "threshold": 20, "window": WINDOW}
         assert_same(
             LineReadout(variant=variant, **parameters)(image, device=device), read_lines(image, **parameters), slack=4.0
@@ -218,12 +222,18 @@ def test_flat_top_is_read_in_its_middle(device):
 METHODS_WITH_PEAKS = ("windowed", "gauss3", "fir", "ml")
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize(
-    ("along", "peak_selection"), [("columns", "strongest"), ("rows", "strongest"), ("columns", "last")]
+    "kernel",
+    [
+        (along, peak_selection, variant)
+        for along, peak_selection in (("columns", "strongest"), ("rows", "strongest"), ("columns", "last"))
+        for variant in VARIANTS
+    ],
+    ids="-".join,
 )
 @pytest.mark.parametrize("method", METHODS_WITH_PEAKS)
-def test_top_wider_than_the_window(device, variant, along, peak_selection, method):
+def test_top_wider_than_the_window(device, kernel, method):
+    along, peak_selection, variant = kernel
     for width in (20, 21):
         frame = column(*[0] * 20, *[255] * width, *[0] * 40)
         frame = frame if along == "columns" else np.ascontiguousarray(frame.T)
@@ -237,21 +247,23 @@ def test_top_wider_than_the_window(device, variant, along, peak_selection, metho
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("peak_selection", ["first", "strongest"])
-def test_only_neighbours_make_a_flat_top(device, variant, peak_selection):
+@pytest.mark.parametrize("method", ["gauss3", "fir", "windowed"])
+def test_only_neighbours_make_a_flat_top(device, variant, peak_selection, method):
     frame = column(*[0] * 19, 100, 255, 100, *[0] * 4, 100, 255, 255, *[0] * 20)
-    for method in ("gauss3", "fir", "windowed"):
-        parameters = {
-            "method": method,
-            "threshold": 5,
-            "window": 8 if method == "gauss3" else 3,
-            "peak_selection": peak_selection,
-        }
-        reading = LineReadout(variant=variant, **parameters)(frame, device=device)
-        np.testing.assert_array_equal(reading.status, SATURATED)
-        np.testing.assert_allclose(reading.position, 20.0, atol=1e-5)
+    parameters = {
+        "method": method,
+        "threshold": 5,
+        "window": 8 if method == "gauss3" else 3,
+        "peak_selection": peak_selection,
+    }
+    reading = LineReadout(variant=variant, **parameters)(frame, device=device)
+    np.testing.assert_array_equal(reading.status, SATURATED)
+    np.testing.assert_allclose(reading.position, 20.0, atol=1e-5)
 
 
-@pytest.mark.parametrize(("dtype", "gain"), [("uint8", 0.0), ("float32", 0.3)])
+@pytest.mark.parametrize(
+    ("dtype", "gain"), [("uint8", 0.0), ("uint8", 0.3), pytest.param("float32", 0.3, marks=pytest.mark.slow)]
+)
 def test_fit_of_noise_stays_at_its_peak(device, rng, dtype, gain):
     """If the fit does not converge inside the window, the centre of gravity is returned."""
     frame = rng.integers(0, 255, (70, 400)).astype(dtype)
@@ -285,27 +297,30 @@ def test_fit_leaves_saturated_samples_out(device):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("along", ["columns", "rows"])
-def test_not_finite(device, rng, variant, along):
-    for method, peak_selection in (("centroid", "strongest"), ("windowed", "strongest"), ("windowed", "last")):
-        frames = line_frames(rng, "float32", (60, 70), along) - 50.0  # negative after a dark frame
-        frames[7, 20], frames[11, 21], frames[13, 22] = np.nan, np.inf, -np.inf
-        parameters = {
-            "method": method,
-            "peak_selection": peak_selection,
-            "threshold": 0.0,
-            "window": WINDOW,
-            "along": along,
-            "saturation": 1e9,
-        }
-        reading, expected = (
-            LineReadout(variant=variant, **parameters)(frames, device=device),
-            read_lines(frames, **parameters),
-        )
-        lost = expected["status"] & NOT_FINITE != 0
-        assert lost.sum() == 3
-        np.testing.assert_array_equal(reading.status & NOT_FINITE != 0, lost)
-        assert all(np.isnan(getattr(reading, name)[lost]).all() for name in ("position", "peak", "width", "total"))
-        np.testing.assert_allclose(reading.position[~lost], expected["position"][~lost], rtol=4e-7, atol=2e-5)
+@pytest.mark.parametrize(
+    "estimator", [("centroid", "strongest"), ("windowed", "strongest"), ("windowed", "last")], ids="-".join
+)
+def test_not_finite(device, rng, variant, along, estimator):
+    method, peak_selection = estimator
+    frames = line_frames(rng, "float32", (60, 70), along) - 50.0  # negative after a dark frame
+    frames[7, 20], frames[11, 21], frames[13, 22] = np.nan, np.inf, -np.inf
+    parameters = {
+        "method": method,
+        "peak_selection": peak_selection,
+        "threshold": 0.0,
+        "window": WINDOW,
+        "along": along,
+        "saturation": 1e9,
+    }
+    reading, expected = (
+        LineReadout(variant=variant, **parameters)(frames, device=device),
+        read_lines(frames, **parameters),
+    )
+    lost = expected["status"] & NOT_FINITE != 0
+    assert lost.sum() == 3
+    np.testing.assert_array_equal(reading.status & NOT_FINITE != 0, lost)
+    assert all(np.isnan(getattr(reading, name)[lost]).all() for name in ("position", "peak", "width", "total"))
+    np.testing.assert_allclose(reading.position[~lost], expected["position"][~lost], rtol=4e-7, atol=2e-5)
 
 
 @pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
@@ -451,33 +466,33 @@ LENS = Lens(k1=4e-8, k2=1e-14, centre=(450.0, 350.0))
 
 
 @pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
-def test_triangulates_in_the_same_pass(device, rng, along, variant):
+@pytest.mark.parametrize("method", ["centroid", "windowed"])
+def test_triangulates_in_the_same_pass(device, rng, along, variant, method):
     sheet = replace(SHEET, along=along, lens=LENS)
     frames = line_frames(rng, "uint8", (2, 99, 130), along)
     axes = SampleAxes(position_origin=300.0, sample_origin=400.0, sample_pitch=2.0)
-    for method in ("centroid", "windowed"):
-        parameters = {"method": method, "along": along, "threshold": 20, "window": WINDOW}
-        reading = LineReadout(variant=variant, triangulation=sheet, axes=axes, **parameters)(frames, device=device)
-        expected = read_lines(frames, **parameters)
-        samples = np.broadcast_to(400.0 + 2.0 * np.arange(reading.position.shape[1]), reading.position.shape)
-        g, h, status = triangulate(
-            expected["position"] + 300.0,
-            samples,
-            sheet.homography,
-            sheet.region,
-            lens=(LENS.k1, LENS.k2, LENS.centre),
-            along=along,
-        )
-        good = expected["status"] == 0
-        assert good.any()
-        assert not status[good].any()
-        np.testing.assert_array_equal(reading.status, expected["status"])
-        # 0.2 mm per pixel; single precision resolves 4e-5 px at 400 px.
-        np.testing.assert_allclose(reading.g[good], g[good], atol=2e-8)
-        np.testing.assert_allclose(reading.h[good], h[good], atol=2e-8)
-        lost = np.isnan(expected["position"])
-        assert np.isnan(reading.g[lost]).all()
-        assert np.isnan(reading.h[lost]).all()
+    parameters = {"method": method, "along": along, "threshold": 20, "window": WINDOW}
+    reading = LineReadout(variant=variant, triangulation=sheet, axes=axes, **parameters)(frames, device=device)
+    expected = read_lines(frames, **parameters)
+    samples = np.broadcast_to(400.0 + 2.0 * np.arange(reading.position.shape[1]), reading.position.shape)
+    g, h, status = triangulate(
+        expected["position"] + 300.0,
+        samples,
+        sheet.homography,
+        sheet.region,
+        lens=(LENS.k1, LENS.k2, LENS.centre),
+        along=along,
+    )
+    good = expected["status"] == 0
+    assert good.any()
+    assert not status[good].any()
+    np.testing.assert_array_equal(reading.status, expected["status"])
+    # 0.2 mm per pixel; single precision resolves 4e-5 px at 400 px.
+    np.testing.assert_allclose(reading.g[good], g[good], atol=2e-8)
+    np.testing.assert_allclose(reading.h[good], h[good], atol=2e-8)
+    lost = np.isnan(expected["position"])
+    assert np.isnan(reading.g[lost]).all()
+    assert np.isnan(reading.h[lost]).all()
 
 
 def test_triangulation_flags_its_own(device):

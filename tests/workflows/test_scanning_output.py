@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from SurfaceTopography.IO import open_topography
 
 from gpuvision.formats.range_image import read_ply, read_tiff
 from gpuvision.host.files import atomic_folder, check_writable_file, check_writable_folder
@@ -114,6 +113,8 @@ def test_an_empty_name_is_not_this_folder(plane: Path, tmp_path: Path, run: Any)
 
 
 def test_a_scan_also_writes_surface_files_and_a_ply_of_valid_points(plane: Path, tmp_path: Path, run: Any) -> None:
+    from SurfaceTopography.IO import open_topography  # takes seconds; here only the process of this test imports it
+
     out = tmp_path / "out"
     formats = ("--format", "x3p", "--format", "sur", "--format", "sdf-ascii", "--ply", "valid")
     assert run("scan", plane, "--sensor", "psd_line", "--out", out, *formats).code == 0

@@ -44,7 +44,10 @@ def centre(blobs: Any, k: int = 0) -> np.ndarray:
     return np.array([blobs.x[k], blobs.y[k]], np.float64)
 
 
-@pytest.mark.parametrize(("dtype", "variant"), [(np.uint8, "vector"), (np.uint16, "vector"), (np.float32, "work_item")])
+@pytest.mark.parametrize(
+    ("dtype", "variant"),
+    [(np.uint8, "vector"), pytest.param(np.uint16, "vector", marks=pytest.mark.slow), (np.float32, "work_item")],
+)
 def test_a_disc(device: Device, dtype: Any, variant: Any) -> None:
     blobs = replace(PLAIN, variant=variant)(image_of(a_disc(), dtype), place(), device=device)
     assert blobs.status[0] == 0
@@ -127,7 +130,10 @@ def test_edges_alone_as_their_circle_has_it(device: Device, variant: Any, radius
     assert abs(blobs.size[0] - radius) < 0.01
 
 
-@pytest.mark.parametrize(("spokes", "match"), [(8, True), pytest.param(20, True, marks=pytest.mark.slow), (44, False)])
+@pytest.mark.parametrize(
+    ("spokes", "match"),
+    [(8, True), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((20, True), (44, False)))],
+)
 def test_any_number_of_rulers(device: Device, spokes: int, match: bool) -> None:
     """Numbers of fiducials that fill the kernel's vectors, and other numbers."""
     blobs = replace(PLAIN, spokes=spokes, match=match)(a_disc().astype(np.float32), place(), device=device)
@@ -354,7 +360,7 @@ def test_wrong_input(device: Device) -> None:
     with pytest.raises(ValueError, match="to the number of blobs"):
         PLAIN.bind(device, SHAPE, np.uint8)
     with pytest.raises(ValueError, match="shape"):
-        replace(PLAIN, shape="square")(np.zeros(SHAPE, np.uint8), place(), device=device)
+        replace(PLAIN, shape="square", polarity="dark")(np.zeros(SHAPE, np.float32), place(), device=device)
     with pytest.raises(TypeError, match="float32"):
         PLAIN(np.zeros(SHAPE, np.uint8), place().astype(np.float64), device=device)
 

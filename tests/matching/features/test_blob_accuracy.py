@@ -15,9 +15,11 @@ from gpuvision.reference import blob as reference
 CONTRAST, DRAWS = 100.0, 200
 SLOW = pytest.mark.slow
 DISCS = [
-    (3.0, 1.0),
     (10.0, 1.0),
-    *(pytest.param(*each, marks=SLOW) for each in ((3.0, 0.5), (5.0, 1.5), (10.0, 2.0), (20.0, 0.7), (40.0, 1.5))),
+    *(
+        pytest.param(*each, marks=SLOW)
+        for each in ((3.0, 1.0), (3.0, 0.5), (5.0, 1.5), (10.0, 2.0), (20.0, 0.7), (40.0, 1.5))
+    ),
 ]
 
 
@@ -71,6 +73,7 @@ def test_close_to_the_bound(device: Device, radius: float, blur: float, snr: flo
     assert abs(predicted / deviation - 1.0) <= 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr", [12.0, 50.0])
 @pytest.mark.parametrize(("radius", "blur"), [(10.0, 1.0), pytest.param(20.0, 2.0, marks=SLOW)])
 def test_edges_alone(device: Device, radius: float, blur: float, snr: float, rng: np.random.Generator) -> None:

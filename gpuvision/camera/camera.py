@@ -41,6 +41,8 @@ _MAX_SQUARE = 1e12
 # Factor on the largest squared distorted radius of the sampled fold points: the fold of a decentred lens can lie
 # farther out between the sampled directions.
 _FOLD_SAMPLING = 1.05
+# Error of a correction without a test in the kernel, relative to the rounding of the corrected coordinate.
+_SHARE_OF_ROUNDING = 0.25
 # Fitted starting polynomials that are kept, each some kilobytes.
 _KEPT_STARTS = 64
 
@@ -184,17 +186,28 @@ class Camera:
         with np.errstate(over="ignore"):
             return np.concatenate(parts).astype(real)
 
-    def newton_steps(self, real: npt.DTypeLike, region: Region | None = None) -> int:
-        """Return CAMERA_STEPS for ``camera_undistort``: Newton steps after which most pixels have converged.
+    def newton_steps(self, real: npt.DTypeLike) -> int:
+        """Return CAMERA_STEPS for ``camera_undistort``: Newton steps after which most pixels have converged."""
+        return _inverse_start(self, self._principal_region).newton_steps(real)
+
+    def correction_defines(self, real: npt.DTypeLike, unit: float, region: Region) -> dict[str, Define]:
+        """Return the defines of ``kernels/common/camera.h`` for ``camera_correction``.
 
         Parameters
         ----------
         real : dtype
             float32 or float64, the kernel's real type.
-        region : ((column, column), (row, row)), optional
-            Region of the sensor that is measured [px]. Default: a sensor that the principal point halves.
+        unit : float
+            Unit of the corrections [px]. If a number of steps is known to leave errors below a quarter of the unit's
+            rounding in the whole region, the kernel takes these steps, often none, without a test.
+        region : ((column, column), (row, row))
+            Region of the sensor that is measured [px].
         """
-        return _inverse_start(self, region or self._principal_region).newton_steps(real)
+        start = _inverse_start(self, region)
+        largest_focal = max(self.matrix[0][0], self.matrix[1][1])
+        sure = start.sure_steps(_SHARE_OF_ROUNDING * float(np.finfo(np.dtype(real)).eps) * unit / largest_focal)
+        steps = start.newton_steps(real) if sure is None else sure
+        return {**self.defines(), "CAMERA_STEPS": steps, **flags(CAMERA_SURE=sure is not None)}
 
     # ---- host computation in float64 -----------------------------------------------------------------------
 

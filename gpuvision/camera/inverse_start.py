@@ -18,6 +18,8 @@ Float64 = npt.NDArray[np.float64]
 _TERMS, _VECTOR_TERMS = 8, 3
 # Polar grid of the points of the fit.
 _RADII, _DIRECTIONS = 32, 16
+# Polar grid of the points on which the error of the steps is tested: between the directions of the fit, up to its edge.
+_TEST_RADII, _TEST_DIRECTIONS = 48, 37
 # Radius of the fit: the first factor on the sensor's farthest corner, at most the second on the fold's distorted
 # radius. The inverse has a square-root singularity at the fold, which polynomials do not fit.
 _CORNER_FACTOR, _FOLD_FACTOR = 1.1, 0.95
@@ -108,7 +110,15 @@ class InverseStart:
     @cached_property
     def _steps(self) -> tuple[Float64, Float64]:
         """Squared lengths of the kernel's steps and of the errors after them over the points' own, (steps, points)."""
-        m = self._points
+        square = np.sum(self._points**2, axis=-1)
+        iterates = self._iterates(self._points)
+        with np.errstate(all="ignore"):
+            sizes = np.sum(np.diff(iterates, axis=0) ** 2, axis=-1) / square
+            errors = np.sum((iterates[1:] - self._exact) ** 2, axis=-1) / square
+        return sizes, errors
+
+    def _iterates(self, m: Float64) -> Float64:
+        """Return the displacements of points (n, 2) before the kernel's steps and after each, (1 + steps, n, 2)."""
         square = np.sum(m**2, axis=-1, keepdims=True)
         z = square / self._reach
         terms, by_v, by_w = self._coefficients[:_TERMS], *self._slopes
@@ -116,18 +126,42 @@ class InverseStart:
         g = z * polynomial.polyval(z, terms) + _dot(m, at_v)
         slope = polynomial.polyval(z, terms * np.arange(1, _TERMS + 1)) + _dot(m, _values(z, by_v))
         cross_terms = _values(z, by_w)
-        back, sizes, errors = m * g + square * at_w, [], []
+        iterates = [m * g + square * at_w]
         with np.errstate(all="ignore"):
             for _ in range(_MAX_STEPS):
-                left = self._lens(m + back)[0] + back
+                left = self._lens(m + iterates[-1])[0] + iterates[-1]
                 along = _dot(m, left)
                 step = (
                     left + g * left + m * (2.0 / self._reach * slope * along + _dot(at_v, left)) + cross_terms * along
                 )
-                back = back - step
-                sizes.append(_dot(step, step)[:, 0] / square[:, 0])
-                errors.append(np.sum((back - self._exact) ** 2, axis=-1) / square[:, 0])
-        return np.array(sizes), np.array(errors)
+                iterates.append(iterates[-1] - step)
+        return np.array(iterates)
+
+    @cached_property
+    def _largest_errors(self) -> Float64:
+        """Largest error of a displacement before the kernel's steps and after each, on points between the fit's own."""
+        radii = np.sqrt(self._reach) * (np.arange(_TEST_RADII) + 1.0) / _TEST_RADII
+        angles = (np.arange(_TEST_DIRECTIONS) + 0.5) * (2.0 * math.pi / _TEST_DIRECTIONS)
+        points = (radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1)).reshape(-1, 2)
+        exact = invert_displacement(self._lens, points) - points
+        errors = np.max(np.abs(self._iterates(points) - exact), axis=(1, 2))
+        return np.asarray(np.where(np.isfinite(errors), errors, math.inf))
+
+    def sure_steps(self, tolerance: float) -> int | None:
+        """Return the number of steps, possibly 0, after which every point within the reach is exact to ``tolerance``.
+
+        Parameters
+        ----------
+        tolerance : float
+            Largest error of a displacement, normalised coordinates.
+
+        Returns
+        -------
+        int or None
+            None if no number of steps suffices: a part of the reach lies close to the fold.
+        """
+        enough = np.flatnonzero(self._largest_errors <= tolerance)
+        return int(enough[0]) if len(enough) else None
 
     @cached_property
     def _shrinkage(self) -> float:

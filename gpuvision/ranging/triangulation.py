@@ -153,8 +153,9 @@ class Triangulation(VisionOperation[SheetPoints]):
         if self.lens is not None:
             options |= self.lens.defines
         if self.camera is not None and any(self.camera.distortion):
-            steps = self.camera.newton_steps(real, self._image_region)
-            options |= {**self.camera.defines(), "CAMERA_STEPS": steps, **flags(SHEET_ROWS=self.along == "rows")}
+            _, half = self._centre_and_half_extent()
+            options |= self.camera.correction_defines(real, float(half[0]), self._image_region)
+            options |= flags(SHEET_ROWS=self.along == "rows")
         return options
 
     def packed(self, real: npt.DTypeLike, axes: SampleAxes | None = None) -> npt.NDArray[Any]:

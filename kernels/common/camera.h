@@ -15,7 +15,9 @@
 // Options: only terms that are not zero are compiled. CAMERA; CAMERA_RADIAL and CAMERA_RATIONAL: number of coefficients
 //          (0 to 3) of k1.. and k4..; CAMERA_DECENTRED: p and s; CAMERA_PRISM: s2 and s4; CAMERA_TILTED;
 //          CAMERA_MATRICES: the ideal pixels have another camera matrix; CAMERA_STEPS: Newton steps after which most
-//          points have converged (Camera.newton_steps); it compiles camera_undistort.
+//          points have converged (Camera.newton_steps); it compiles camera_undistort. CAMERA_SURE: the host has verified
+//          that these steps, possibly 0, reach rounding within the reach of the start polynomials
+//          (Camera.correction_options); the steps are not tested then.
 // Tables:  Camera.packed in camera.py, one per direction, with the entries CAMERA_...
 #ifndef CAMERA_H
 #define CAMERA_H
@@ -62,6 +64,11 @@
 #define CAMERA_NOISE 1e-13f
 #endif
 #define CAMERA_MOST_STEPS 8
+#ifdef CAMERA_SURE
+#define CAMERA_TESTED 0
+#else
+#define CAMERA_TESTED 1
+#endif
 
 #if CAMERA_RADIAL == 3
 #define CAMERA_OVER(q, k) ((q) * ((k)[0] + (q) * ((k)[1] + (q) * (k)[2])))
@@ -265,9 +272,9 @@ static inline __attribute__((always_inline)) masks LANED(camera_approach)(reals 
 #endif
     slope *= 2 * per;
     const masks within = mask_of(z <= 1);
-    masks settled = 0;
+    masks settled = -1;
     reals before = camera[CAMERA_FIRST] * q;
-    for (int k = 0; k < CAMERA_MOST_STEPS && (k < CAMERA_STEPS || any_lane(within & ~settled)); k++) {
+    for (int k = 0; k < CAMERA_STEPS || (CAMERA_TESTED && k < CAMERA_MOST_STEPS && any_lane(within & ~settled)); k++) {
         reals move_x, move_y;
         const reals at = LANED(camera_bend)(x + *back_x, y + *back_y, camera, &move_x, &move_y);
         const reals left_x = move_x + *back_x, left_y = move_y + *back_y, along = x * left_x + y * left_y;
@@ -279,12 +286,14 @@ static inline __attribute__((always_inline)) masks LANED(camera_approach)(reals 
         const reals turn = slope * along;
         const reals step_x = left_x + (g * left_x + x * turn), step_y = left_y + (g * left_y + y * turn);
 #endif
-        const reals step = step_x * step_x + step_y * step_y;
         *back_x -= step_x;
         *back_y -= step_y;
+#if CAMERA_TESTED
+        const reals step = step_x * step_x + step_y * step_y;
         settled = mask_of(at < camera[CAMERA_SAFE]) &
                   mask_of(step * step <= (real)CAMERA_LEFT * q * (before + (real)CAMERA_NOISE * q));
         before = step;
+#endif
     }
     return ~(within & settled);
 }

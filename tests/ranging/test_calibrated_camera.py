@@ -227,17 +227,34 @@ def test_only_what_the_camera_has_is_compiled() -> None:
 
 
 def test_the_start_polynomials_fit_the_region(device: Device, rng: np.random.Generator) -> None:
-    """A window far from the principal point takes as few steps as the whole sensor."""
+    """A window far from the principal point needs no step and no test, as the whole sensor."""
     moved = CAMERAS["tilted"].in_window((900.0, 700.0))
     operation = scanner(moved, region=((0.0, 300.0), (0.0, 300.0)))
-    steps = operation.defines(np.float32)["CAMERA_STEPS"]
-    assert isinstance(steps, int)
-    assert steps <= 2
+    options = operation.defines(np.float32)
+    assert options["CAMERA_STEPS"] == 0
+    assert "CAMERA_SURE" in options
     u, v = drawn(operation, rng, 500, np.float32)
     g, h, _ = oracle(operation, u, v)
     result = operation(u, v, device=device)
     np.testing.assert_allclose(result.g, g, rtol=0, atol=4e-6 * 0.1)
     np.testing.assert_allclose(result.h, h, rtol=0, atol=4e-6 * 0.1)
+
+
+def test_a_region_beyond_the_reach_of_the_start_polynomials(device: Device, rng: np.random.Generator) -> None:
+    """Positions outside of the region, and lenses near their fold, are found by the tested iteration."""
+    operation = scanner(CAMERAS["all"], region=((400.0, 600.0), (500.0, 800.0)))
+    wide = replace(operation, region=REGION)
+    u, v = drawn(wide, rng, 500, np.float32)
+    g, h, status = oracle(operation, u, v)
+    assert not status.any()
+    result = operation(u, v, device=device)
+    np.testing.assert_array_equal(result.status, 0)
+    for found, expected in ((result.g, g), (result.h, h)):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * 0.1)
+    near_fold = Camera(
+        matrix=((500.0, 0.0, 640.0), (0.0, 500.0, 512.0), (0.0, 0.0, 1.0)), distortion=(-0.3, 0.1, 1e-4, *(0.0,) * 11)
+    )
+    assert "CAMERA_SURE" not in scanner(near_fold).defines(np.float32)
 
 
 def test_tables_and_errors() -> None:

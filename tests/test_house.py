@@ -179,6 +179,7 @@ FLOORS = (
     ("matching.field",),
     ("matching.pose",),
     ("matching.board",),
+    ("inspection",),
     ("simulation.scene",),
     ("simulation.sensors",),
     ("simulation.errors", "simulation.transport"),

@@ -40,6 +40,10 @@ PACKAGES = {
         "Matching and pose estimation",
         "Measure edges along calipers (rulers), find fiducials, fit lines, and solve for the pose of a board or robot.",
     ),
+    "inspection": (
+        "Inspection",
+        "Measure solder paste and the coplanarity of leads in height maps, with standard deviations.",
+    ),
     "simulation": (
         "Simulation",
         "Predict what a sheet-of-light sensor measures over a part: occlusion, reflectance, interreflection, noise.",

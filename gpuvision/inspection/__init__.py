@@ -1,0 +1,1 @@
+"""Inspection of solder paste and of component leads in height maps."""

@@ -1,0 +1,273 @@
+"""Alignment of a board with a height map by its solder paste: correlation of the pattern, then least squares."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+from scipy.ndimage import median_filter
+
+from gpuvision.inspection.apertures import Aperture, BoardPlacement
+from gpuvision.inspection.coverage import covered
+from gpuvision.inspection.deposits import Deposits, PasteSettings, measure_deposits
+from gpuvision.matching.artwork.shapes import Float64
+from gpuvision.ranging.regrid import Grid
+
+_CELLS_ACROSS = 4.0  # coarse cells across the median aperture. Chosen
+_MOST_COARSE = 1024  # coarse cells along a side. Chosen: a correlation takes 0.1 s
+_BACKGROUND = 5.0  # width of the median filter that finds the board, in aperture sizes
+_MOST_FITTED = 200  # apertures of the least-squares fit. Chosen: they determine the place to a tenth of one offset
+_ROUNDS = 6  # of the least-squares fit
+_CONVERGED = 1e-8  # shift of a round [m]
+_TUKEY = 4.685
+_SECOND_PEAK = 0.95  # a second place whose correlation reaches this share of the best one is as good. Chosen
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alignment:
+    """Place of a board in a height map, fitted to its solder paste.
+
+    Attributes
+    ----------
+    placement : BoardPlacement
+        Fitted place.
+    covariance : (3, 3)
+        Covariance of x, y [m] and theta [rad] about the centre of the apertures, from the scatter of the offsets.
+    centre : (2,)
+        Centre of the fitted apertures in the height map [m].
+    residual_scale : float
+        Robust standard deviation of the offsets about the fit [m].
+    count : int
+        Number of fitted deposits.
+    correlation : float
+        Correlation of the height map with the pattern, 0 to 1.
+    second_correlation : float
+        Correlation of the second best place, more than half an aperture away.
+    """
+
+    placement: BoardPlacement
+    covariance: Float64
+    centre: Float64
+    residual_scale: float
+    count: int
+    correlation: float
+    second_correlation: float
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether another place within the search range fits about as well."""
+        return self.second_correlation > _SECOND_PEAK * self.correlation
+
+
+def align_apertures(
+    z: npt.NDArray[np.floating],
+    grid: Grid,
+    apertures: Sequence[Aperture],
+    settings: PasteSettings,
+    *,
+    initial: BoardPlacement,
+    search_range: tuple[float, float],
+) -> Alignment:
+    """Find the place of a board in a height map by its solder paste.
+
+    Parameters
+    ----------
+    z : numpy.ndarray
+        Heights [m], (rows, columns); NaN in holes.
+    grid : Grid
+        Grid of the heights.
+    apertures : sequence of Aperture
+        Apertures in the coordinates of the board, two or more.
+    settings : PasteSettings
+        Settings of the measurement.
+    initial : BoardPlacement
+        Place where the search begins.
+    search_range : tuple of float
+        Largest shift [m] of the centre of the apertures, and largest rotation [rad].
+
+    Returns
+    -------
+    Alignment
+
+    Raises
+    ------
+    ValueError
+        Fewer than two deposits are found, or the height map shows no part of the pattern.
+
+    Notes
+    -----
+    The common shift and rotation of all deposits is taken for the place of the board: a stencil that is misaligned as a
+    whole is not visible in offsets about this fit.
+    """
+    middle = np.mean([each.centroid for each in apertures], axis=0)
+    coarse, heights = _coarse_heights(np.asarray(z, np.float64), grid, apertures)
+    placement, best, second = _correlate(coarse, heights, apertures, middle, initial, search_range)
+    step = max(len(apertures) // _MOST_FITTED, 1)
+    fitted = list(apertures)[::step]
+    fit = None
+    reach = max(settings.margin, 1.5 * max(coarse.cell_x, coarse.cell_y))
+    for _ in range(_ROUNDS):
+        # The first rounds look farther: the correlation is right to about a coarse cell.
+        found = measure_deposits(
+            z, grid, fitted, placement, dataclasses.replace(settings, margin=reach), correlation_area=1.0
+        )
+        fit = _fit_rigid(found, placement)
+        if fit is None:
+            raise ValueError(
+                "the board was not found in the height map: fewer than two deposits of its paste layer; give another "
+                "initial pose, a larger search range, or the pose"
+            )
+        before, (placement, covariance, scale, count, centre) = placement, fit
+        moved = placement.to_map(middle) - before.to_map(middle)
+        if reach == settings.margin and np.hypot(*moved) < _CONVERGED:
+            break
+        reach = settings.margin
+    return Alignment(
+        placement=placement,
+        covariance=covariance,
+        centre=centre,
+        residual_scale=scale,
+        count=count,
+        correlation=best,
+        second_correlation=second,
+    )
+
+
+def _coarse_heights(z: Float64, grid: Grid, apertures: Sequence[Aperture]) -> tuple[Grid, Float64]:
+    """Return a coarser grid and the heights above the board on it, 0 in holes, limited to typical heights."""
+    size = math.sqrt(float(np.median([each.area for each in apertures])))
+    cell = max(grid.cell_x, grid.cell_y)
+    target = max(size / _CELLS_ACROSS, max(grid.columns * grid.cell_x, grid.rows * grid.cell_y) / _MOST_COARSE, cell)
+    factors = [max(round(target / each), 1) for each in (grid.cell_y, grid.cell_x)]
+    rows, columns = (max(count // factor, 1) for count, factor in zip(grid.shape, factors, strict=True))
+    blocks = z[: rows * factors[0], : columns * factors[1]].reshape(rows, factors[0], columns, factors[1])
+    known = np.isfinite(blocks)
+    count = known.sum(axis=(1, 3))
+    means = np.where(known, blocks, 0.0).sum(axis=(1, 3)) / np.maximum(count, 1)
+    if not count.any():
+        raise ValueError("the height map has no height; expected the heights of a board")
+    filled = np.where(count > 0, means, np.median(means[count > 0]))
+    coarse = Grid(
+        left=grid.left + (factors[1] - 1) / 2 * grid.cell_x,
+        top=grid.top - (factors[0] - 1) / 2 * grid.cell_y,
+        cell_x=factors[1] * grid.cell_x,
+        cell_y=factors[0] * grid.cell_y,
+        columns=columns,
+        rows=rows,
+    )
+    width = max(round(_BACKGROUND * size / target), 3) | 1
+    above = np.where(count > 0, filled - median_filter(filled, width, mode="nearest"), 0.0)
+    limit = float(np.percentile(above, 99))
+    return coarse, np.clip(above, 0.0, limit) if limit > 0 else above
+
+
+def _correlate(
+    grid: Grid,
+    heights: Float64,
+    apertures: Sequence[Aperture],
+    middle: Float64,
+    initial: BoardPlacement,
+    search_range: tuple[float, float],
+) -> tuple[BoardPlacement, float, float]:
+    """Return the place with the best correlation, this correlation, and that of the second best place."""
+    shift, turn = search_range
+    reach = max(float(np.max(np.abs(np.concatenate([each.bounds for each in apertures]) - middle))), grid.cell_x)
+    step = max(grid.cell_x, grid.cell_y) / reach
+    turns = np.linspace(-turn, turn, 2 * math.ceil(turn / step) + 1)
+    pad = [fft.next_fast_len(2 * count, real=True) for count in heights.shape]
+    centred = heights - heights.mean()
+    spectrum = fft.rfft2(centred, pad)
+    norm = float(np.sqrt(np.sum(centred**2)))
+    rows = np.rint(fft.fftfreq(pad[0], 1 / pad[0])).astype(int)[:, None]
+    columns = np.rint(fft.fftfreq(pad[1], 1 / pad[1])).astype(int)[None, :]
+    allowed = np.hypot(rows * grid.cell_y, columns * grid.cell_x) <= shift + min(grid.cell_x, grid.cell_y) / 2
+    allowed &= (np.abs(rows) < heights.shape[0]) & (np.abs(columns) < heights.shape[1])
+    maps: list[Float64] = []
+    places = []
+    for each in turns:
+        placement = _turned(initial, middle, float(each))
+        pattern = _pattern(grid, apertures, placement)
+        spread = float(np.sqrt(np.sum((pattern - pattern.mean()) ** 2)))
+        if not (spread > 0 and norm > 0):
+            maps.append(np.full(pad, -np.inf))
+        else:
+            found = fft.irfft2(spectrum * np.conj(fft.rfft2(pattern - pattern.mean(), pad)), pad)
+            maps.append(np.where(allowed, found / (spread * norm), -np.inf))
+        places.append(placement)
+    peaks = [int(np.argmax(each)) for each in maps]
+    scores = [each.flat[peak] for each, peak in zip(maps, peaks, strict=True)]
+    best = int(np.argmax(scores))
+    if not np.isfinite(scores[best]):
+        raise ValueError("the height map shows no part of the paste pattern; give another initial pose")
+    row, column = np.unravel_index(peaks[best], pad)
+    row_shift, column_shift = int(rows[row, 0]), int(columns[0, column])
+    away = math.sqrt(float(np.median([each.area for each in apertures]))) / 2
+    near = np.hypot((rows - row_shift) * grid.cell_y, (columns - column_shift) * grid.cell_x) <= max(
+        away, 2 * max(grid.cell_x, grid.cell_y)
+    )
+    second = float(np.max(np.where(near, -np.inf, maps[best])))
+    placement = dataclasses.replace(
+        places[best], x=places[best].x + column_shift * grid.cell_x, y=places[best].y - row_shift * grid.cell_y
+    )
+    return placement, float(scores[best]), max(second, 0.0)
+
+
+def _turned(placement: BoardPlacement, middle: Float64, turn: float) -> BoardPlacement:
+    """Return a placement that is turned about a point (2,) of the board."""
+    turned = dataclasses.replace(placement, theta=placement.theta + turn)
+    shift = placement.to_map(middle) - turned.to_map(middle)
+    return dataclasses.replace(turned, x=placement.x + float(shift[0]), y=placement.y + float(shift[1]))
+
+
+def _pattern(grid: Grid, apertures: Sequence[Aperture], placement: BoardPlacement) -> Float64:
+    """Return 1 where cells lie in an aperture, 0 elsewhere."""
+    pattern = np.zeros(grid.shape)
+    x, y = grid.x, grid.y
+    for each in apertures:
+        moved = each.moved(placement)
+        (left, bottom), (right, top) = moved.bounds
+        columns = slice(*np.searchsorted(x, [left, right]))
+        rows = slice(*np.searchsorted(-y, [-top, -bottom]))
+        if columns.stop > columns.start and rows.stop > rows.start:
+            pattern[rows, columns] += covered(moved.shapes, x[columns], y[rows])
+    return np.minimum(pattern, 1.0)
+
+
+def _fit_rigid(
+    found: Deposits, placement: BoardPlacement
+) -> tuple[BoardPlacement, Float64, float, int, Float64] | None:
+    """Fit a shift and a rotation to the offsets of deposits, robustly; None for fewer than two deposits."""
+    known = np.isfinite(found.offset).all(axis=1)
+    if np.count_nonzero(known) < 2:
+        return None
+    offset = found.offset[known] @ placement.matrix.T  # in the height map
+    at = found.centre[known]
+    centre = at.mean(axis=0)
+    arm = at - centre
+    # offset = shift + turn * (-arm_y, arm_x)
+    design = np.zeros((len(at), 2, 3))
+    design[:, 0, 0] = design[:, 1, 1] = 1.0
+    design[:, 0, 2], design[:, 1, 2] = -arm[:, 1], arm[:, 0]
+    weights = np.ones(len(at))
+    motion = np.zeros(3)
+    scale = 0.0
+    for _ in range(30):
+        normal = np.einsum("i,ijk,ijl->kl", weights, design, design)
+        motion = np.linalg.lstsq(normal, np.einsum("i,ijk,ij->k", weights, design, offset), rcond=None)[0]
+        residual = np.hypot(*(offset - design @ motion).T)
+        # The length of a residual of two normal coordinates has the median 1.1774 sigma.
+        scale = max(float(np.median(residual)) / 1.1774, 1e-12)
+        weights = np.maximum(1.0 - (residual / (_TUKEY * scale)) ** 2, 0.0) ** 2
+    turned = dataclasses.replace(placement, theta=placement.theta + float(motion[2]))
+    cos, sin = math.cos(motion[2]), math.sin(motion[2])
+    origin = np.array([placement.x, placement.y]) - centre
+    moved = np.array([[cos, -sin], [sin, cos]]) @ origin + centre + motion[:2]
+    normal = np.einsum("i,ijk,ijl->kl", weights, design, design)
+    covariance = scale**2 * np.linalg.pinv(normal)
+    turned = dataclasses.replace(turned, x=float(moved[0]), y=float(moved[1]))
+    return turned, covariance, scale, int(np.count_nonzero(weights > 0)), centre

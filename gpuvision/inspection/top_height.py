@@ -1,0 +1,102 @@
+"""Height of the top of a bump, without the bias of a maximum over noisy cells."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import uniform_filter
+
+from gpuvision.matching.artwork.shapes import Float64
+
+_LEAST_FILLED = 0.6  # share of the cells of a patch that must have a height. Chosen
+_LEAST_FOR_CURVED = 10  # cells of a patch for a paraboloid, which has 6 coefficients; fewer give their mean. Chosen
+
+
+class TopHeight(NamedTuple):
+    """Height of a top, its standard deviation for independent cells, and its place.
+
+    Attributes
+    ----------
+    height, sigma
+        Height and standard deviation, in the unit of the heights; NaN if no patch has enough cells.
+    row, column
+        Place of the top in cells.
+    """
+
+    height: float
+    sigma: float
+    row: float
+    column: float
+
+
+def top_height(
+    z: Float64, allowed: npt.NDArray[np.bool_], sigma: Float64, half: int, *, reach: npt.NDArray[np.bool_] | None = None
+) -> TopHeight:
+    """Measure the height of the highest patch.
+
+    The cells are split like the fields of a chessboard. The cells of one colour choose the place with the highest
+    mean; a paraboloid through the cells of the other colour gives the height there, and the other way round; the result
+    is the mean of both. The choice is independent of the noise of the measured cells, so that the result has not the
+    upward bias of the largest of many noisy heights.
+
+    Parameters
+    ----------
+    z : numpy.ndarray
+        Heights (rows, columns), NaN in holes.
+    allowed : numpy.ndarray
+        bool, places where the top may lie.
+    sigma : numpy.ndarray
+        Standard deviations of the heights.
+    half : int
+        Half width of a patch in cells, 1 or more: it has (2 half + 1)^2 cells.
+    reach : numpy.ndarray, optional
+        bool, cells that a patch may read. Default: all.
+
+    Returns
+    -------
+    TopHeight
+    """
+    rows, columns = np.indices(z.shape)
+    valid = np.isfinite(z) if reach is None else np.isfinite(z) & reach
+    dark = (rows + columns) % 2 == 0
+    found = []
+    for choosing in (dark, ~dark):
+        place = _highest(z, valid & choosing, allowed, half)
+        if place is None:
+            return TopHeight(math.nan, math.nan, math.nan, math.nan)
+        near = (np.abs(rows - place[0]) <= half) & (np.abs(columns - place[1]) <= half) & valid & ~choosing
+        weights = _evaluation_weights(rows[near] - place[0], columns[near] - place[1])
+        if not len(weights):
+            return TopHeight(math.nan, math.nan, math.nan, math.nan)
+        found.append((weights @ z[near], float(np.sum((weights * sigma[near]) ** 2)), *place))
+    heights, variances, at_row, at_column = np.array(found).T
+    return TopHeight(
+        float(heights.mean()), math.sqrt(variances.sum()) / 2, float(at_row.mean()), float(at_column.mean())
+    )
+
+
+def _highest(
+    z: Float64, used: npt.NDArray[np.bool_], allowed: npt.NDArray[np.bool_], half: int
+) -> tuple[int, int] | None:
+    """Return the row and column of the allowed patch with the highest mean of the used cells."""
+    size = 2 * half + 1
+    filled = uniform_filter(used.astype(np.float64), size, mode="constant")
+    level = float(np.mean(z[used])) if used.any() else 0.0  # keeps the sums of the filter small
+    total = uniform_filter(np.where(used, z - level, 0.0), size, mode="constant")
+    enough = allowed & (filled >= _LEAST_FILLED * 0.5)
+    if not enough.any():
+        return None
+    mean = np.where(enough, total / np.where(enough, filled, 1.0), -np.inf)
+    row, column = np.unravel_index(np.argmax(mean), mean.shape)
+    return int(row), int(column)
+
+
+def _evaluation_weights(u: npt.NDArray[np.int64], v: npt.NDArray[np.int64]) -> Float64:
+    """Return weights of cells whose weighted sum is the value at the origin of a least-squares paraboloid."""
+    if len(u) < _LEAST_FOR_CURVED:
+        return np.full(len(u), 1.0 / max(len(u), 1))
+    design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1).astype(np.float64)
+    return np.asarray(np.linalg.pinv(design)[0])

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from gpuvision.host import files
 from gpuvision.host.outputs import MANIFEST, Outputs
 
 Link = Callable[[Path, Path], object]
@@ -114,6 +115,14 @@ def test_two_outputs_of_one_name(tmp_path: Path) -> None:
     (tmp_path / "same").symlink_to(tmp_path)
     with pytest.raises(ValueError, match="two outputs have the same name"):
         outputs.claim(tmp_path / "same" / "report.json")
+
+
+def test_a_folder_of_many_outputs_is_checked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check writes a file: a check of each of a thousand outputs would take seconds on a network disk."""
+    checked: list[Path] = []
+    monkeypatch.setattr(files, "check_writable_folder", lambda folder: checked.append(Path(folder)))
+    Outputs("job").claim(*(tmp_path / f"{name}.png" for name in range(5)), tmp_path / "other" / "6.png")
+    assert checked == [tmp_path, tmp_path / "other"]
 
 
 def test_standard_output_and_devices_are_no_files(tmp_path: Path) -> None:

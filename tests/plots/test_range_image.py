@@ -126,6 +126,23 @@ def test_the_length_bar_is_as_long_as_it_says(tmp_path, heights, style):
     assert all(abs(length - 55) <= 3 for length in filled)
 
 
+def test_the_height_bar_stands_beside_the_map(tmp_path, heights):
+    path = tmp_path / "map.png"
+    picture.draw_height_map(path, heights, GRID)
+    image = cv2.imread(str(path)).astype(int)
+    # The map is 1100 pixels wide and begins 0.3 in from the left and 0.72 in from the top, at 150 pixels/in. The bar is
+    # 0.16 in to its right, 0.16 in wide and 4.5 in high.
+    bar = image[:, round((0.3 + 0.16 + 0.08) * 150) + 1100]
+    coloured = np.flatnonzero(np.ptp(bar, axis=1) > 20)
+    assert abs(coloured[0] - 0.72 * 150) <= 2
+    assert abs(np.ptp(coloured) - 4.5 * 150) <= 4
+    # Its colours are those of the highest and the lowest cell.
+    row, column = np.divmod([np.nanargmax(heights.z), np.nanargmin(heights.z)], GRID.columns)
+    cells = image[(108 + (row + 0.5) * 4.4).astype(int), (45 + (column + 0.5) * 4.4).astype(int)]
+    ends = bar[[coloured[0] + 4, coloured[-1] - 4]]
+    assert np.abs(cells - ends).max() < np.abs(cells - ends[::-1]).max()
+
+
 def test_a_picture_shows_the_cells(tmp_path, heights):
     path = tmp_path / "map.png"
     picture.draw_height_map(path, heights, GRID)

@@ -203,6 +203,14 @@ def test_outliers_do_little_harm(loss, rng):
     assert any("loss='tukey'" in each for each in plain.warnings)
 
 
+def test_noise_above_the_given_one_is_said(rng):
+    made = scene(rng, "grid", 15)
+    views = made.views(rng, 0.1)
+    for sigma, ratio in ((0.05, "2.0 times the given noise"), (0.1, None)):
+        said = [each for each in fit_camera(views, made.size, model="tilt", sigma=sigma).warnings if "noise" in each]
+        assert [ratio in each for each in said] == ([True] if ratio else [])
+
+
 def test_a_view_that_is_all_wrong_is_named(rng):
     made = scene(rng, "grid", 10)
     views = made.views(rng, 0.1)

@@ -204,6 +204,12 @@ def test_margin_keeps_away_from_valid_light() -> None:
     assert np.all(windows[:, 1] >= u.max(axis=0) + 3e-4 + 3.29 * 4e-5 - 5e-5)
 
 
+def test_a_margin_wider_than_the_strip_opens_all_of_it() -> None:
+    view, light, truth, _ = part(4)
+    windows = optimise_mask(view, light, truth, margin=2.0 * LENGTH).mask.windows
+    np.testing.assert_array_equal(windows, np.broadcast_to(view.u_edges[[0, -1]], windows.shape))
+
+
 def test_samples_without_valid_light_are_closed() -> None:
     """They would read only secondary light, so no reading is better."""
     view, light, truth, u = part(4)

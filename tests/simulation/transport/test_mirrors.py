@@ -18,6 +18,7 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
+from gpuvision.simulation.transport.mirror_surfaces import MirrorLimits, MirrorSurfaces
 from gpuvision.simulation.transport.mirrors import Mirrors
 from mirror_scenes import mirrors_of, quad, sensor_view
 
@@ -53,6 +54,14 @@ def expected_of_line(sensor: SensorView, y: float, power: float) -> np.ndarray:
         return power / np.pi * cosine * float(sensor.aperture_solid_angle(place))
 
     return np.array([integral(density, a, b, epsrel=1e-13)[0] for a, b in itertools.pairwise(edges)])
+
+
+def test_surfaces_are_compared_by_identity() -> None:
+    """They hold arrays, whose comparison has no single truth value."""
+    scene, sensor = before_a_wall(0.004), sensor_view()
+    one, other = (MirrorSurfaces(sensor, scene, MATERIALS, None, MirrorLimits()) for _ in range(2))
+    assert one != other
+    assert len({one, other}) == 2
 
 
 def test_a_plane_mirror_shows_a_second_line_at_twice_its_distance(device: Device) -> None:

@@ -42,6 +42,7 @@ WIDEST_WINDOW = 180  # samples on either side: sums of 16-bit samples times thei
 _LANES = 16  # of a vector of the vector variant: its kernel's vectors have 16 elements
 _GROUP = 64  # work-items of a work-group
 _STRIP = 1024  # largest number of columns of a strip: MAX_STRIP in line_strip.h
+_FIELDS = ("position", "peak", "width", "total", "status")  # default outputs without a triangulation
 _WIDE_BYTES = 64  # bytes of a wide vector (one cache line): WIDE in line_wide.h
 
 
@@ -79,6 +80,15 @@ class LineReading(NamedTuple):
         HORIZON and NOT_INVERTIBLE are set by the triangulation and make only ``g`` and ``h`` NaN.
     g, h
         Point in the sheet of light [m], if the readout has a triangulation.
+    sigma
+        Predicted standard deviation of the position by the noise of the samples [px]. NaN where the position is NaN and
+        where it does not come from the estimator: a flat top wider than the window, a fit that did not converge.
+    sigma_g, sigma_h
+        Random error: standard deviations of ``g`` and ``h`` by ``sigma`` [m]. Both come from the same error of the
+        position: g and h err together.
+    systematic_g, systematic_h
+        Systematic error: standard deviations of ``g`` and ``h`` by the covariance of the triangulation [m]. The error
+        is the same in all frames.
     """
 
     position: FloatArray | None = None
@@ -88,6 +98,11 @@ class LineReading(NamedTuple):
     status: StatusArray | None = None
     g: FloatArray | None = None
     h: FloatArray | None = None
+    sigma: FloatArray | None = None
+    sigma_g: FloatArray | None = None
+    sigma_h: FloatArray | None = None
+    systematic_g: FloatArray | None = None
+    systematic_h: FloatArray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,13 +150,17 @@ class LineReadout(VisionOperation[LineReading]):
     fir_length : {4, 8}
         Taps of the derivative filter, default 4.
     read_noise, gain : float
-        Noise model of ``"ml"``: standard deviation of a dark sample [grey levels], default 1, and variance per grey
-        level of light [grey levels per electron], default 0.
+        Noise model of ``"ml"`` and of the sigmas: standard deviation of a dark sample, without quantisation [grey
+        levels], default 1, and variance per grey level [grey levels per electron], default 0.
+    speckle : float
+        Standard deviation of the position by speckle and surface texture [px], >= 0, default 0. It adds to ``sigma`` in
+        quadrature and depends on the optics only, not on the brightness of the line [3]_.
     triangulation, axes : Triangulation, SampleAxes
         Triangulate in the same kernel (outputs ``g`` and ``h``): u is the position, v the number of the profile,
         converted to sensor coordinates by ``axes``.
     outputs : tuple of str, optional
-        Names of the `LineReading` fields to compute; the code of other fields is not compiled. Default: all.
+        Names of the `LineReading` fields to compute; the code of other fields is not compiled. Default: all but the
+        sigmas.
     precision : {"single", "double", None}
         Precision of the arithmetic and of the outputs; ``None`` is single.
     variant : {"auto", "vector", "work_item"}
@@ -160,11 +179,25 @@ class LineReadout(VisionOperation[LineReading]):
     Error: integer samples are summed exactly. The rounding errors of float32 sums are kept in a second number
     (compensated summation). The rounding error of the position is a few ulp.
 
+    Noise: the variance of a sample is ``read_noise**2 + gain * level``, plus 1/12 for integer frames (quantisation).
+    ``sigma`` is its effect on the estimator, to first order:
+
+    - centroids: ``sum variance_k (k - p)**2 / total**2`` over the samples above the threshold.
+    - ``"gauss3"``, ``"fir"``: the derivatives with respect to the three samples, or to the taps of the two filters on
+      either side of the zero crossing.
+    - ``"ml"``: the Cramer-Rao bound at the fit.
+
+    The prediction is too small where noise moves the peak by more than a pixel, so that the window loses light, and
+    for flagged samples. It is too large by up to 20 % where the threshold lies within the noise of the background. If a
+    background image was subtracted from the frames, ``read_noise`` must contain the noise of both.
+
     References
     ----------
     .. [1] F. Blais and M. Rioux, Real-time numerical peak detector, Signal Processing 11 (1986) 145-155.
     .. [2] R. B. Fisher and D. K. Naidu, A comparison of algorithms for subpixel peak detection, in Image Technology,
        Springer 1996.
+    .. [3] R. G. Dorsch, G. Haeusler and J. M. Herrmann, Laser triangulation: fundamental uncertainty in distance
+       measurement, Applied Optics 33 (1994) 1306-1314.
 
     Examples
     --------
@@ -192,6 +225,7 @@ class LineReadout(VisionOperation[LineReading]):
     fir_length: Literal[4, 8] = 4
     read_noise: float = 1.0
     gain: float = 0.0
+    speckle: float = 0.0
     triangulation: Triangulation | None = None
     axes: SampleAxes = SampleAxes()
     outputs: tuple[str, ...] | None = None
@@ -204,11 +238,12 @@ class LineReadout(VisionOperation[LineReading]):
                 object.__setattr__(self, name, integer(getattr(self, name), f"LineReadout.{name}"))
         self._check_names()
         self._check_numbers()
-        possible = LineReading._fields if self.triangulation is not None else LineReading._fields[:5]
+        possible = LineReading._fields if self.triangulation is not None else (*_FIELDS, "sigma")
         for name in self.outputs or ():
             if name not in possible:
                 raise ValueError(f"LineReadout.outputs has {name!r}, expected some of {', '.join(possible)}")
-        object.__setattr__(self, "outputs", possible if self.outputs is None else tuple(self.outputs))
+        default = _FIELDS if self.triangulation is None else (*_FIELDS, "g", "h")
+        object.__setattr__(self, "outputs", default if self.outputs is None else tuple(self.outputs))
 
     def _check_names(self) -> None:
         allowed: dict[str, tuple[Any, ...]] = {
@@ -238,7 +273,7 @@ class LineReadout(VisionOperation[LineReading]):
             )
         if self.saturation is not None:
             finite(self.saturation, "LineReadout.saturation", above=0.0)
-        for name in ("read_noise", "gain"):
+        for name in ("read_noise", "gain", "speckle"):
             if finite(getattr(self, name), f"LineReadout.{name}") < 0.0:
                 raise ValueError(f"LineReadout.{name} is {getattr(self, name)}, expected a number >= 0")
         if self.method == "ml" and self.read_noise == 0.0 and self.gain == 0.0:
@@ -342,12 +377,15 @@ class LineReadout(VisionOperation[LineReading]):
         chosen = self.outputs or ()
         defines |= flags(**{f"WITH_{name.upper()}": True for name in chosen})
         if self.triangulation is not None:
+            # Random and systematic errors are separate outputs here.
             defines |= {"WITH_SHEET": None} | self.triangulation.defines(real)
+            defines.pop("SHEET_COVARIANCE", None)
         return defines | flags(
             ALONG_ROWS=self.along == "rows",
             AMBIGUITY=self.ambiguity is not None,
             CANDIDATES=self._has_candidates,
             WIDTH_LIMITS=self._limits_width,
+            NOISE=any(name.startswith("sigma") for name in chosen),
             COUNT_WIDTH="width" in chosen or (self.method == "centroid" and self._limits_width),
             LONG_MOMENT=bits < 32 and length**2 // 2 * np.iinfo(f"uint{bits}").max >= 2**32,
         )
@@ -355,12 +393,16 @@ class LineReadout(VisionOperation[LineReading]):
     def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any], length: int) -> Any:
         """Return the parameter table of the kernel."""
         widest = length if self.maximum_width is None else min(self.maximum_width, length)
+        noise = self.read_noise**2 + (1.0 / 12.0 if dtype.kind == "u" else 0.0)
         table = LineTable(
             min_width=min(self.minimum_width, length + 1),
             max_width=widest,
             ambiguous_ratio=self.ambiguity or 0.0,
             read_variance=self.read_noise**2,
             gain=self.gain,
+            noise_variance=noise,
+            lit_variance=noise + self.gain * self.threshold,
+            speckle_variance=self.speckle**2,
         )
         return np.array(table, real)
 
@@ -373,3 +415,6 @@ class LineTable(NamedTuple):
     ambiguous_ratio: float
     read_variance: float
     gain: float
+    noise_variance: float
+    lit_variance: float
+    speckle_variance: float

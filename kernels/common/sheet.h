@@ -147,27 +147,27 @@ static inline void sheet_pull_back(reals position, reals sample, constant SheetT
 #endif
 }
 
-// Compute the standard deviation of G or H, given its terms and factor, at (p, q) with denominator w, for the standard
-// deviations sigma_x and sigma_y of the measured x and y.
-static inline reals sheet_sigma_of(constant real *terms, constant real *factor, reals position, reals sample, reals p,
-                                   reals q, reals w, reals sigma_x, reals sigma_y, constant SheetTable *sheet) {
+typedef struct {
+    reals g, h;  // variances of G and H [m^2]
+} SheetVariances;
+
+// Compute the variance of G or H, given its terms, at (p, q) with denominator w, for the standard deviations sigma_x and
+// sigma_y of the measured x and y.
+static inline reals sheet_noise_of(constant real *terms, reals position, reals sample, reals p, reals q, reals w,
+                                   reals sigma_x, reals sigma_y, constant SheetTable *sheet) {
     const reals offset = terms[1] * p + terms[2] * q;
     reals slope_x = (terms[1] - offset * sheet->w_terms[0]) / w;
     reals slope_y = (terms[2] - offset * sheet->w_terms[1]) / w;
     sheet_pull_back(position, sample, sheet, &slope_x, &slope_y);
     slope_x *= sigma_x;
     slope_y *= sigma_y;
-    reals variance = slope_x * slope_x + slope_y * slope_y;
-#ifdef SHEET_COVARIANCE
-    variance += sheet_parameter_variance(factor, p, q, offset);
-#endif
-    return sqrt(variance);
+    return slope_x * slope_x + slope_y * slope_y;
 }
 
-// Compute the standard deviations of G and H for independent errors of position and sample, to first order. Under
-// SHEET_COVARIANCE the covariance of the parameters is added. The result is meaningless where sheet_point sets a flag.
-static inline void sheet_sigma(reals position, reals sample, reals sigma_position, reals sigma_sample,
-                               constant SheetTable *sheet, reals *sigma_g, reals *sigma_h) {
+// Compute the random variances of G and H, to first order, from independent errors of position and sample. The result
+// is meaningless where sheet_point sets a flag.
+static inline SheetVariances sheet_noise(reals position, reals sample, reals sigma_position, reals sigma_sample,
+                                         constant SheetTable *sheet) {
     reals x, y;
     masks folded;
     sheet_place(position, sample, sheet, &x, &y, &folded);
@@ -175,8 +175,38 @@ static inline void sheet_sigma(reals position, reals sample, reals sigma_positio
     const reals p = x / w, q = y / w;
     const reals sigma_x = sigma_position * sheet->position_scale;
     const reals sigma_y = sigma_sample * sheet->sample_scale;
-    *sigma_g = sheet_sigma_of(sheet->g_terms, sheet->factor_g, position, sample, p, q, w, sigma_x, sigma_y, sheet);
-    *sigma_h = sheet_sigma_of(sheet->h_terms, sheet->factor_h, position, sample, p, q, w, sigma_x, sigma_y, sheet);
+    const SheetVariances noise = {
+        sheet_noise_of(sheet->g_terms, position, sample, p, q, w, sigma_x, sigma_y, sheet),
+        sheet_noise_of(sheet->h_terms, position, sample, p, q, w, sigma_x, sigma_y, sheet)};
+    return noise;
+}
+
+// Compute the systematic variances of G and H, to first order, from the covariance of the parameters.
+static inline SheetVariances sheet_systematic(reals position, reals sample, constant SheetTable *sheet) {
+    constant real *in_g = sheet->g_terms, *in_h = sheet->h_terms;
+    reals x, y;
+    masks folded;
+    sheet_place(position, sample, sheet, &x, &y, &folded);
+    const reals w = 1 + sheet->w_terms[0] * x + sheet->w_terms[1] * y;
+    const reals p = x / w, q = y / w;
+    const SheetVariances systematic = {
+        sheet_parameter_variance(sheet->factor_g, p, q, in_g[1] * p + in_g[2] * q),
+        sheet_parameter_variance(sheet->factor_h, p, q, in_h[1] * p + in_h[2] * q)};
+    return systematic;
+}
+
+// Compute the standard deviations of G and H for independent errors of position and sample. Under SHEET_COVARIANCE the
+// systematic variances are added.
+static inline void sheet_sigma(reals position, reals sample, reals sigma_position, reals sigma_sample,
+                               constant SheetTable *sheet, reals *sigma_g, reals *sigma_h) {
+    SheetVariances sum = sheet_noise(position, sample, sigma_position, sigma_sample, sheet);
+#ifdef SHEET_COVARIANCE
+    const SheetVariances systematic = sheet_systematic(position, sample, sheet);
+    sum.g += systematic.g;
+    sum.h += systematic.h;
+#endif
+    *sigma_g = sqrt(sum.g);
+    *sigma_h = sqrt(sum.h);
 }
 
 #endif

@@ -14,11 +14,14 @@
 //          table      LineTable;  sheet  SheetTable (common/sheet.h), under WITH_SHEET
 // Outputs: (frames, samples), each one compiled only under its WITH_... option:
 //          position real [px], peak real [grey levels], width real [px], total real [grey levels], status uchar,
-//          g, h real [m] (under WITH_SHEET)
+//          g, h real [m] (under WITH_SHEET), sigma real [px] (standard deviation of the position by the noise of the
+//          samples), and under WITH_SHEET sigma_g, sigma_h real [m] (the same of g and h) and systematic_g,
+//          systematic_h real [m] (standard deviation by the covariance of the triangulation)
 // Build options: CODE, CODE4, CODE8, CODE16, CODE_BITS (type of the samples), REAL_IS_DOUBLE, ALONG_ROWS, RADIUS and
 // REACH
 // (window that counts, and window that is read), FIR_HALF, CANDIDATES with SELECT_... (line_peak.h), AMBIGUITY,
-//          WIDTH_LIMITS, COUNT_WIDTH, LONG_MOMENT, PREFETCH, WITH_POSITION/PEAK/WIDTH/TOTAL/STATUS/SHEET/G/H, LENS,
+//          WIDTH_LIMITS, COUNT_WIDTH, LONG_MOMENT, PREFETCH, NOISE (compute variances: any of the sigmas is an output),
+//          WITH_POSITION/PEAK/WIDTH/TOTAL/STATUS/SHEET/G/H/SIGMA/SIGMA_G/SIGMA_H/SYSTEMATIC_G/SYSTEMATIC_H, LENS,
 //          LENS_K2, LENS_K3, LENS_K4, PAST_CACHES, VECTOR_VARIANT.
 // Work:    global size (work-items of a frame, frames). Vector variant: a work-item reads a strip of columns, or 16
 // rows;
@@ -31,7 +34,10 @@ typedef struct {
     real min_width, max_width;  // limits on the number of samples above the threshold
     real ambiguous_ratio;       // fraction of the peak's light from which on a second peak counts
     real read_variance;         // METHOD_ML: variance of a dark sample [grey level^2]
-    real gain;                  // METHOD_ML: variance per grey level of light
+    real gain;                  // variance per grey level of light
+    real noise_variance;        // NOISE: variance of a dark sample with quantisation [grey level^2]
+    real lit_variance;          // NOISE: the same of a sample at the threshold
+    real speckle_variance;      // NOISE: variance of the position by speckle [px^2]
 } LineTable;
 
 #include "line/line_peak.h"
@@ -50,14 +56,15 @@ typedef struct {
 typedef struct {
     global real *position, *peak, *width, *total;
     global uchar *status;
-    global real *g, *h;
+    global real *g, *h, *sigma, *sigma_g, *sigma_h, *systematic_g, *systematic_h;
     constant SheetTable *sheet;
+    constant LineTable *table;
 } Outputs;
 
 // Write the readings of LANES profiles, the first of them element `first` of the outputs and profile `sample` of its
 // frame.
 static inline void store_reading(const Outputs *to, ulong first, int sample, reals position, codes peak, reals width,
-                                 reals total, ints flags) {
+                                 reals total, ints flags, reals variance) {
     ints lost = ~int_mask((flags & (STATUS_LOW_SIGNAL | STATUS_OUT_OF_RANGE | STATUS_NOT_FINITE)) == 0);
 #if CODE_BITS == 32
     // Sums that overflow to infinity or NaN.
@@ -67,6 +74,12 @@ static inline void store_reading(const Outputs *to, ulong first, int sample, rea
 #endif
     const ints not_finite = ~int_mask((flags & STATUS_NOT_FINITE) == 0);
     position = nan_where(to_masks(lost), position);
+#ifdef NOISE
+    const reals sigma = nan_where(to_masks(lost), sqrt(variance + to->table->speckle_variance));
+#endif
+#ifdef WITH_SIGMA
+    store_reals(sigma, to->sigma + first);
+#endif
 #ifdef WITH_SHEET
     reals g, h;
     const reals samples = to_reals((ints)sample + LANE_NUMBERS);
@@ -77,6 +90,24 @@ static inline void store_reading(const Outputs *to, ulong first, int sample, rea
 #endif
 #ifdef WITH_H
     store_reals(h, to->h + first);
+#endif
+#if defined(WITH_SIGMA_G) || defined(WITH_SIGMA_H)
+    const SheetVariances noise = sheet_noise(position, samples, sigma, (reals)0, to->sheet);
+#endif
+#ifdef WITH_SIGMA_G
+    store_reals(nan_where(to_masks(not_finite_lanes(g)), sqrt(noise.g)), to->sigma_g + first);
+#endif
+#ifdef WITH_SIGMA_H
+    store_reals(nan_where(to_masks(not_finite_lanes(h)), sqrt(noise.h)), to->sigma_h + first);
+#endif
+#if defined(WITH_SYSTEMATIC_G) || defined(WITH_SYSTEMATIC_H)
+    const SheetVariances systematic = sheet_systematic(position, samples, to->sheet);
+#endif
+#ifdef WITH_SYSTEMATIC_G
+    store_reals(nan_where(to_masks(not_finite_lanes(g)), sqrt(systematic.g)), to->systematic_g + first);
+#endif
+#ifdef WITH_SYSTEMATIC_H
+    store_reals(nan_where(to_masks(not_finite_lanes(h)), sqrt(systematic.h)), to->systematic_h + first);
 #endif
 #endif
 #ifdef WITH_POSITION
@@ -119,7 +150,13 @@ static inline void finish_centroid(const Profiles *profiles, const Centroid *cen
     const ints cut = int_mask(begin >= least) | int_mask(end >= least);
     const ints flags = flag_where(dark, STATUS_LOW_SIGNAL) | flag_where(cut & ~dark, STATUS_OUT_OF_RANGE) |
                        common_flags(profiles, centroid->peak, centroid->not_finite);
-    store_reading(to, first, sample, centroid->position, centroid->peak, centroid->width, centroid->total, flags);
+#ifdef NOISE
+    const reals variance = centroid->variance;
+#else
+    const reals variance = 0;
+#endif
+    store_reading(to, first, sample, centroid->position, centroid->peak, centroid->width, centroid->total, flags,
+                  variance);
 }
 #else
 static inline void finish_peak(const Profiles *profiles, const Peak *peak, const Place *found,
@@ -137,7 +174,12 @@ static inline void finish_peak(const Profiles *profiles, const Peak *peak, const
     const reals width = 0;
 #endif
     const reals total = choose_reals(peak->found, place.total, 0);
-    store_reading(to, first, sample, to_reals(peak->at) + place.at, peak->level, width, total, flags);
+#ifdef NOISE
+    const reals variance = place.variance;
+#else
+    const reals variance = 0;
+#endif
+    store_reading(to, first, sample, to_reals(peak->at) + place.at, peak->level, width, total, flags, variance);
 }
 
 // Copy the window of every lane and estimate the position in it, by any of the methods.
@@ -145,11 +187,11 @@ static inline Place place_in_window(const Profiles *profiles, Peak *peak, consta
     CODE window[(2 * REACH + 1) * LANES];
     gather_centred(profiles, peak, REACH, window);
 #if defined(METHOD_WINDOWED)
-    return window_centroid(window, REACH, profiles, peak);
+    return window_centroid(window, REACH, profiles, peak, table);
 #elif defined(METHOD_ML)
     return fit_gaussian(window, profiles, peak, table);
 #else
-    return place_by_points(window, profiles, peak);
+    return place_by_points(window, profiles, peak, table);
 #endif
 }
 #endif
@@ -196,7 +238,10 @@ static inline void read_frame(const Profiles *frame, int samples, constant LineT
     const int sample = get_global_id(0);
     if (sample >= samples) return;
     const Profiles profiles = profiles_from(frame, sample);
-    const Centroid centroid = profile_centroid(&profiles);
+    Centroid centroid = profile_centroid(&profiles);
+#ifdef NOISE
+    set_variance(&centroid, &profiles, 0, profiles.length, table);
+#endif
     finish_centroid(&profiles, &centroid, table, to, first + sample, sample);
 }
 
@@ -229,7 +274,9 @@ kernel void line_readout(global const CODE *restrict frames,
 #endif
                          global real *restrict position, global real *restrict peak, global real *restrict width,
                          global real *restrict total, global uchar *restrict status, global real *restrict g,
-                         global real *restrict h, const int rows, const int columns, const CODE threshold,
+                         global real *restrict h, global real *restrict sigma, global real *restrict sigma_g,
+                         global real *restrict sigma_h, global real *restrict systematic_g,
+                         global real *restrict systematic_h, const int rows, const int columns, const CODE threshold,
                          const CODE saturation, const CODE minimum, constant LineTable *table,
                          constant SheetTable *sheet) {
 #ifndef SELECT_NEAREST
@@ -243,6 +290,7 @@ kernel void line_readout(global const CODE *restrict frames,
     const ulong number = get_global_id(1);
     const Profiles frame = {frames + number * rows * columns, stride, lane_stride, length,
                             threshold,                        saturation, minimum};
-    const Outputs to = {position, peak, width, total, status, g, h, sheet};
+    const Outputs to = {position, peak,    width,   total,        status,       g,     h,
+                        sigma,    sigma_g, sigma_h, systematic_g, systematic_h, sheet, table};
     read_frame(&frame, samples, table, &to, number * samples, previous);
 }

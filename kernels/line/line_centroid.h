@@ -19,7 +19,33 @@ typedef struct {
     reals position, total, width;  // width: number of samples above the threshold
     codes peak;                    // largest sample
     ints not_finite;               // lanes with a sample that is not finite
+#ifdef NOISE
+    reals variance;  // of the position [px^2]
+#endif
 } Centroid;
+
+#ifdef NOISE
+// Add the terms of the samples v of light at distances d from the centroid to the sum of lit_variance + gain v times
+// d^2 over the samples above the threshold; the sum over the square of the total light is the variance of the centroid
+// (centroid_variance() in line_window.h).
+static inline reals add_noise(reals sum, reals v, reals d, constant LineTable *table) {
+    const reals noise = table->lit_variance + table->gain * v;
+    return sum + choose_reals(int_mask(v > 0), noise * d * d, 0);
+}
+
+// Set the variance of the centroid of every lane. All samples above the threshold lie in begin <= index < end.
+static inline void set_variance(Centroid *centroid, const Profiles *profiles, int begin, int end,
+                                constant LineTable *table) {
+    reals sum = 0;
+    for (int k = begin; k < end; k++) {
+        const codes level = sample_of(profiles, k);
+        if (!any_lit(level, profiles->threshold)) continue;
+        const reals v = over_threshold(level, profiles->threshold);
+        sum = add_noise(sum, v, (real)k - centroid->position, table);
+    }
+    centroid->variance = sum / centroid->total / centroid->total;
+}
+#endif
 
 #if CODE_BITS == 32
 

@@ -61,7 +61,9 @@ typedef struct {
     reals right[ML_UNKNOWNS];
 } Normal;
 
-static inline Normal normal_equations(const CODE *window, Gaussian at, CODE saturation, constant LineTable *table) {
+// Normal equations at a fit; `dark_variance` is the variance of a sample without light.
+static inline Normal normal_equations(const CODE *window, Gaussian at, CODE saturation, real dark_variance,
+                                      constant LineTable *table) {
     Normal normal;
     for (int i = 0; i < ML_UNKNOWNS * (ML_UNKNOWNS + 1) / 2; i++) normal.matrix[i] = 0;
     for (int i = 0; i < ML_UNKNOWNS; i++) normal.right[i] = 0;
@@ -77,7 +79,7 @@ static inline Normal normal_equations(const CODE *window, Gaussian at, CODE satu
         const reals column[ML_UNKNOWNS] = {by_place, by_sigma, light, (reals)1};
         const reals model = at.background + at.amplitude * light;
         const codes level = window_level(window, k + RADIUS);
-        const reals variance = table->read_variance + table->gain * fmax(model, (reals)0);
+        const reals variance = dark_variance + table->gain * fmax(model, (reals)0);
         const reals trust = at.amplitude * at.amplitude / fmax(variance, (reals)1e-12f);
         const reals weight = choose_reals(int_mask(level >= (codes)saturation), 0, trust);
         const reals residual = (to_reals(level) - model) / at.amplitude * weight;
@@ -91,8 +93,9 @@ static inline Normal normal_equations(const CODE *window, Gaussian at, CODE satu
     return normal;
 }
 
-// Solve the normal equations by Cholesky factorisation, with damping; the solution replaces the right side.
-static inline void solve(Normal *normal) {
+// Cholesky factorisation L L' of the normal equations, with damping. L replaces the matrix, and L^-1 times the right
+// side replaces the right side.
+static inline void factorise(Normal *normal) {
     reals *a = normal->matrix, *x = normal->right;
     for (int i = 0; i < ML_UNKNOWNS; i++) {
         reals *row = a + i * (i + 1) / 2;
@@ -105,11 +108,30 @@ static inline void solve(Normal *normal) {
         for (int k = 0; k < i; k++) x[i] -= row[k] * x[k];
         x[i] /= row[i];
     }
+}
+
+// Solve the normal equations; the solution replaces the right side.
+static inline void solve(Normal *normal) {
+    factorise(normal);
+    const reals *a = normal->matrix;
+    reals *x = normal->right;
     for (int i = ML_UNKNOWNS - 1; i >= 0; i--) {
         for (int k = i + 1; k < ML_UNKNOWNS; k++) x[i] -= a[k * (k + 1) / 2 + i] * x[k];
         x[i] /= a[i * (i + 1) / 2 + i];
     }
 }
+
+#ifdef NOISE
+// Variance of the position: element [0, 0] of the inverse of the normal equations L L', the squared length of the first
+// column of the inverse of L. It replaces the right side.
+static inline reals position_variance(Normal *normal) {
+    reals *x = normal->right, variance = 0;
+    for (int i = 0; i < ML_UNKNOWNS; i++) x[i] = i == 0 ? 1 : 0;
+    factorise(normal);
+    for (int i = 0; i < ML_UNKNOWNS; i++) variance += x[i] * x[i];
+    return variance;
+}
+#endif
 
 // Take one step, limited to the range in which the linearisation holds. Return the larger movement of position and
 // sigma: the position alone may rest by chance while the other unknowns still move.
@@ -140,17 +162,22 @@ static inline Place fit_gaussian(const CODE *window, const Profiles *profiles, c
     reals moved = 1;
     ints moving = peak->found;
     for (int n = 0; n < ML_STEPS && any_int_lane(moving); n++) {
-        Normal normal = normal_equations(window, at, profiles->saturation, table);
+        Normal normal = normal_equations(window, at, profiles->saturation, table->read_variance, table);
         Gaussian next = at;
         const reals by = take_step(&next, &normal);
         at = choose_gaussian(moving, next, at);
         moved = choose_reals(moving, by, moved);
         moving &= ~int_mask(moved <= ML_SETTLED);
     }
-    Place place = window_centroid(window, RADIUS, profiles, peak);
+    Place place = window_centroid(window, RADIUS, profiles, peak, table);
     const ints settled = int_mask(moved <= 100 * ML_SETTLED) & int_mask(fabs(at.position) <= RADIUS);
     place.at = choose_reals(settled, at.position, place.at);
     place.flags = flag_where(~settled & peak->found, STATUS_AMBIGUOUS);
+#ifdef NOISE
+    // The Cramer-Rao bound at the fit, for the noise with quantisation.
+    Normal normal = normal_equations(window, at, profiles->saturation, table->noise_variance, table);
+    place.variance = nan_where(to_masks(~settled), position_variance(&normal));
+#endif
     return place;
 }
 

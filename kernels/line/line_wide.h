@@ -68,4 +68,10 @@ static inline int lowest(int16 v) {
 }
 static inline int highest(int16 v) { return -lowest(-v); }
 
+static inline real sum_of(real16 v) {
+    const real8 a = v.lo + v.hi;
+    const real4 b = a.lo + a.hi;
+    return (b.x + b.y) + (b.z + b.w);
+}
+
 #endif

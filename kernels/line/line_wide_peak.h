@@ -93,6 +93,9 @@ typedef ushort16 unsigned_indices;
 #define to_indices convert_short16
 #define to_sums convert_short16
 #define as_unsigned as_ushort16
+// The product v * offset^2 is at most 255 * 15^2 = 57375 < 2^16: as an unsigned number it fits 16 bits.
+typedef uint16 squares16;
+#define to_squares(product) convert_uint16(as_ushort16(product))
 #else
 typedef int16 indices;
 typedef uint16 unsigned_indices;
@@ -101,9 +104,14 @@ typedef uint16 unsigned_indices;
 #if CODE_BITS == 32
 typedef real16 sums16;
 #define to_sums convert_real16
+typedef real16 squares16;
+#define to_squares
 #else
 typedef int16 sums16;
 #define to_sums convert_int16
+// The products of 16-bit samples and squares of offsets exceed 32 bits.
+typedef real16 squares16;
+#define to_squares(product) (to_reals(v) * to_reals(offset * offset))
 #endif
 #endif
 
@@ -134,11 +142,18 @@ static inline ints first_row_apart(const Profiles *profiles, codes level, ints b
 // offset o is in the window where o + RADIUS <= 2 * RADIUS as unsigned numbers. Also count the flat top: the first
 // offset past it is the smallest unsigned offset whose sample differs from the peak (negative offsets are large
 // unsigned numbers; an equal sample has all bits set by the OR with its mask).
-static inline Place span_centroid(const Profiles *profiles, const Peak *peak, Span span, ints *top) {
+//
+// Under NOISE the loop also sums what centroid_variance() needs. The second moment of the light exceeds 16 bits.
+static inline Place span_centroid(const Profiles *profiles, const Peak *peak, Span span, ints *top,
+                                  constant LineTable *table) {
     const indices at = to_indices(peak->at);
     sums16 total = 0, moment = 0;
     indices offset = (indices)span.begin - at;
     unsigned_indices past = as_unsigned((indices)-1);  // first offset past the flat top; -1: none yet
+#ifdef NOISE
+    indices lit_count = 0, lit_moment = 0, lit_square = 0;
+    squares16 square = 0;
+#endif
     for (int k = span.begin; k < span.end; k++) {
         const codes x = sample_of(profiles, k);
         const indices inside = as_unsigned(offset + (indices)RADIUS) <= (unsigned_indices)(2 * RADIUS);
@@ -148,7 +163,15 @@ static inline Place span_centroid(const Profiles *profiles, const Peak *peak, Sp
         const sums16 v = to_sums(x > (codes)profiles->threshold ? x - (codes)profiles->threshold : (codes)0) & inside;
 #endif
         total += v;
-        moment += v * to_sums(offset);
+        const sums16 first = v * to_sums(offset);
+        moment += first;
+#ifdef NOISE
+        const indices lit = to_indices(v > (sums16)0);
+        lit_count -= lit;
+        lit_moment += lit & offset;
+        lit_square += lit & (offset * offset);
+        square += to_squares(first * to_sums(offset));
+#endif
         const unsigned_indices other = as_unsigned(offset | to_indices(x == peak->level));
         past = other < past ? other : past;
         offset += (indices)1;
@@ -158,17 +181,21 @@ static inline Place span_centroid(const Profiles *profiles, const Peak *peak, Sp
     place.total = to_reals(total);
     place.at = to_reals(moment) / place.total;
     place.flags = 0;
+#ifdef NOISE
+    place.variance = centroid_variance(place.at, place.total, to_reals(moment), to_reals(square), to_reals(lit_count),
+                                       to_reals(lit_moment), to_reals(lit_square), table);
+#endif
     return place;
 }
 
 // Windowed centroid of all lanes over their common span; twice where a flat top moves a peak to its middle.
-static inline Place centroid_together(const Profiles *profiles, Peak *peak) {
+static inline Place centroid_together(const Profiles *profiles, Peak *peak, constant LineTable *table) {
     ints top;
     const Span span = span_of(peak->at, peak->found, RADIUS, RADIUS, profiles->length);
-    const Place place = span_centroid(profiles, peak, span, &peak->top);
+    const Place place = span_centroid(profiles, peak, span, &peak->top, table);
     if (!centre_top(profiles, peak)) return place;
     const Span settled = span_of(peak->at, peak->found, RADIUS, RADIUS, profiles->length);
-    return span_centroid(profiles, peak, settled, &top);
+    return span_centroid(profiles, peak, settled, &top, table);
 }
 
 #else

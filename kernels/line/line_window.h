@@ -13,6 +13,9 @@ typedef struct {
     reals at;     // position relative to the index of the peak
     reals total;  // light in the window
     ints flags;
+#ifdef NOISE
+    reals variance;  // of the position [px^2]; NaN where no noise model holds
+#endif
 } Place;
 
 // Copy the window of every lane; beyond the border the sample at the border is repeated.
@@ -86,23 +89,54 @@ static inline Place middle_of_wide_top(const Peak *peak, Place place) {
     const ints wide = int_mask(peak->top > WINDOW) & peak->found;
     place.at = choose_reals(wide, to_reals((peak->top - 1) & 1) / 2, place.at);
     place.flags = choose_ints(wide, STATUS_AMBIGUOUS, place.flags);
+#ifdef NOISE
+    place.variance = nan_where(to_masks(wide), place.variance);
+#endif
     return place;
 }
 
+#ifdef NOISE
+// Variance of the centroid a = m1 / m0 of the light v_k of the samples k. A sample above the threshold moves it by
+// (k - a) / m0 per grey level, and has the variance lit_variance + gain v_k (LineTable), so that
+//     variance = (lit_variance sum_lit (k - a)^2 + gain sum v_k (k - a)^2) / m0^2.
+// The sums are taken about the middle of the window: m2 = sum v_k k^2, and n0, n1, n2 the sums of 1, k and k^2 over the
+// samples above the threshold.
+static inline reals centroid_variance(reals a, reals m0, reals m1, reals m2, reals n0, reals n1, reals n2,
+                                      constant LineTable *table) {
+    const reals constant_part = n2 - a * (2 * n1 - a * n0), shot_part = m2 - a * m1;
+    return (table->lit_variance * constant_part + table->gain * shot_part) / m0 / m0;
+}
+#endif
+
 // Centroid of the light in the window, relative to its middle. Samples that gather() repeated beyond the border have no
 // light; peak + k as an unsigned integer is below the length only for indices inside the profile.
-static inline Place window_centroid(const CODE *window, int reach, const Profiles *profiles, const Peak *peak) {
+static inline Place window_centroid(const CODE *window, int reach, const Profiles *profiles, const Peak *peak,
+                                    constant LineTable *table) {
     reals total = 0, moment = 0;
+#ifdef NOISE
+    reals square = 0, lit_count = 0, lit_moment = 0, lit_square = 0;
+#endif
     for (int k = -RADIUS; k <= RADIUS; k++) {
         const ints inside = int_mask(as_uints(peak->at + k) < (uints)profiles->length);
         const reals v = choose_reals(inside, over_threshold(window_level(window, k + reach), profiles->threshold), 0);
         total += v;
         moment += v * (real)k;
+#ifdef NOISE
+        const reals lit = choose_reals(int_mask(v > 0), 1, 0);
+        square += v * (real)(k * k);
+        lit_count += lit;
+        lit_moment += lit * (real)k;
+        lit_square += lit * (real)(k * k);
+#endif
     }
     Place place;
     place.at = moment / total;
     place.total = total;
     place.flags = 0;
+#ifdef NOISE
+    place.variance =
+        centroid_variance(place.at, total, moment, square, lit_count, lit_moment, lit_square, table);
+#endif
     return place;
 }
 

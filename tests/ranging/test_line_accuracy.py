@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from gpuvision.ranging.line import LineReadout
-from gpuvision.reference.line import cramer_rao, pixel_gaussian
+from gpuvision.ranging.sheet import SampleAxes
+from gpuvision.ranging.triangulation import Triangulation
+from gpuvision.reference.line import cramer_rao, pixel_gaussian, position_sigma
 
 TRIALS, LENGTH, BACKGROUND, READ_NOISE = 4000, 41, 20.0, 10.0
 
@@ -79,3 +81,135 @@ def test_bias_without_noise(device, sigma, windowed, gauss3, four_taps):
         assert np.max(np.abs(reading.position - places)) < 1.15 * bias + 1e-4
     fit = LineReadout(method="ml", window=16, read_noise=1.0)(frame, device=device)
     assert np.max(np.abs(fit.position - places)) < 1e-4
+
+
+# ---- predicted standard deviations -----------------------------------------------------------------------------
+
+PHASES = (-0.4, -0.2, 0.05, 0.3)  # of the line in its pixel: noise without the bias that depends on the phase
+METHODS = (
+    {"method": "centroid"},
+    {"method": "windowed", "window": 8},
+    {"method": "gauss3", "window": 4},
+    {"method": "fir", "window": 8},
+    {"method": "fir", "window": 8, "fir_length": 8},
+    {"method": "ml", "window": 8},
+)
+
+
+def digitised(rng, trials, *, sigma, peak, background, read_noise, gain):
+    """Return uint8 frames of lines at each phase, `trials` columns of each: shot noise, read noise, quantisation."""
+    places = LENGTH // 2 + np.repeat(PHASES, trials)
+    light = pixel_gaussian(np.arange(LENGTH)[:, None], places, sigma, peak, background)
+    shot = rng.poisson(light / gain) * gain if gain else light
+    return np.clip(np.rint(shot + rng.normal(0.0, read_noise, light.shape)), 0, 255).astype(np.uint8)
+
+
+def scatter_ratio(reading):
+    """Return the standard deviation of the positions within a phase, over the predicted one."""
+    assert np.mean(reading.status == 0) > 0.999
+    position, sigma = (each.reshape(len(PHASES), -1).astype(np.float64) for each in (reading.position, reading.sigma))
+    return float(np.sqrt(np.mean(np.var(position, axis=1)) / np.mean(sigma**2)))
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda each: "-".join(map(str, each.values())))
+def test_sigma_is_the_scatter(device, rng, method):
+    # Four phases of 2000 trials determine a standard deviation to 0.8 %.
+    for line in (
+        {"sigma": 1.0, "peak": 150.0, "background": 10.0, "read_noise": 1.5, "gain": 0.1},
+        {"sigma": 2.0, "peak": 150.0, "background": 10.0, "read_noise": 1.5, "gain": 0.1},
+        {"sigma": 2.0, "peak": 150.0, "background": 10.0, "read_noise": 1.5, "gain": 0.0},
+        {"sigma": 2.0, "peak": 60.0, "background": 10.0, "read_noise": 3.0, "gain": 0.1},
+    ):
+        if method["method"] == "gauss3" and line["sigma"] > 1.0:
+            continue  # a parabola through the three samples of a flat peak is not linear in their noise
+        noise = {name: line[name] for name in ("read_noise", "gain")}
+        readout = LineReadout(threshold=24, outputs=("position", "sigma", "status"), **noise, **method)
+        assert scatter_ratio(readout(digitised(rng, 2000, **line), device=device)) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("method", "dtype", "along", "variant"),
+    [
+        ("centroid", "uint8", "rows", "vector"),
+        ("windowed", "float32", "columns", "vector"),
+        ("fir", "float32", "rows", "work_item"),
+        pytest.param("centroid", "uint16", "columns", "vector", marks=pytest.mark.slow),
+        pytest.param("centroid", "float32", "rows", "vector", marks=pytest.mark.slow),
+        pytest.param("centroid", "uint8", "columns", "work_item", marks=pytest.mark.slow),
+        pytest.param("windowed", "uint16", "columns", "vector", marks=pytest.mark.slow),
+        pytest.param("windowed", "uint8", "rows", "work_item", marks=pytest.mark.slow),
+        pytest.param("gauss3", "uint16", "columns", "vector", marks=pytest.mark.slow),
+        pytest.param("gauss3", "float32", "rows", "work_item", marks=pytest.mark.slow),
+    ],
+)
+def test_sigma_is_the_effect_of_every_sample(device, rng, method, dtype, along, variant):
+    top = {"uint8": 200.0, "uint16": 50_000.0, "float32": 3.0}[dtype]
+    length, samples = 83, 80
+    places = length / 2 + 0.4 * length * np.sin(0.1 * np.arange(samples)) + rng.uniform(-0.5, 0.5, samples)
+    profiles = pixel_gaussian(np.arange(length)[:, None], places, 1.7, top * rng.uniform(0.3, 1.0, samples), 0.05 * top)
+    profiles += rng.normal(0.0, 0.003 * top, profiles.shape)
+    profiles[60, 20] += 0.15 * top  # a hot pixel far from the line counts for the centroid
+    profiles = np.clip(np.rint(profiles) if dtype != "float32" else profiles, 0, None).astype(dtype)
+    frame = np.ascontiguousarray(profiles if along == "columns" else profiles.T)
+    settings = {"method": method, "read_noise": 0.01 * top, "gain": 0.002 * top, "threshold": round(0.1 * top, 1)}
+    readout = LineReadout(
+        along=along, variant=variant, window=7, speckle=0.002, outputs=("sigma", "position", "status"), **settings
+    )
+    reading = readout(frame, device=device)
+    np.testing.assert_array_equal(np.isnan(reading.sigma), np.isnan(reading.position))
+    good = np.flatnonzero(reading.status == 0)
+    assert good.size > 0.6 * samples
+    quantised, saturation = dtype != "float32", np.inf
+    expected = [
+        np.hypot(
+            position_sigma(
+                profiles[:, i].astype(np.float64), quantised=quantised, saturation=saturation, window=7, **settings
+            ),
+            0.002,
+        )
+        for i in good[::4]
+    ]
+    np.testing.assert_allclose(reading.sigma[good[::4]], expected, rtol=2e-3)
+
+
+def test_sigma_travels_to_the_sheet(device, rng):
+    line = {"sigma": 2.0, "peak": 150.0, "background": 10.0, "read_noise": 1.5, "gain": 0.1}
+    frame = digitised(rng, 50, **line)
+    covariance = np.diag([1e-12, 2e-12, 3e-12, 4e-12, 5e-12, 6e-12, 1e-8, 2e-8])
+    sheet = Triangulation(
+        homography=((1.1e-5, 2.0e-4, -0.1), (-2.2e-4, 1.0e-6, 0.06), (2.0e-4, 1.0e-5, 1.0)),
+        region=((0.0, LENGTH - 1.0), (0.0, frame.shape[1] - 1.0)),
+        covariance=covariance,
+    )
+    axes = SampleAxes(position_origin=0.0, position_pitch=1.0, sample_origin=0.0, sample_pitch=1.0)
+    wanted = ("position", "status", "g", "h", "sigma", "sigma_g", "sigma_h", "systematic_g", "systematic_h")
+    readout = LineReadout(threshold=24, read_noise=1.5, gain=0.1, triangulation=sheet, axes=axes, outputs=wanted)
+    reading = readout(frame, device=device)
+    assert np.all(reading.status == 0)
+    # Oracle: numerical derivatives of the homography in float64, and the sheet's covariance by NumPy.
+    matrix = np.array(sheet.homography)
+    v = np.arange(frame.shape[1], dtype=np.float64)
+
+    def points(u):
+        lifted = matrix @ np.stack([u, v, np.ones_like(u)])
+        return lifted[:2] / lifted[2]
+
+    u = reading.position.astype(np.float64)
+    slopes = np.abs(points(u + 1e-4) - points(u - 1e-4)) / 2e-4
+    np.testing.assert_allclose([reading.sigma_g, reading.sigma_h], slopes * reading.sigma, rtol=1e-4)
+    of_parameters = sheet.covariance_at(np.stack([u, v], axis=-1))
+    expected = np.sqrt([of_parameters[:, 0, 0], of_parameters[:, 1, 1]])
+    np.testing.assert_allclose([reading.systematic_g, reading.systematic_h], expected, rtol=1e-4)
+
+
+def test_sigma_is_unknown_without_an_estimate(device):
+    profile = np.zeros((24, 16), np.uint8)
+    profile[11:14] = 100
+    profile[:, 8:] = 0  # dark
+    frame = profile.copy()
+    frame[2:22, :4] = 100  # flat top wider than the window
+    reading = LineReadout(window=6, threshold=20, outputs=("position", "sigma", "status"))(frame, device=device)
+    assert np.all(np.isfinite(reading.position[:8]))
+    assert np.all(np.isnan(reading.sigma[:4]))
+    assert np.all(np.isfinite(reading.sigma[4:8]))
+    assert np.all(np.isnan(reading.sigma[8:]))

@@ -92,6 +92,19 @@ def read_centroid(
     return np.sum(v * np.arange(len(x))) / v.sum(), x.max(), lit, v.sum(), status
 
 
+def position_sigma(x: Float64, *, quantised: bool, read_noise: float, gain: float, **settings: Any) -> float:
+    """Return the standard deviation of the position of one profile, by numerical derivatives of `read_profile`."""
+    settings = {"previous": np.nan, "read_noise": read_noise, "gain": gain, **settings}
+    position, step, variance = read_profile(x, **settings)[0], 1e-5 * float(x.max()), 0.0
+    for k in range(len(x)):
+        # Towards lower values: a sample at the threshold has no light.
+        moved = x.copy()
+        moved[k] -= step
+        slope = (position - read_profile(moved, **settings)[0]) / step
+        variance += slope**2 * (read_noise**2 + gain * max(x[k], 0.0) + (1.0 / 12.0 if quantised else 0.0))
+    return float(np.sqrt(variance))
+
+
 def runs_of(x: Float64, threshold: float) -> list[tuple[int, int]]:
     """Return (begin, end) of each run of samples above the threshold."""
     lit = np.concatenate([[False], x > threshold, [False]])

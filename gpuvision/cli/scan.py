@@ -4,14 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, Overwrite, ReportFile, echo, named_path, prints_report, write_report
+from gpuvision.cli.arguments import (
+    DeviceLabel,
+    Overwrite,
+    ReportFile,
+    echo,
+    named_path,
+    prints_report,
+    reject_unused,
+    write_report,
+)
+
+if TYPE_CHECKING:
+    from gpuvision.sensor.sensor import Sensor
 
 
 class Precision(StrEnum):
@@ -97,6 +109,16 @@ TraceFile = Annotated[
 ]
 
 
+Preview = Annotated[
+    bool,
+    typer.Option(
+        "--preview",
+        help="Only write preview.png: frames of the recording with the line that the readout finds, threshold and "
+        "flags. No scan.",
+    ),
+]
+
+
 def scan(
     recording: Recording,
     sensor: SensorFile,
@@ -110,6 +132,7 @@ def scan(
     formats: SurfaceFiles = None,
     ply: PlyFile = PlyPoints.organised,
     trace: TraceFile = None,
+    preview: Preview = False,
     as_json: ReportFile = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -132,6 +155,19 @@ def scan(
         inputs.append(described.recording.background)
     if described.encoder is not None:
         inputs.append(described.encoder.file)
+    if preview:
+        reject_unused(
+            "with --preview",
+            precision=precision,
+            rate=rate,
+            policy=policy,
+            format=formats,
+            ply=None if ply is PlyPoints.organised else ply,
+            trace=trace,
+            json=as_json,
+        )
+        _write_preview(recording, described, out, inputs, device, overwrite)
+        return
     outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
     chosen_formats = [each.value for each in formats or ()]
     outputs.claim_folder(out, (*SCAN_FILES, *surface_files(chosen_formats).values()))
@@ -158,6 +194,20 @@ def scan(
     for advice in done.advice():
         echo(f"warning: {advice}", err=True)
     echo(f"{done.summary()}\nlook at {out / 'picture.png'} and {out / 'report.json'}", err=prints_report(as_json))
+
+
+def _write_preview(
+    recording: Path, sensor: Sensor, out: Path, inputs: Sequence[str | Path], device: str | None, overwrite: bool
+) -> None:
+    """Write the preview of a scan and print its line."""
+    from gpuvision.host import Device
+    from gpuvision.host.outputs import Outputs
+    from gpuvision.workflows.preview import PREVIEW_FILE, preview_scan
+
+    Outputs("preview", inputs=inputs, overwrite=overwrite).claim_folder(out, (PREVIEW_FILE,))
+    found = preview_scan(recording, sensor, device=None if device is None else Device.named(device))
+    found.write(out, overwrite=overwrite)
+    echo(f"{found.summary()}\nlook at {out / PREVIEW_FILE}")
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -179,7 +179,22 @@ class PairsSubtracted(_Subtracted):
         return len(out)
 
 
-def sample_frames(source: Source, count: int = 16, *, group: int = 1) -> HostArray:
+class FrameSample(NamedTuple):
+    """Frames that are spread evenly over a recording.
+
+    Attributes
+    ----------
+    frames : numpy.ndarray
+        (groups, group, ...).
+    numbers : numpy.ndarray
+        Number of the first frame of each group in the recording, (groups,) int64.
+    """
+
+    frames: HostArray
+    numbers: npt.NDArray[np.int64]
+
+
+def sample_frames(source: Source, count: int = 16, *, group: int = 1) -> FrameSample:
     """Return frames that are spread evenly over a recording; reads it to its end.
 
     Parameters
@@ -193,8 +208,8 @@ def sample_frames(source: Source, count: int = 16, *, group: int = 1) -> HostArr
 
     Returns
     -------
-    numpy.ndarray
-        (groups, group, ...), fewer than ``2 * count`` groups.
+    FrameSample
+        Fewer than ``2 * count`` groups.
 
     Raises
     ------
@@ -213,8 +228,8 @@ def sample_frames(source: Source, count: int = 16, *, group: int = 1) -> HostArr
             del kept[1::2]
             stride *= 2
     if not kept:
-        raise RecordingError("the recording has too few frames to estimate its background")
-    return np.stack(kept)
+        raise RecordingError("the recording has too few frames to sample it")
+    return FrameSample(np.stack(kept), group * stride * np.arange(len(kept), dtype=np.int64))
 
 
 def _groups(source: Source, group: int) -> Iterator[HostArray]:

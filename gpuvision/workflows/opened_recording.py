@@ -108,7 +108,8 @@ def _sampled(recording: str | Path | Source | Array, sensor: Sensor) -> Array:
         )
     source, _ = _open(recording, sensor)
     try:
-        return sample_frames(source, group=2 if sensor.recording.background in ("dark_after", "dark_before") else 1)
+        group = 2 if sensor.recording.background in ("dark_after", "dark_before") else 1
+        return sample_frames(source, group=group).frames
     finally:
         source.close()
 

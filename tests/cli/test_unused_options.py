@@ -36,6 +36,10 @@ from gpuvision.cli.main import application
             ("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--materials", "m.toml", "--albedo", "0"),
             "--albedo",
         ),
+        *(
+            (("scan", "points.npy", "--sensor", "camera_line", "--out", "d", "--preview", option, value), option)
+            for option, value in (("--rate", "9"), ("--trace", "t.json"), ("--json", "-"), ("--ply", "valid"))
+        ),
         (("select", "g", "--region", "0,0,1cm,1cm", "--scale", "25um", "--out", "d", "--device", "pocl"), "--device"),
         (("locate-robot", "points.npy", "--field", "robocup_msl", "--scale", "1cm"), "--scale"),
         (("locate-robot", "points.npy", "--field", "robocup_msl", "--camera", "c.toml"), "--camera"),

@@ -118,7 +118,9 @@ def test_samples_are_spread_evenly(length: int, count: int, group: int) -> None:
         with pytest.raises(RecordingError, match="too few frames"):
             sample_frames(ArraySource(frames), count, group=group)
         return
-    found = sample_frames(ArraySource(frames), count, group=group)[:, :, 0, 0]
+    sample = sample_frames(ArraySource(frames), count, group=group)
+    found = sample.frames[:, :, 0, 0]
+    np.testing.assert_array_equal(sample.numbers, found[:, 0])
     assert min(count, groups) <= len(found) < 2 * count
     assert np.all(np.diff(found, axis=1) == 1)
     firsts = found[:, 0] // group

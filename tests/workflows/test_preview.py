@@ -1,0 +1,89 @@
+"""Preview of a scan: the line over some frames, before the scan."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from gpuvision.host import Device
+from gpuvision.host.outputs import MANIFEST
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.status import Status
+from gpuvision.workflows.preview import preview_scan
+from scanning import Ran, check_refused, currents
+from scanning import line_frames as frames_of_lines
+
+PROFILES = 40
+ROWS = 10.0 + 1.1 * np.arange(PROFILES)[:, None] + np.linspace(0.0, 1.0, 480)
+
+
+def recording() -> Any:
+    """Return 40 frames in ambient light of 60 grey levels; 48 of 480 columns have no line."""
+    frames = frames_of_lines(ROWS, peak=120.0) + np.uint8(60)
+    frames[:, :, :48] = 60
+    return frames
+
+
+def daylight() -> Sensor:
+    shipped = Sensor.load("camera_line")
+    median = dataclasses.replace(shipped.recording, background="median")
+    return dataclasses.replace(shipped, recording=median, auto_threshold=True)
+
+
+def test_frames_are_spread_over_the_recording(device: Device) -> None:
+    found = preview_scan(recording(), daylight(), count=5, device=device)
+    numbers = [frame.number for frame in found.frames]
+    assert len(numbers) == 5
+    assert numbers[0] == 0
+    assert numbers[-1] >= PROFILES - 10
+    for frame in found.frames:
+        # The background is subtracted, and the line is where it was drawn: 0.03 px for rounding and threshold.
+        assert np.median(frame.image) == 0
+        np.testing.assert_allclose(frame.position[48:], ROWS[frame.number, 48:], rtol=0, atol=0.05)
+        assert np.all(frame.status[:48] & Status.LOW_SIGNAL)
+        assert frame.found_fraction == pytest.approx(0.9)
+    threshold = found.sensor.readout.threshold  # type: ignore[union-attr]
+    assert 4 <= threshold <= 40
+    assert found.summary() == (
+        f"preview of 5 frames at threshold {threshold:g} grey levels, background median: "
+        "a line in 90.0 % of the samples"
+    )
+
+
+def test_a_short_recording_is_shown_as_a_whole() -> None:
+    found = preview_scan(recording()[:3], Sensor.load("camera_line"))
+    assert [frame.number for frame in found.frames] == [0, 1, 2]
+
+
+def test_the_picture_shows_line_and_flags(tmp_path: Path) -> None:
+    found = preview_scan(recording(), daylight())
+    found.write(tmp_path)
+    picture = cv2.imread(str(tmp_path / "preview.png"))
+    assert picture is not None
+    blue, green, red = np.moveaxis(picture.astype(int), 2, 0)
+    # Dots on 432 samples and marks of 48 samples, in 9 frames.
+    assert np.count_nonzero(green - np.maximum(red, blue) > 40) > 9 * 432
+    assert np.count_nonzero(red - np.maximum(green, blue) > 40) > 9 * 48
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    np.save(tmp_path / "line.npy", recording())
+    np.save(tmp_path / "psd.npy", currents(3))
+    arguments = ("scan", tmp_path / "line.npy", "--sensor", "camera_line", "--out", tmp_path / "out", "--preview")
+    ran = Ran(capsys, monkeypatch, *arguments)
+    assert (ran.code, ran.err) == (0, "")
+    first, second = ran.out.splitlines()
+    assert first.startswith("preview of 9 frames at threshold 16 grey levels: a line in ")
+    assert second == f"look at {tmp_path / 'out' / 'preview.png'}"
+    assert [each.name for each in (tmp_path / "out").iterdir() if each.name != MANIFEST] == ["preview.png"]
+    assert Ran(capsys, monkeypatch, *arguments).code == 0  # it replaces its own picture
+    ran = Ran(
+        capsys, monkeypatch, "scan", tmp_path / "psd.npy", "--sensor", "psd_line", "--out", tmp_path / "o", "--preview"
+    )
+    check_refused(ran, "a preview shows the line in camera frames; the sensor is of kind 'psd'")
+    assert not (tmp_path / "o").exists()

@@ -177,10 +177,13 @@ def test_metres_and_micrometres() -> None:
     np.testing.assert_allclose(truth.h[np.abs(truth.g - 2e-3) > 5.1e-6], 0.0, atol=1e-13)
 
 
+@pytest.mark.parametrize("falls", [False, True])
 @pytest.mark.parametrize("lens", [None, Lens(k1=-900.0, centre=(1e-4, -2e-4)), Lens(k1=-4e3)])
-def test_out_of_view_behind_the_lens_and_beyond_the_fold(lens: Lens | None) -> None:
-    """A ramp from below the sensor's range up to far above the lens: only points with an image count."""
+def test_out_of_view_behind_the_lens_and_beyond_the_fold(lens: Lens | None, falls: bool) -> None:
+    """A ramp between below the sensor's range and far above the lens: only points with an image count."""
     ramp = quad((-0.03, -1, -0.05), (0.5, -1, 1.0), (0.5, 1, 1.0), (-0.03, 1, -0.05))
+    if falls:
+        ramp = quad((-0.5, -1, 1.0), (0.03, -1, -0.05), (0.03, 1, -0.05), (-0.5, 1, 1.0))
     seen_by = sensor_view(
         lens=lens, bins=30, u_edges=np.linspace(-9e-3, 9e-3, 31), v_edges=np.linspace(-9e-3, 9e-3, 10)
     )

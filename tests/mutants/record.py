@@ -37,30 +37,32 @@ def is_recorded() -> bool:
 
 
 def environment(tree: Path) -> dict[str, str]:
-    """Return the environment of tests in a copy of the repository: its package comes before an installed one."""
-    return {**os.environ, "PYTHONPATH": str(tree), "GPUVISION_DEBUG": "", "PYTHONDONTWRITEBYTECODE": ""}
+    """Return the environment of tests in a copy of the repository: its packages come before installed ones."""
+    path = f"{tree}{os.pathsep}{tree / 'tests'}"
+    return {**os.environ, "PYTHONPATH": path, "GPUVISION_DEBUG": "", "PYTHONDONTWRITEBYTECODE": ""}
 
 
 def tests_of(fault: Fault, budget: float) -> list[str]:
-    """Return the test files of a file, and recorded tests that run the lines of the fault, up to `budget` seconds.
+    """Return tests for a fault, in the order to run them: recorded tests, the shortest first, then test files.
 
-    Lines that run only at import have no recorded tests; for them, take all tests that run any line of the file. For a
-    kernel, take the test files of the operations that launch it; for a header of many kernels, at most `_MAX_FILES`.
+    The recorded tests run the lines of the fault and take up to `budget` seconds together. Lines that run only at
+    import have no recorded tests; for them, take all tests that run any line of the file. For a kernel, take the tests
+    of the operations that launch it; for a header of many kernels, at most `_MAX_FILES` files.
     """
     path = ROOT / fault.file
     is_code = path.suffix == ".py"
     places = [(path, fault.lines(path.read_text()))] if is_code else list(_launches(fault.file))
-    chosen = [file for files in dict.fromkeys(_test_files(file) for file, _ in places) for file in files][:_MAX_FILES]
-    if not budget:
-        return chosen
-    names = {name for file, lines in places for name in _contexts(file, lines)}
-    names = names or {name for file, _ in places for name in _contexts(file, None)}
-    times, total = _seconds(), 0.0
-    for name in sorted(names, key=lambda name: (times[_key(name)], name)):
-        total += times[_key(name)]
-        if name.partition("::")[0] not in chosen and total <= budget:
-            chosen.append(name)
-    return chosen
+    files = [file for files in dict.fromkeys(_test_files(file) for file, _ in places) for file in files][:_MAX_FILES]
+    chosen: list[str] = []
+    if budget:
+        names = {name for file, lines in places for name in _contexts(file, lines)}
+        names = names or {name for file, _ in places for name in _contexts(file, None)}
+        times, total = _seconds(), 0.0
+        for name in sorted(names, key=lambda name: (times[_key(name)], name)):
+            total += times[_key(name)]
+            if total <= budget:
+                chosen.append(name)
+    return [*chosen, *files]
 
 
 @cache

@@ -26,14 +26,14 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "tests")]
 
-from mutants import record  # noqa: E402
+from mutants import order, record  # noqa: E402
 from mutants.faults import Fault, draw_faults, planted_faults  # noqa: E402
 
 _BUDGET = 60.0  # for recorded tests of one fault, in addition to its test files [s]; by the times of the record
 _TIMEOUT = 900.0  # of all tests of one fault [s]: kernels are compiled anew, and the machine may be busy
 _TEST_TIMEOUT = 150.0  # of one test [s]: an endless loop in Python fails the test
 _KERNEL_SHARE = 0.3  # of the sample
-_OPTIONS = ("-x", "-q", "-p", "no:xdist", "--tb=line", "--tier", "fast")
+_OPTIONS = ("-x", "-q", "-p", "no:xdist", "--tb=line", "--tier", "fast", "-p", "mutants.order")
 _UNBUILT = ("BuildError", "BUILD_PROGRAM_FAILURE", "clBuildProgram")
 _STATES = ("killed", "survived", "did not end", "not built")
 
@@ -173,7 +173,9 @@ class _Tree:
     def _pytest(self, tests: list[str], *more: str) -> tuple[int, list[str], str]:
         """Return the exit status, the tests that failed, and the output."""
         omitted = [f"--deselect={name}" for name in self.omitted]
-        (self.folder / "build" / "tests.txt").write_text("\n".join([*tests, *omitted]))
+        named = [name for name in tests if "::" not in name or name.partition("::")[0] not in tests]
+        (self.folder / "build" / "tests.txt").write_text("\n".join([*named, *omitted]))
+        (self.folder / order.LIST).write_text("\n".join(tests))
         done = subprocess.run(
             [sys.executable, "-m", "pytest", *_OPTIONS, f"--timeout={_TEST_TIMEOUT}", *more, "@build/tests.txt"],
             cwd=self.folder,

@@ -46,13 +46,16 @@ def tests_of(fault: Fault, budget: float) -> list[str]:
     """Return tests for a fault, in the order to run them: recorded tests, the shortest first, then test files.
 
     The recorded tests run the lines of the fault and take up to `budget` seconds together. Lines that run only at
-    import have no recorded tests; for them, take all tests that run any line of the file. For a kernel, take the tests
-    of the operations that launch it; for a header of many kernels, at most `_MAX_FILES` files.
+    import have no recorded tests; for them, take all tests that run any line of the file. For a kernel, take the test
+    file of its name and the tests of the operations that launch it; for a header of many kernels, at most `_MAX_FILES`
+    files.
     """
     path = ROOT / fault.file
     is_code = path.suffix == ".py"
     places = [(path, fault.lines(path.read_text()))] if is_code else list(_launches(fault.file))
-    files = [file for files in dict.fromkeys(_test_files(file) for file, _ in places) for file in files][:_MAX_FILES]
+    own = [] if is_code else [str(file.relative_to(ROOT)) for file in _tests() if file.name == f"test_{path.stem}.py"]
+    others = [file for files in dict.fromkeys(_test_files(file) for file, _ in places) for file in files]
+    files = list(dict.fromkeys([*own, *others]))[:_MAX_FILES]
     chosen: list[str] = []
     if budget:
         names = {name for file, lines in places for name in _contexts(file, lines)}

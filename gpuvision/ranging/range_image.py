@@ -32,10 +32,12 @@ from gpuvision.host import (
     StatusArray,
     Variant,
     WorkSize,
+    flags,
     round_up,
     type_defines,
 )
 from gpuvision.operation import VisionOperation
+from gpuvision.ranging.sheet import BentSheet, check_orthonormal
 from gpuvision.validation import check_keys, finite, numbers
 
 _STRIP = 1024  # samples of a work-item of the vector variant: SAMPLES_PER_STRIP in range_image.cl
@@ -45,8 +47,6 @@ _PARALLEL = 1e-9  # volume of three unit vectors, or sine between two, below whi
 # A vector whose length is 1 within this rounding (two epsilon) is not normalised again, so that a written vector reads
 # back unchanged.
 _UNIT_ROUNDING = 4e-16
-# Largest difference of scalar products of given axes from 0 and 1. Chosen: axes written with 6 decimals pass.
-_ORTHONORMAL = 1e-6
 
 Vector = tuple[float, float, float]
 Limits = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -97,6 +97,14 @@ class StraightTable(NamedTuple):
     e3: npt.ArrayLike
 
 
+class BentTable(NamedTuple):
+    """Parameters of ``kernels/range_image/range_image.cl`` after those of a straight transport, under ``SHEET_BENT``."""
+
+    bend: npt.ArrayLike
+    pinhole: npt.ArrayLike
+    across: npt.ArrayLike
+
+
 class RotatingTable(NamedTuple):
     """Parameters of ``kernels/range_image/range_image.cl`` after the limits, under ``GEOMETRY_ROTATING``."""
 
@@ -133,11 +141,15 @@ class StraightTransport:
         Direction of the transport, from a profile to the next one; it is normalised.
     origin : (3,) array_like
         Point G = H = 0 of the sheet at L = 0 [m].
+    bend : BentSheet, optional
+        Deviation of the light from the mean plane of the sheet, to which G and H refer; ``g_axis`` and ``h_axis`` must
+        then be orthonormal. Default: a flat sheet.
 
     Raises
     ------
     ValueError
-        A number is not finite, the step is 0, or the three directions lie in one plane.
+        A number is not finite, the step is 0, the three directions lie in one plane, or the axes of a bent sheet are
+        not orthonormal.
 
     References
     ----------
@@ -150,6 +162,7 @@ class StraightTransport:
     h_axis: Vector = (0.0, 0.0, 1.0)
     direction: Vector = (0.0, 1.0, 0.0)
     origin: Vector = (0.0, 0.0, 0.0)
+    bend: BentSheet | None = None
 
     def __post_init__(self) -> None:
         if self.step is not None:
@@ -163,6 +176,8 @@ class StraightTransport:
         axes = np.array([self.g_axis, self.h_axis, self.direction])
         if abs(np.linalg.det(axes)) <= _PARALLEL * np.prod(np.linalg.norm(axes, axis=1)):
             raise ValueError("StraightTransport: g_axis, h_axis and direction lie in one plane; expected a volume")
+        if self.bend is not None:
+            check_orthonormal((self.g_axis, self.h_axis), "StraightTransport: g_axis and h_axis of a bent sheet")
 
     def transport(self, profiles: int, first: int = 0) -> npt.NDArray[np.float64]:
         """Return the transport of the profiles ``first``, ``first + 1``, ... for a uniform step [m], shape (profiles,).
@@ -186,16 +201,28 @@ class StraightTransport:
     @property
     def defines(self) -> dict[str, None]:
         """Build options of ``kernels/range_image/range_image.cl`` for this geometry."""
-        return {}
+        return flags(SHEET_BENT=self.bend is not None)
 
     def packed(self) -> npt.NDArray[np.float64]:
         """Return the part of the kernel's parameter table after the limits."""
-        return np.hstack(StraightTable(origin=self.origin, e1=self.g_axis, e2=self.h_axis, e3=self.direction))
+        straight = StraightTable(origin=self.origin, e1=self.g_axis, e2=self.h_axis, e3=self.direction)
+        if self.bend is None:
+            return np.hstack(straight)
+        # The kernel's terms and normal are in units of the distance of the pinhole.
+        distance = self.bend.pinhole[2]
+        bent = BentTable(
+            bend=np.array(self.bend.terms) / distance,
+            pinhole=self.bend.pinhole[:2],
+            across=distance * np.cross(self.g_axis, self.h_axis),
+        )
+        return np.hstack([*straight, *bent])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers and lists, as in a TOML file."""
-        numbers = {name: list(getattr(self, name)) for name in ("g_axis", "h_axis", "direction", "origin")}
-        return ({} if self.step is None else {"step": self.step}) | {"start": self.start} | numbers
+        """Return plain numbers, lists and tables, as in a TOML file."""
+        table: dict[str, Any] = {} if self.step is None else {"step": self.step}
+        table |= {"start": self.start}
+        table |= {name: list(getattr(self, name)) for name in ("g_axis", "h_axis", "direction", "origin")}
+        return table if self.bend is None else {**table, "bend": self.bend.to_dict()}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> StraightTransport:
@@ -206,7 +233,10 @@ class StraightTransport:
         TypeError, ValueError
             A key is unknown, or a value has the wrong type or range.
         """
-        return cls(**check_keys(table, cls.__dataclass_fields__, (), "straight transport"))
+        values = dict(check_keys(table, cls.__dataclass_fields__, (), "straight transport"))
+        if "bend" in values:
+            values["bend"] = BentSheet.from_dict(values["bend"])
+        return cls(**values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,8 +317,7 @@ class RotatingSheet:
         if np.linalg.norm(np.cross(self.axis_direction, self.sheet_normal)) <= _PARALLEL:
             raise ValueError("RotatingSheet: the sheet's normal lies along the axis, so that turning does not move it")
         axes = numbers(self.scene_axes, (3, 3), "RotatingSheet.scene_axes")
-        if np.max(np.abs(np.array(axes) @ np.array(axes).T - np.eye(3))) > _ORTHONORMAL:
-            raise ValueError("RotatingSheet.scene_axes are not three orthonormal vectors")
+        check_orthonormal(axes, "RotatingSheet.scene_axes")
         object.__setattr__(self, "scene_axes", axes)
 
     def transport(self, profiles: int, first: int = 0) -> npt.NDArray[np.float64]:

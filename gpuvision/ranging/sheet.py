@@ -1,14 +1,19 @@
-"""Coordinates of laser triangulation: points in the sheet of light, sample axes of a sensor, and the kernels' table."""
+"""Coordinates of laser triangulation: points in the sheet of light, its shape, sample axes of a sensor, kernel tables."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import FloatArray, StatusArray
-from gpuvision.validation import finite
+from gpuvision.validation import check_keys, finite, numbers
+
+# Largest difference of scalar products of given axes from 0 and 1. Chosen: axes written with 6 decimals pass.
+_ORTHONORMAL = 1e-6
 
 
 class SheetPoints(NamedTuple):
@@ -87,3 +92,85 @@ class SampleAxes:
             finite(getattr(self, name), f"SampleAxes.{name}")
         if self.sample_pitch == 0.0 or self.position_pitch == 0.0:
             raise ValueError("SampleAxes: a pitch is 0, expected the distance between samples in sensor units")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BentSheet:
+    """Deviation of the sheet of light from its mean plane, a quadratic surface: ``d = gg G^2 + gh G H + hh H^2``.
+
+    d is the distance from the mean plane, along the normal ``g_axis x h_axis``. A triangulation gives the point Q at
+    which the ray of the camera meets the mean plane; the light lies on the same ray, at ``P = Q + s (E - Q)`` with E the
+    pinhole of the camera.
+
+    Parameters
+    ----------
+    terms : (gg, gh, hh)
+        Coefficients of the surface [1/m].
+    pinhole : (G, H, D)
+        Pinhole of the camera: its coordinates in the mean plane, and its distance from it along the normal [m], not 0.
+
+    Raises
+    ------
+    ValueError
+        A number is not finite, or the pinhole lies in the mean plane.
+    """
+
+    terms: tuple[float, float, float]
+    pinhole: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "terms", numbers(self.terms, (3,), "BentSheet.terms (gg, gh, hh)"))
+        object.__setattr__(self, "pinhole", numbers(self.pinhole, (3,), "BentSheet.pinhole"))
+        if self.pinhole[2] == 0.0:
+            raise ValueError("BentSheet.pinhole lies in the mean plane of the sheet: nothing can be triangulated")
+
+    @classmethod
+    def from_pose(
+        cls, terms: npt.ArrayLike, *, origin: npt.ArrayLike, g_axis: npt.ArrayLike, h_axis: npt.ArrayLike
+    ) -> BentSheet:
+        """Build a bent sheet from the pose of its mean plane in the camera frame, where the pinhole is 0.
+
+        Parameters
+        ----------
+        terms : (3,) array_like
+            As in the class.
+        origin, g_axis, h_axis : (3,) array_like
+            Point G = H = 0 [m] and directions of G and H, orthonormal.
+
+        Raises
+        ------
+        ValueError
+            The axes are not orthonormal, or the class refuses the values.
+        """
+        g, h, start = (np.array(numbers(each, (3,), "BentSheet.from_pose")) for each in (g_axis, h_axis, origin))
+        check_orthonormal((g, h), "BentSheet.from_pose: g_axis and h_axis")
+        pinhole = numbers([-start @ g, -start @ h, -start @ np.cross(g, h)], (3,), "BentSheet.pinhole")
+        return cls(terms=numbers(terms, (3,), "BentSheet.terms (gg, gh, hh)"), pinhole=pinhole)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return lists of numbers, as in a TOML file."""
+        return {"terms": list(self.terms), "pinhole": list(self.pinhole)}
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> BentSheet:
+        """Build a bent sheet from the table of `to_dict`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            A key is unknown or missing, or a value has the wrong type or range.
+        """
+        return cls(**check_keys(table, ("terms", "pinhole"), ("terms", "pinhole"), "bent sheet"))
+
+
+def check_orthonormal(axes: Sequence[npt.ArrayLike], what: str) -> None:
+    """Check that vectors have length 1 and are perpendicular to each other.
+
+    Raises
+    ------
+    ValueError
+        A scalar product differs from 0 or 1 by more than 1e-6, so that axes written with 6 decimals pass.
+    """
+    matrix = np.array(axes, dtype=np.float64)
+    if np.max(np.abs(matrix @ matrix.T - np.eye(len(matrix)))) > _ORTHONORMAL:
+        raise ValueError(f"{what} are not orthonormal vectors")

@@ -2,6 +2,7 @@
 //
 // Two geometries (RangeImage in gpuvision/ranging/range_image.py):
 //     straight transport:  point = origin + G e1 + H e2 + L e3     (G, H in the sheet, L travelled along e3)
+// SHEET_BENT:              the same for light at the distance d = f(G, H) from the plane of G and H (bent, below)
 // GEOMETRY_ROTATING:   the ray r = (a, b, 1) of a camera at rest meets the sheet n.(X - p) = e, whose normal n turns
 //                          about an axis through p:
 //                          depth = (e + n.p) / (n.r),  point = origin + depth (a e1 + b e2 + e3)
@@ -13,7 +14,7 @@
 //          table       RangeTable
 // Outputs: x, y, z     (profiles, samples) real [m]; NaN under a flag other than SATURATED and AMBIGUOUS
 // status      (profiles, samples) uchar: the given flags, and NOT_FINITE, NOT_INVERTIBLE, HORIZON, OUT_OF_RANGE Build
-// options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, GEOMETRY_ROTATING, LENS, LENS_K2, LENS_K3, LENS_K4,
+// options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, SHEET_BENT, GEOMETRY_ROTATING, LENS, LENS_K2, LENS_K3, LENS_K4,
 //          PAST_CACHES, VECTOR_VARIANT.
 // Work:    vector variant: global size (strips of SAMPLES_PER_STRIP samples, profiles), the last strip up to twice as
 // long.
@@ -33,6 +34,11 @@ typedef struct {
     real low[3], high[3];             // limits of x, y, z [m]
     real origin[3];                   // of the points
     real e1[3], e2[3], e3[3];         // axes of the points
+#ifdef SHEET_BENT
+    real bend[3];                     // gg, gh, hh of f, over the distance D of the pinhole from the plane [1/m^2]
+    real pinhole[2];                  // G and H of the pinhole [m]
+    real across[3];                   // normal of the plane, of length D [m]
+#endif
 #ifdef GEOMETRY_ROTATING
     real position_origin, sample_origin, scale;  // a = (position - position_origin) scale, b = (sample - ...) scale
     real horizon;                     // smallest n.r that counts
@@ -114,14 +120,44 @@ static inline Pose pose_of(real travelled, constant RangeTable *table) {
     return pose;
 }
 
-// Compute the point of (g, h); no ray misses the sheet here, and no lens folds.
+#ifdef SHEET_BENT
+// Move (g, h), where the ray of the camera meets the mean plane, to where it meets the bent sheet; return the share s of
+// the way from the plane to the pinhole. `missed`: the ray does not meet the sheet in front of the pinhole.
+//
+// With V the vector from (g, h) to the pinhole along the plane and F = f / D, the light is at the share s where
+//     s = F((g, h) + s V),  F quadratic:  F(V) s^2 - (1 - grad F . V) s + F(g, h) = 0
+// The smaller root is written as a quotient in which nothing cancels. It is exact: there is no iteration.
+static inline reals bent(reals *g, reals *h, constant RangeTable *table, masks *missed) {
+    constant real *f = table->bend;
+    const reals to_g = table->pinhole[0] - *g, to_h = table->pinhole[1] - *h;
+    const reals here = *g * (f[0] * *g + f[1] * *h) + f[2] * *h * *h;
+    const reals there = to_g * (f[0] * to_g + f[1] * to_h) + f[2] * to_h * to_h;
+    const reals slope = to_g * (2 * f[0] * *g + f[1] * *h) + to_h * (f[1] * *g + 2 * f[2] * *h);
+    const reals b = 1 - slope, square = b * b - 4 * there * here;
+    const reals share = 2 * here / (b + sqrt(square));
+    *missed = ~(mask_of(b > 0) & mask_of(square >= 0) & mask_of(share < 1));
+    *g += share * to_g;
+    *h += share * to_h;
+    return share;
+}
+#endif
+
+// Compute the point of (g, h); no lens folds here.
 static inline void locate(reals g, reals h, Pose pose, constant RangeTable *table, reals *x, reals *y, reals *z,
                           masks *missed, masks *folded) {
     constant real *e1 = table->e1, *e2 = table->e2;
     *missed = *folded = 0;
+#ifdef SHEET_BENT
+    constant real *across = table->across;
+    const reals share = bent(&g, &h, table, missed);
+    *x = pose.x + (e1[0] * g + e2[0] * h + across[0] * share);
+    *y = pose.y + (e1[1] * g + e2[1] * h + across[1] * share);
+    *z = pose.z + (e1[2] * g + e2[2] * h + across[2] * share);
+#else
     *x = pose.x + (e1[0] * g + e2[0] * h);
     *y = pose.y + (e1[1] * g + e2[1] * h);
     *z = pose.z + (e1[2] * g + e2[2] * h);
+#endif
 }
 
 #endif

@@ -247,6 +247,9 @@ from .ranging.regrid import (
     Regrid as Regrid,
 )
 from .ranging.sheet import (
+    BentSheet as BentSheet,
+)
+from .ranging.sheet import (
     SampleAxes as SampleAxes,
 )
 from .ranging.sheet import (

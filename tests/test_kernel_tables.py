@@ -12,7 +12,7 @@ from gpuvision.matching.pose import board_pose, pose
 from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.ranging.line import LineTable
 from gpuvision.ranging.psd import PsdTable
-from gpuvision.ranging.range_image import RotatingTable, StraightTable
+from gpuvision.ranging.range_image import BentTable, RotatingTable, StraightTable
 from gpuvision.ranging.regrid import RegridCounts, RegridTable
 from gpuvision.ranging.sheet import SheetTable
 from gpuvision.simulation.transport.mirror_points import MirrorPoints, TriangleBlocks
@@ -56,8 +56,9 @@ def test_struct_has_the_fields_of_the_table(file: str, table: Any) -> None:
 
 def test_range_table_has_the_limits_and_the_fields_of_the_geometry() -> None:
     fields = fields_of("range_image/range_image.cl", "RangeTable")
-    assert fields == ("low", "high", *RotatingTable._fields)
-    assert RotatingTable._fields[: len(StraightTable._fields)] == StraightTable._fields
+    straight = StraightTable._fields
+    assert fields == ("low", "high", *straight, *BentTable._fields, *RotatingTable._fields[len(straight) :])
+    assert RotatingTable._fields[: len(straight)] == straight
 
 
 @pytest.mark.parametrize(

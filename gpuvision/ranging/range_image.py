@@ -32,7 +32,6 @@ from gpuvision.host import (
     StatusArray,
     Variant,
     WorkSize,
-    flags,
     round_up,
     type_defines,
 )
@@ -98,7 +97,7 @@ class StraightTable(NamedTuple):
 
 
 class BentTable(NamedTuple):
-    """Parameters of ``kernels/range_image/range_image.cl`` after those of a straight transport, under ``SHEET_BENT``."""
+    """Parameters of ``kernels/range_image/range_image.cl`` after those of `StraightTable`, under ``SHEET_BENT``."""
 
     bend: npt.ArrayLike
     pinhole: npt.ArrayLike
@@ -201,7 +200,7 @@ class StraightTransport:
     @property
     def defines(self) -> dict[str, None]:
         """Build options of ``kernels/range_image/range_image.cl`` for this geometry."""
-        return flags(SHEET_BENT=self.bend is not None)
+        return {} if self.bend is None else {"SHEET_BENT": None}
 
     def packed(self) -> npt.NDArray[np.float64]:
         """Return the part of the kernel's parameter table after the limits."""

@@ -1,4 +1,4 @@
-"""Coordinates of laser triangulation: points in the sheet of light, its shape, sample axes of a sensor, kernel tables."""
+"""Laser triangulation: points in the sheet of light, shape of the sheet, sample axes of a sensor, kernel tables."""
 
 from __future__ import annotations
 
@@ -99,8 +99,8 @@ class BentSheet:
     """Deviation of the sheet of light from its mean plane, a quadratic surface: ``d = gg G^2 + gh G H + hh H^2``.
 
     d is the distance from the mean plane, along the normal ``g_axis x h_axis``. A triangulation gives the point Q at
-    which the ray of the camera meets the mean plane; the light lies on the same ray, at ``P = Q + s (E - Q)`` with E the
-    pinhole of the camera.
+    which the ray of the camera meets the mean plane; the light lies on the same ray, at ``P = Q + s (E - Q)`` with the
+    pinhole E of the camera.
 
     Parameters
     ----------

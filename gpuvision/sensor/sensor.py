@@ -18,9 +18,10 @@ Tables of the file (the files in ``gpuvision/presets/sensors`` are commented exa
                       and ``[axes]``
 ``[triangulation]``   sensor to sheet, for a straight transport: ``baseline``, ``stand_off`` and so on (see
                       `Triangulation.from_stand_off`); or the sheet in the frame of a camera, ``sheet_origin``,
-                      ``g_axis``, ``h_axis``, with a table ``[camera]``, or without it with ``focal_length_px`` and
-                      ``principal_point_px``; or ``homography``; or ``constants`` (`Triangulation.from_constants`); or
-                      ``points``: calibration points (u, v, G, H) to fit
+                      ``g_axis``, ``h_axis`` and, if it is bent, ``bend`` (see `BentSheet`), with a table ``[camera]``,
+                      or without it with ``focal_length_px`` and ``principal_point_px``; or ``homography``; or
+                      ``constants`` (`Triangulation.from_constants`); or ``points``: calibration points (u, v, G, H) to
+                      fit
 ``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`;
                       with an encoder ``encoder``, a file with a count for each profile, and ``metres_per_count`` or
                       ``radians_per_count`` instead of a step
@@ -223,7 +224,9 @@ class Sensor:
         transport, encoder = read_transport(moving, optics.lens, along, is_rotating=is_rotating)
         if not is_rotating:
             region = _region(kind, top, frame, along, axes, readout)
-            sheet = read_triangulation(top.section("triangulation"), optics, region, along)
+            sheet, bend = read_triangulation(top.section("triangulation"), optics, region, along)
+            assert isinstance(transport, StraightTransport)  # it is not rotating
+            transport = replace(transport, bend=bend)
         polygon = None
         if kind == "psd":
             assert frame is not None  # a PSD has strips

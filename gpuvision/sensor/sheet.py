@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gpuvision.ranging.sheet import BentSheet
 from gpuvision.ranging.triangulation import Along, Triangulation
 from gpuvision.schema import Section
 from gpuvision.sensor.optics import Optics
@@ -16,7 +17,9 @@ from gpuvision.sensor.optics import Optics
 Region = tuple[tuple[float, float], tuple[float, float]]
 
 
-def read_triangulation(table: Section, optics: Optics, region: Region, along: Along) -> Triangulation:
+def read_triangulation(
+    table: Section, optics: Optics, region: Region, along: Along
+) -> tuple[Triangulation, BentSheet | None]:
     """Read a triangulation: a homography, constants, calibration points, a setup in metres, or a camera's pose.
 
     Parameters
@@ -29,6 +32,13 @@ def read_triangulation(table: Section, optics: Optics, region: Region, along: Al
         Region of the sensor [sensor unit].
     along : {"columns", "rows"}
         Image axis of the samples.
+
+    Returns
+    -------
+    Triangulation
+        To the mean plane of the sheet.
+    BentSheet or None
+        Deviation of the sheet from the plane, for a pose with the key ``bend``.
 
     Raises
     ------
@@ -43,8 +53,9 @@ def read_triangulation(table: Section, optics: Optics, region: Region, along: Al
         problem = f"has {' and '.join(given)} at once" if given else "has no geometry"
         raise table.error(f"[{table.name}] {problem}, expected one of {', '.join(ways)}")
     made = ways[given[0]](table, common)
+    bend = _bend(table) if given[0] in _POSES else None
     table.finish()
-    return made
+    return made, bend
 
 
 def _from_homography(table: Section, common: dict[str, Any]) -> Triangulation:
@@ -93,6 +104,15 @@ def _pose(table: Section) -> dict[str, Any]:
     return {"origin": origin, "g_axis": g_axis, "h_axis": h_axis}
 
 
+def _bend(table: Section) -> BentSheet | None:
+    """Read the bend of a sheet whose pose in the camera frame is given."""
+    terms = table.numbers("bend", "1/m", (3,), None)
+    if terms is None:
+        return None
+    with table.checking():
+        return BentSheet.from_pose(terms, **_pose(table))
+
+
 _Reader = Callable[[Section, dict[str, Any]], Triangulation]
 _WAYS: dict[str, _Reader] = {
     "homography": _from_homography,
@@ -106,3 +126,4 @@ _WAYS_OF_CAMERA: dict[str, _Reader] = {
     "points": _from_points,
     "sheet_origin": _from_camera,
 }
+_POSES = ("focal_length_px", "sheet_origin")

@@ -14,6 +14,7 @@ from hypothesis.extra import numpy as hnp
 from gpuvision import Device, Status
 from gpuvision.camera.lens import Lens
 from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
+from gpuvision.ranging.sheet import BentSheet
 from gpuvision.reference import range_image as reference
 
 VARIANTS = ("vector", "work_item")
@@ -99,6 +100,75 @@ def test_a_straight_transport_lays_profiles_side_by_side(device, rng, shape, dty
         *expect_straight(op, g, h, transport, given),
         tolerance=6 * 0.1 * np.finfo(dtype).eps,
     )
+
+
+# A tilted camera 0.3 m away, whose sheet deviates by up to 1.5 mm in a field of 0.1 m.
+BENT = StraightTransport(
+    step=1e-4,
+    g_axis=(0.0, 1.0, 0.0),
+    h_axis=(math.sin(0.3), 0.0, math.cos(0.3)),
+    direction=(1.0, 0.1, 0.0),
+    origin=(0.01, -0.02, 0.03),
+    bend=BentSheet(terms=(0.4, -0.15, 0.25), pinhole=(0.01, 0.25, -0.18)),
+)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "variant", "sign"),
+    [(np.float32, "vector", 1.0), (np.float64, "vector", -1.0), (np.float32, "work_item", -1.0)],
+)
+def test_rays_meet_a_bent_sheet(device, rng, dtype, variant, sign):
+    """Bent towards the camera and away from it, against a search along the rays."""
+    bend = dataclasses.replace(BENT.bend, terms=tuple(sign * each for each in BENT.bend.terms))
+    op = RangeImage(geometry=dataclasses.replace(BENT, bend=bend), variant=variant)
+    g, h = rng.uniform(-0.05, 0.05, (2, 3, 1043)).astype(dtype)
+    transport = op.geometry.transport(3).astype(dtype)
+    given = rng.choice(np.array([0, 0, 0, 1, 2, 16, 32], np.uint8), g.shape)
+    points, missed = reference.points_of_bent_sheet(op.geometry, g, h, transport)
+    assert not missed.any()
+    deviation = points - reference.points_of_straight_transport(op.geometry, g, h, transport)
+    assert 1e-3 < np.max(np.linalg.norm(deviation, axis=-1)) < 5e-3
+    no = np.zeros(g.shape, bool)
+    expected = reference.apply_status(points, given, no, no, no, op.limits)
+    # About eight terms below 0.1 m.
+    close(op(g, h, transport, given, device=device), *expected, tolerance=8 * 0.1 * np.finfo(dtype).eps)
+
+
+def test_points_of_a_bent_sheet_and_rays_that_miss_it(device):
+    """A point of the surface, seen by the camera, comes back; where the sheet bends away from the ray there is none."""
+    bend = BentSheet.from_pose(
+        (2.0, 0.5, -1.0), origin=(0.0, 0.02, 0.3), g_axis=(1.0, 0.0, 0.0), h_axis=(0.0, -0.6, -0.8)
+    )
+    normal = np.cross((1.0, 0.0, 0.0), (0.0, -0.6, -0.8))
+    truth = np.array([0.03, 0.02, 2.0 * 0.03**2 + 0.5 * 0.03 * 0.02 - 0.02**2])
+    # In the camera frame the pinhole is 0: the ray through the point meets the mean plane at Q.
+    point = np.array([0.0, 0.02, 0.3]) + truth @ np.array([(1.0, 0.0, 0.0), (0.0, -0.6, -0.8), normal])
+    on_plane = point * (normal @ (0.0, 0.02, 0.3)) / (normal @ point) - (0.0, 0.02, 0.3)
+    g, h = np.array([[on_plane[0]]]), np.array([[on_plane @ (0.0, -0.6, -0.8)]])
+    geometry = StraightTransport(g_axis=(1.0, 0.0, 0.0), h_axis=(0.0, 0.0, 1.0), bend=bend)
+    made = RangeImage(geometry=geometry)(g, h, np.zeros(1), np.zeros((1, 1), np.uint8), device=device)
+    # g_axis x h_axis is -y here.
+    np.testing.assert_allclose([made.x[0, 0], -made.y[0, 0], made.z[0, 0]], truth[[0, 2, 1]], atol=1e-15)
+    # With the pinhole 0.1 m above a sheet of 40 G^2 a ray from Q meets it at s = 400 Q^2 (1 - s)^2; bent the other way
+    # s = -400 Q^2 (1 - s)^2, without a solution from Q = 0.025 on.
+    g = np.array([[0.0, 0.01, 0.05, 0.3, np.nan, np.inf]])
+    for sign, flags in ((1.0, [0, 0, 0, 0, 8, 8]), (-1.0, [0, 0, Status.HORIZON, Status.HORIZON, 8, 8])):
+        steep = dataclasses.replace(geometry, bend=BentSheet(terms=(sign * 40.0, 0.0, 0.0), pinhole=(0.0, 0.0, 0.1)))
+        made = RangeImage(geometry=steep)(g, np.zeros_like(g), np.zeros(1), np.zeros(g.shape, np.uint8), device=device)
+        assert made.status[0].tolist() == flags
+        np.testing.assert_array_equal(np.isnan(made.x), made.status != 0)
+        good, share = made.status == 0, -made.y / 0.1
+        np.testing.assert_allclose(share[good], (sign * 400.0 * g**2 * (1.0 - share) ** 2)[good], atol=1e-14)
+        np.testing.assert_allclose(made.x[good], (g * (1.0 - share))[good], atol=1e-15)
+
+
+def test_a_wrong_bent_sheet_is_refused():
+    with pytest.raises(ValueError, match=r"g_axis and h_axis of a bent sheet are not orthonormal"):
+        dataclasses.replace(BENT, h_axis=(math.tan(0.3), 0.0, 1.0))
+    with pytest.raises(ValueError, match=r"pinhole lies in the mean plane"):
+        BentSheet(terms=(0.1, 0.0, 0.0), pinhole=(0.1, 0.2, 0.0))
+    with pytest.raises(ValueError, match=r"from_pose: g_axis and h_axis are not orthonormal"):
+        BentSheet.from_pose((0.1, 0.0, 0.0), origin=(0, 0, 1), g_axis=(1, 0, 0), h_axis=(0, 0.5, 0))
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -295,7 +365,7 @@ def test_wrong_input_is_refused(device):
         op(g, transport, given, device=device)
 
 
-@pytest.mark.parametrize("geometry", [TILTED, dataclasses.replace(HEAD, lens=Lens(k1=1e-8, centre=(4.0, 5.0)))])
+@pytest.mark.parametrize("geometry", [TILTED, BENT, dataclasses.replace(HEAD, lens=Lens(k1=1e-8, centre=(4.0, 5.0)))])
 def test_a_geometry_survives_its_table(geometry):
     assert type(geometry).from_dict(geometry.to_dict()) == geometry
 

@@ -48,6 +48,46 @@ def points_of_straight_transport(geometry: Any, g: NDArray[Any], h: NDArray[Any]
     )
 
 
+def points_of_bent_sheet(
+    geometry: Any, g: NDArray[Any], h: NDArray[Any], transport: NDArray[Any]
+) -> tuple[Float64, NDArray[np.bool_]]:
+    """Return the scene points at which view rays meet a bent sheet of light, and which rays miss it.
+
+    The intersection is searched along the ray: the first sign change of the distance from the surface on 2000 points
+    between the mean plane and 3/4 of the way to the pinhole, on both sides of the plane, then bisection.
+    Parameters as for `points_of_straight_transport`.
+    """
+    g, h = np.asarray(g, np.float64), np.asarray(h, np.float64)
+    gg, gh, hh = geometry.bend.terms
+    pinhole = np.array(geometry.bend.pinhole)
+    start = np.stack([g, h, np.zeros_like(g)], -1)
+    way = pinhole - start
+
+    def height_over_surface(share: NDArray[Any]) -> Float64:
+        at_g, at_h, d = np.moveaxis(start + share[..., None] * way, -1, 0)
+        return np.asarray((d - (gg * at_g**2 + gh * at_g * at_h + hh * at_h**2)) * np.sign(pinhole[2]))
+
+    low, high, found = np.zeros_like(g), np.zeros_like(g), np.zeros(g.shape, bool)
+    previous = np.zeros_like(g)
+    at_plane = height_over_surface(previous)
+    # Below the plane (the surface lies on the side of the pinhole: the distance is negative there) search towards the
+    # pinhole, otherwise away from it.
+    side = np.where(at_plane < 0.0, 1.0, -1.0)
+    for share in np.linspace(0.0, 0.75, 2001)[1:]:
+        value = height_over_surface(side * share)
+        crossed = ~found & (value * at_plane <= 0.0)
+        low, high = np.where(crossed, previous, low), np.where(crossed, side * share, high)
+        found |= crossed
+        previous = np.where(found, previous, side * share)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        same = height_over_surface(middle) * at_plane > 0.0
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    g, h, d = np.moveaxis(start + (0.5 * (low + high))[..., None] * way, -1, 0)
+    flat = points_of_straight_transport(geometry, g, h, transport)
+    return flat + d[..., None] * np.cross(geometry.g_axis, geometry.h_axis), ~found
+
+
 def points_of_rotating_sheet(
     geometry: Any, position: NDArray[Any], angles: NDArray[Any]
 ) -> tuple[Float64, Float64, NDArray[np.bool_]]:

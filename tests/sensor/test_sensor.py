@@ -509,6 +509,27 @@ def test_other_ways_to_give_the_sheet_of_a_calibrated_camera() -> None:
         np.testing.assert_allclose(found.to_sensor(sheet), sensor, rtol=0, atol=1e-6, err_msg=name)
 
 
+def test_the_bend_of_a_sheet_reaches_the_transport() -> None:
+    """Its pinhole is the origin of the camera frame, in the coordinates of the sheet."""
+    bent = with_camera(TILTED_CAMERA.to_dict(), triangulation=SHEET_POSE | {"bend": [0.2, -0.1, 0.3]})
+    assert isinstance(bent.transport, StraightTransport)
+    bend = bent.transport.bend
+    assert bend is not None
+    assert bend.terms == (0.2, -0.1, 0.3)
+    # g_axis x h_axis is (0, 0.8, -0.6).
+    assert bend.pinhole == pytest.approx((-0.001, 0.24, 0.18), abs=1e-15)
+    flat = with_camera(TILTED_CAMERA.to_dict())
+    assert bent.readout.triangulation == flat.readout.triangulation
+    assert isinstance(flat.transport, StraightTransport)
+    assert flat.transport.bend is None
+    with pytest.raises(DescriptionError, match=r"triangulation: .* g_axis and h_axis are not orthonormal"):
+        with_camera(
+            TILTED_CAMERA.to_dict(), triangulation=SHEET_POSE | {"bend": [0.2, 0.1, 0.3], "g_axis": [1.0, 0.1, 0.0]}
+        )
+    with pytest.raises(DescriptionError, match=r"unknown key 'triangulation\.bend'"):
+        sensor_of(changed("camera_line", triangulation__bend=[0.2, 0.1, 0.3]))
+
+
 def test_errors_of_a_calibrated_camera(tmp_path: Path) -> None:
     camera = TILTED_CAMERA.to_dict()
     write_lens(tmp_path / "camera.toml", TILTED_CAMERA, {"image": {"size": [1920, 1080]}})

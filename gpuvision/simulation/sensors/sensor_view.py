@@ -113,6 +113,8 @@ class SensorView:
     def __post_init__(self) -> None:
         if self.triangulation.camera is not None:
             raise ValueError("SensorView.triangulation has a camera; a simulation takes one with a lens, or without")
+        if self.transport.bend is not None:
+            raise ValueError("SensorView.transport has a bent sheet; a simulation takes a flat one")
         object.__setattr__(self, "lens", numbers(self.lens, (3,), "SensorView.lens"))
         object.__setattr__(self, "u_edges", _edges(self.u_edges, "SensorView.u_edges"))
         object.__setattr__(self, "v_edges", _edges(self.v_edges, "SensorView.v_edges"))

@@ -62,6 +62,10 @@ class PsdReading(NamedTuple):
         Predicted standard deviation of the position [m].
     g, h
         Point in the sheet of light [m], if the readout has a triangulation.
+    sigma_g, sigma_h
+        Random error: standard deviations of ``g`` and ``h`` by ``sigma`` [m]; g and h err together.
+    systematic_g, systematic_h
+        Systematic error: standard deviations of ``g`` and ``h`` by the covariance of the triangulation [m].
     """
 
     position: FloatArray | None = None
@@ -70,6 +74,10 @@ class PsdReading(NamedTuple):
     sigma: FloatArray | None = None
     g: FloatArray | None = None
     h: FloatArray | None = None
+    sigma_g: FloatArray | None = None
+    sigma_h: FloatArray | None = None
+    systematic_g: FloatArray | None = None
+    systematic_h: FloatArray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,7 +303,7 @@ class PsdReadout(VisionOperation[PsdReading]):
         sheet = ("g", "h") if self.triangulation is not None else ()
         if self.outputs is None:
             return ("position", "total", "status", *(("sigma",) if self.noise is not None else ()), *sheet)
-        possible = ("position", "total", "status", "sigma", *sheet)
+        possible = PsdReading._fields if sheet else PsdReading._fields[:4]
         for name in self.outputs:
             if name not in possible:
                 raise ValueError(f"PsdReadout.outputs has {name!r}, expected some of {', '.join(possible)}")
@@ -358,7 +366,9 @@ class PsdReadout(VisionOperation[PsdReading]):
         defines = type_defines("INPUT", dtype, 16)
         defines |= flags(**{f"WITH_{name.upper()}": True for name in self.outputs or ()})
         if self.triangulation is not None:
+            # Random and systematic errors are separate outputs here.
             defines |= {"WITH_SHEET": None} | self.triangulation.defines(real)
+            defines.pop("SHEET_COVARIANCE", None)
         return defines | flags(
             PLANAR=self.layout == "planar",
             DARK_LEVEL=any(self.dark),

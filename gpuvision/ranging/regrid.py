@@ -48,11 +48,14 @@ class HeightMap(NamedTuple):
     status
         uint8 `Status` flags. NO_DATA: no measurement near enough. NOT_INVERTIBLE: the sampling runs backwards here, two
         surfaces share the cell. A cell with SATURATED or AMBIGUOUS keeps its value.
+    sigma
+        Random standard deviation of the height [m] (`Regrid.sigma`), NaN in holes; None if it was not requested.
     """
 
     z: FloatArray
     intensity: FloatArray
     status: StatusArray
+    sigma: FloatArray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +141,8 @@ class Regrid:
     """Resampling of an organised range image to heights over regular cells.
 
     Called as ``op(x, y, z, intensity, status)`` with arrays of shape (profiles, samples), float32 or float64 (uint8
-    status), NumPy or device arrays; returns a `HeightMap`.
+    status), NumPy or device arrays; returns a `HeightMap`. With ``sigma=True`` the standard deviation of z is the last
+    argument [m].
 
     Interpolation is linear between neighbouring good samples, in x and in y. Two samples are neighbours if they are at
     most `max_gap` apart and their heights differ by at most `max_step`; bad samples between them are bridged.
@@ -162,6 +166,8 @@ class Regrid:
         Largest distance that a line may run backwards without being folded [m], >= 0, default 0.
     folded : {"drop", "top"}
         ``"drop"``: NOT_INVERTIBLE cells are NaN. ``"top"``: they keep the highest surface, with the flag.
+    sigma : bool
+        Whether to compute the standard deviation of the heights, default False.
     precision : {"single", "double", None}
         Precision of the arithmetic and of the outputs; ``None`` follows the input.
 
@@ -173,7 +179,9 @@ class Regrid:
     Notes
     -----
     Error: linear interpolation of a surface with curvature k between samples at a distance d has an error of at most
-    k d^2 / 8. In single precision the place of a cell has an error of 6e-8 of its distance from the origin.
+    k d^2 / 8. ``sigma`` is that of the interpolation of samples with independent errors of z: between two samples it is
+    below that of a sample. Errors of x and y, which move the height on a slope, are not part of it. In single precision
+    the place of a cell has an error of 6e-8 of its distance from the origin.
     """
 
     grid: Grid
@@ -183,6 +191,7 @@ class Regrid:
     across: Direction | None = None
     fold_tolerance: float = 0.0
     folded: Literal["drop", "top"] = "drop"
+    sigma: bool = False
     precision: Precision = None
 
     def __post_init__(self) -> None:
@@ -216,6 +225,7 @@ class Regrid:
         z: Any,
         intensity: Any,
         status: Any,
+        sigma: Any = None,
         *,
         device: Device | None = None,
         out: HeightMap | None = None,
@@ -225,11 +235,18 @@ class Regrid:
         Raises
         ------
         TypeError, ValueError
-            Wrong dtype, shape, layout or device.
+            Wrong dtype, shape, layout or device; or a standard deviation without ``sigma=True``, or the other way
+            round.
         """
+        if (sigma is not None) != self.sigma:
+            raise TypeError(f"Regrid.sigma is {self.sigma}; expected the standard deviation of z if it is True")
         along, across = (x, y) if self.along[-1] == "x" else (y, x)
-        lines = self._along_samples()(along, z, intensity, status, across, device=device)
-        return self._along_profiles()(lines.across, lines.z, lines.intensity, lines.status, device=device, out=out)
+        more = () if sigma is None else (sigma,)
+        lines = self._along_samples()(along, z, intensity, status, across, *more, device=device)
+        kept = () if sigma is None else (lines.sigma,)
+        return self._along_profiles()(
+            lines.across, lines.z, lines.intensity, lines.status, *kept, device=device, out=out
+        )
 
     def _along_samples(self) -> _AlongSamples:
         return _AlongSamples(regrid=self, direction=self.along)
@@ -244,7 +261,7 @@ class BoundRegrid:
     Attributes
     ----------
     inputs : tuple of pyopencl.array.Array
-        Input arrays of the instance: x, y, z, intensity, status.
+        Input arrays of the instance: x, y, z, intensity, status, and sigma if the operation computes it.
     outputs : HeightMap of pyopencl.array.Array
         Output arrays of the instance.
     """
@@ -259,8 +276,9 @@ class BoundRegrid:
         self._profiles: Bound[HeightMap] = regrid._along_profiles().bind(
             device, self._lines.z.shape, self._lines.z.dtype, queue=queue
         )
-        along, z, intensity, status, across = self._samples.inputs
-        self.inputs = (along, across, z, intensity, status) if self._x_first else (across, along, z, intensity, status)
+        along, z, intensity, status, across, *sigma = self._samples.inputs
+        x, y = (along, across) if self._x_first else (across, along)
+        self.inputs = (x, y, z, intensity, status, *sigma)
         self.outputs = self._profiles.outputs
 
     def __call__(self, *frames: DeviceArray, out: HeightMap | None = None, wait_for: Any = None) -> Any:
@@ -269,7 +287,7 @@ class BoundRegrid:
         Parameters
         ----------
         *frames : pyopencl.array.Array
-            x, y, z, intensity, status; without arguments: `inputs`.
+            x, y, z, intensity, status, and sigma if the operation computes it; without arguments: `inputs`.
         out : HeightMap, optional
             Where to write instead of `outputs`.
         wait_for : sequence of pyopencl.Event, optional
@@ -279,13 +297,17 @@ class BoundRegrid:
         TypeError, ValueError
             A frame has another shape, dtype or device than the instance.
         """
-        if len(frames) not in (0, 5):
-            raise TypeError(f"expected x, y, z, intensity and status, got {len(frames)} arrays")
-        x, y, z, intensity, status = frames or self.inputs
+        if len(frames) not in (0, len(self.inputs)):
+            expected = (
+                "x, y, z, intensity, status and sigma" if self.operation.sigma else "x, y, z, intensity and status"
+            )
+            raise TypeError(f"expected {expected}, got {len(frames)} arrays")
+        x, y, z, intensity, status, *sigma = frames or self.inputs
         along, across = (x, y) if self._x_first else (y, x)
-        first = self._samples(along, z, intensity, status, across, wait_for=wait_for)
+        first = self._samples(along, z, intensity, status, across, *sigma, wait_for=wait_for)
         lines: Any = self._lines
-        return self._profiles(lines.across, lines.z, lines.intensity, lines.status, out=out, wait_for=[first])
+        kept = (lines.sigma,) if self.operation.sigma else ()
+        return self._profiles(lines.across, lines.z, lines.intensity, lines.status, *kept, out=out, wait_for=[first])
 
 
 class RegridCounts(NamedTuple):
@@ -317,6 +339,7 @@ class _Lines(NamedTuple):
     z: FloatArray
     intensity: FloatArray
     status: StatusArray
+    sigma: FloatArray | None
     across: FloatArray
 
 
@@ -370,14 +393,16 @@ class _Pass(VisionOperation[R]):
             Sizes and pitches of the inputs and outputs.
         """
         value = (build.shape, build.dtype)
+        with_sigma = self.regrid.sigma
+        made_by_name = {name: made if name != "sigma" or with_sigma else None for name in self.Result._fields}
         return build.launch(
             "regrid/regrid.cl",
             "resample",
             # A CPU runtime that runs several lines in one group spills the state of each line.
             work=WorkSize((lines,), (1,) if build.device.is_cpu else None),
-            more_inputs=[value, value, (build.shape, np.dtype(np.uint8)), *([value] if with_other else [])],
-            outputs=build.outputs(dict.fromkeys(self.Result._fields, made)),
-            defines=type_defines("INPUT", build.dtype) | flags(WITH_OTHER=with_other),
+            more_inputs=[value, value, (build.shape, np.dtype(np.uint8)), *([value] * (with_other + with_sigma))],
+            outputs=build.outputs(made_by_name),
+            defines=type_defines("INPUT", build.dtype) | flags(WITH_OTHER=with_other, WITH_SIGMA=with_sigma),
             # Without the other coordinate the kernel gets a null pointer for its output, the last one.
             arguments=[
                 *([] if with_other else [None]),

@@ -10,11 +10,12 @@
 //          sheet       SheetTable (common/sheet.h), under WITH_SHEET
 // Outputs: (samples,), each one compiled only under its WITH_... option:
 //          position real [m], total real [A], status uchar, sigma real [m] (standard deviation of the position),
-//          g, h real [m] (point in the sheet of light)
+//          g, h real [m] (point in the sheet of light), sigma_g, sigma_h real [m] (standard deviation of g and h by
+//          sigma), systematic_g, systematic_h real [m] (the same by the covariance of the triangulation)
 // Build options: INPUT, INPUT16 (float, double or ushort), REAL_IS_DOUBLE, PLANAR, DARK_LEVEL (subtract dark currents),
 //          GAIN (equalise the channels), LINEARITY, SIGNED (a current can be negative or not finite, or the range is
 //          shorter than the strip), BACKGROUND (shot noise of light and dark current all over the strip),
-//          WITH_POSITION/TOTAL/STATUS/SIGMA/SHEET/G/H, LENS, LENS_K2, LENS_K3, LENS_K4,
+//          WITH_POSITION/TOTAL/STATUS/SIGMA/SHEET/G/H/SIGMA_G/SIGMA_H/SYSTEMATIC_G/SYSTEMATIC_H, LENS, LENS_K2, LENS_K3, LENS_K4,
 //          PAST_CACHES, VECTOR_VARIANT.
 // Work:    vector variant: a work-item processes `each` consecutive samples, the last one up to 2 `each` - 1.
 //          Otherwise: one work-item per sample.
@@ -43,7 +44,7 @@ typedef struct {
     global const INPUT *currents;
     global real *position, *total;
     global uchar *status;
-    global real *sigma, *g, *h;
+    global real *sigma, *g, *h, *sigma_g, *sigma_h, *systematic_g, *systematic_h;
     constant PsdTable *table;
     int samples, strips, knots;
     global const real *linearity;
@@ -87,7 +88,7 @@ static inline reals corrected(reals u, int sample, const Readout *io) {
 }
 #endif
 
-#ifdef WITH_SIGMA
+#if defined(WITH_SIGMA) || defined(WITH_SIGMA_G) || defined(WITH_SIGMA_H)
 // Standard deviation of the position, from variances of the currents: u has the derivatives -L right / sum^2 with
 // respect to left and L left / sum^2 with respect to right, so that variances l, r of independent noise give
 //     L^2 / sum^2 ((l + r)/4 (1 + balance^2) + (l - r)/2 balance).
@@ -204,6 +205,24 @@ static inline void read_samples(const int careful, int sample, const Readout *io
 #ifdef WITH_H
     store_reals(at_h, io->h + sample);
 #endif
+#if defined(WITH_SIGMA_G) || defined(WITH_SIGMA_H)
+    const SheetVariances noise = sheet_noise(u, strip, sigma_of(balance, sum, table), (reals)0, io->sheet);
+#endif
+#ifdef WITH_SIGMA_G
+    store_reals(nan_where(mask_of(LANED(not_finite)(at_g)), sqrt(noise.g)), io->sigma_g + sample);
+#endif
+#ifdef WITH_SIGMA_H
+    store_reals(nan_where(mask_of(LANED(not_finite)(at_h)), sqrt(noise.h)), io->sigma_h + sample);
+#endif
+#if defined(WITH_SYSTEMATIC_G) || defined(WITH_SYSTEMATIC_H)
+    const SheetVariances systematic = sheet_systematic(u, strip, io->sheet);
+#endif
+#ifdef WITH_SYSTEMATIC_G
+    store_reals(nan_where(mask_of(LANED(not_finite)(at_g)), sqrt(systematic.g)), io->systematic_g + sample);
+#endif
+#ifdef WITH_SYSTEMATIC_H
+    store_reals(nan_where(mask_of(LANED(not_finite)(at_h)), sqrt(systematic.h)), io->systematic_h + sample);
+#endif
 #endif
 #ifdef WITH_STATUS
     store_bytes(convert_bytes(flags), io->status + sample);
@@ -245,10 +264,12 @@ static inline void read_range(int begin, int end, const Readout *io) {
 #endif
 
 kernel void psd_readout(global const INPUT *currents, global real *position, global real *total, global uchar *status,
-                        global real *sigma, global real *g, global real *h, constant PsdTable *table, int samples,
-                        int each, global const real *linearity, int strips, int knots, constant SheetTable *sheet) {
-    const Readout io = {currents, position, total,   status, sigma, g,        h,
-                        table,    samples,  strips, knots,  linearity, sheet};
+                        global real *sigma, global real *g, global real *h, global real *sigma_g,
+                        global real *sigma_h, global real *systematic_g, global real *systematic_h,
+                        constant PsdTable *table, int samples, int each, global const real *linearity, int strips,
+                        int knots, constant SheetTable *sheet) {
+    const Readout io = {currents, position,     total,        status, sigma,   g,      h,     sigma_g,   sigma_h,
+                        systematic_g, systematic_h, table,  samples, strips, knots, linearity, sheet};
 #ifdef VECTOR_VARIANT
     // The last work-item also processes the remainder, and its last vector overlaps the previous vector: every sample
     // is covered, and no other work-item writes there.

@@ -2,16 +2,18 @@
 // (gpuvision/ranging/regrid.py) runs it along the samples of every profile, and then along the profiles.
 //
 // A line has a coordinate `along`, a height, the intensity, and under WITH_OTHER the other coordinate. All are linear in the
-// coordinate between two neighbouring good samples. Two samples are not joined if they are further apart than max_gap,
+// coordinate between two neighbouring good samples. Under WITH_SIGMA the standard deviation of the height follows: the
+// errors of two samples are independent, so that between a and b, at the fraction t, it is
+// sqrt((1 - t)^2 sigma_a^2 + t^2 sigma_b^2). Two samples are not joined if they are further apart than max_gap,
 // or if their heights differ by more than max_step. Where the coordinate has decreased by at least fold_tolerance below
 // the largest previous coordinate, all cells up to that point are NOT_INVERTIBLE: two surfaces share them.
 //
 // Inputs:  along, height, intensity  lines of INPUT [m, m, any];  given  status flags (uchar);  other  INPUT [m], under
-//          WITH_OTHER
+//          WITH_OTHER;  sigma  INPUT [m], under WITH_SIGMA: standard deviation of the height
 //          count       RegridCounts (uint);  grid  RegridTable (real)
-// Outputs: out_height, out_intensity, out_other (null without WITH_OTHER)  real, NaN in cells without data; out_status
-//          uchar
-// Build options: INPUT (float or double), REAL_IS_DOUBLE, WITH_OTHER.
+// Outputs: out_height, out_intensity, out_sigma (null without WITH_SIGMA), out_other (null without WITH_OTHER)  real, NaN
+//          in cells without data; out_status  uchar
+// Build options: INPUT (float or double), REAL_IS_DOUBLE, WITH_OTHER, WITH_SIGMA.
 // Work:    one work-item per line: the order of the samples decides where the line runs backwards. One variant.
 #include "common/real.h"
 #include "common/status.h"
@@ -35,7 +37,7 @@ typedef struct {
 } RegridTable;
 
 typedef struct {
-    real at, height, intensity, other;  // at: coordinate [cells]
+    real at, height, intensity, other, sigma;  // at: coordinate [cells]
     uint status;
 } Sample;
 
@@ -53,9 +55,9 @@ static inline int last_cell(real high, int cells) { return high < 0 ? -1 : high 
 // The output arrays are separate parameters: in a struct of pointers they would lose `restrict`, which makes the kernel
 // a third slower on PoCL.
 static inline void fill_between(Sample before, Sample now, global real *restrict out_height,
-                                global real *restrict out_intensity, global real *restrict out_other,
-                                global uchar *restrict out_status, ulong out, constant RegridCounts *count,
-                                constant RegridTable *grid) {
+                                global real *restrict out_intensity, global real *restrict out_sigma,
+                                global real *restrict out_other, global uchar *restrict out_status, ulong out,
+                                constant RegridCounts *count, constant RegridTable *grid) {
     const real length = now.at - before.at, rise = now.height - before.height;
     if (fabs(length) > grid->max_gap || fabs(rise) > grid->max_step) return;
     const uint found = (before.status | now.status) & STATUS_INFORMS;
@@ -72,6 +74,10 @@ static inline void fill_between(Sample before, Sample now, global real *restrict
 #ifdef WITH_OTHER
         out_other[i] = before.other + part * (now.other - before.other);
 #endif
+#ifdef WITH_SIGMA
+        const real of_before = (1 - part) * before.sigma, of_now = part * now.sigma;
+        out_sigma[i] = sqrt(of_before * of_before + of_now * of_now);
+#endif
         out_status[i] = (uchar)(found | (old & STATUS_NOT_INVERTIBLE));
     }
 }
@@ -85,8 +91,9 @@ static inline void mark_folded(real from, real to, global uchar *restrict out_st
 
 // Remove the values of all cells (only = 0), or of the cells with the flag `only`, and set their status.
 static inline void clear_cells(global real *restrict out_height, global real *restrict out_intensity,
-                               global real *restrict out_other, global uchar *restrict out_status, ulong out,
-                               constant RegridCounts *count, uint only, uchar status) {
+                               global real *restrict out_sigma, global real *restrict out_other,
+                               global uchar *restrict out_status, ulong out, constant RegridCounts *count, uint only,
+                               uchar status) {
     for (uint cell = 0; cell < count->cells; ++cell) {
         const ulong i = out + (ulong)cell * count->out_cell_pitch;
         if (only && !(out_status[i] & only)) continue;
@@ -94,6 +101,9 @@ static inline void clear_cells(global real *restrict out_height, global real *re
         out_intensity[i] = REAL_NAN;
 #ifdef WITH_OTHER
         out_other[i] = REAL_NAN;
+#endif
+#ifdef WITH_SIGMA
+        out_sigma[i] = REAL_NAN;
 #endif
         out_status[i] = status;
     }
@@ -104,27 +114,33 @@ kernel void resample(global const INPUT *restrict along, global const INPUT *res
 #ifdef WITH_OTHER
                      global const INPUT *restrict other,
 #endif
+#ifdef WITH_SIGMA
+                     global const INPUT *restrict sigma,
+#endif
                      global real *restrict out_height, global real *restrict out_intensity,
-                     global uchar *restrict out_status, global real *restrict out_other, constant RegridCounts *count,
-                     constant RegridTable *grid) {
+                     global uchar *restrict out_status, global real *restrict out_sigma,
+                     global real *restrict out_other, constant RegridCounts *count, constant RegridTable *grid) {
     const ulong line = get_global_id(0);
     const ulong in = line * count->line_pitch, out = line * count->out_line_pitch;
     const real sense = grid->sense, tolerance = grid->fold_tolerance;
-    clear_cells(out_height, out_intensity, out_other, out_status, out, count, 0, STATUS_NO_DATA);
+    clear_cells(out_height, out_intensity, out_sigma, out_other, out_status, out, count, 0, STATUS_NO_DATA);
 
     Sample before;
     int started = 0;
     real furthest = 0, back = 0;  // furthest coordinate reached, and lowest coordinate since then
     for (uint sample = 0; sample < count->samples; ++sample) {
         const ulong i = in + (ulong)sample * count->sample_pitch;
-        Sample now = {(along[i] - grid->origin) * grid->per_metre, height[i], intensity[i], 0, given[i]};
+        Sample now = {(along[i] - grid->origin) * grid->per_metre, height[i], intensity[i], 0, 0, given[i]};
 #ifdef WITH_OTHER
         now.other = other[i];
+#endif
+#ifdef WITH_SIGMA
+        now.sigma = sigma[i];
 #endif
         if ((now.status & ~STATUS_INFORMS) || not_finite(now.at) || not_finite(now.height)) continue;
         const real reached = sense * now.at;
         if (started)
-            fill_between(before, now, out_height, out_intensity, out_other, out_status, out, count, grid);
+            fill_between(before, now, out_height, out_intensity, out_sigma, out_other, out_status, out, count, grid);
         if (!started || reached > furthest) {
             furthest = back = reached;
         } else if (reached <= furthest - tolerance && reached <= back) {
@@ -135,6 +151,6 @@ kernel void resample(global const INPUT *restrict along, global const INPUT *res
         started = 1;
     }
     if (count->drop_folded)
-        clear_cells(out_height, out_intensity, out_other, out_status, out, count, STATUS_NOT_INVERTIBLE,
+        clear_cells(out_height, out_intensity, out_sigma, out_other, out_status, out, count, STATUS_NOT_INVERTIBLE,
                     STATUS_NOT_INVERTIBLE);
 }

@@ -420,6 +420,35 @@ def test_the_sheet_in_the_same_pass(device, rng, variant):
         assert np.isnan(value[~good]).all()
 
 
+def test_sigma_travels_to_the_sheet(device, rng):
+    sheet = Triangulation(
+        homography=((0.8, 0.01, 1e-3), (0.02, 1.0, 2e-3), (5.0, 0.3, 1.0)),
+        region=((-3e-3, 3e-3), (-4e-3, 4e-3)),
+        covariance=np.diag([1e-14, 2e-14, 3e-14, 4e-14, 5e-14, 6e-14, 1e-8, 2e-8]),
+    )
+    pairs = currents(rng, (50, 65, 2))
+    pairs[3, 7] = np.nan
+    names = ("position", "sigma", "sigma_g", "sigma_h", "systematic_g", "systematic_h", "status")
+    settings = {"strip_length": LENGTH, "noise": PsdNoise(independent=1e-9), "axes": SampleAxes(sample_pitch=1e-4)}
+    reading = PsdReadout(triangulation=sheet, outputs=names, **settings)(pairs, device=device)
+    good = reading.status == 0
+    u, v = reading.position.astype(np.float64), np.broadcast_to(1e-4 * np.arange(65), good.shape)
+
+    def points(u):
+        lifted = np.einsum("ij,j...->i...", np.array(sheet.homography), np.stack([u, v, np.ones(u.shape)]))
+        return lifted[:2] / lifted[2]
+
+    slopes = np.abs(points(u + 1e-7) - points(u - 1e-7)) / 2e-7
+    of_parameters = sheet.covariance_at(np.stack([u, v], axis=-1))
+    for axis, name in enumerate("gh"):
+        noise, systematic = getattr(reading, f"sigma_{name}"), getattr(reading, f"systematic_{name}")
+        # Where the point hardly moves, its slope is a difference of terms in float32.
+        rounding = 1e-5 * np.max(slopes[axis][good]) * np.max(reading.sigma[good])
+        np.testing.assert_allclose(noise[good], (slopes[axis] * reading.sigma)[good], rtol=1e-4, atol=rounding)
+        np.testing.assert_allclose(systematic[good], np.sqrt(of_parameters[good][:, axis, axis]), rtol=1e-4)
+        assert np.isnan([noise[3, 7], systematic[3, 7]]).all()
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(

@@ -227,7 +227,8 @@ def test_too_few_points_are_holes(device, shape):
 def test_bound_out_and_device_arrays_give_the_same(device):
     frames = flat((40, 61), np.float32)
     truth = OP(*frames, device=device)
-    out = HeightMap(*(np.empty_like(each) for each in truth))
+    names = HeightMap._fields[:3]
+    out = HeightMap(*(np.empty_like(getattr(truth, name)) for name in names))
     assert OP(*frames, device=device, out=out) is out
     arrays = [cl.array.to_device(device.queue, each) for each in frames]
     on_device = OP(*arrays)
@@ -238,9 +239,9 @@ def test_bound_out_and_device_arrays_give_the_same(device):
         right = op(*frames, device=device)
         for array, frame in zip(bound.inputs, frames, strict=True):
             cl.enqueue_copy(device.queue, array.base_data, frame) if not device.shares_memory else array.set(frame)
-        for name in HeightMap._fields:
+        for name in names:
             np.testing.assert_array_equal(getattr(bound.outputs, name).get(), getattr(right, name))
-    for name in HeightMap._fields:
+    for name in names:
         np.testing.assert_array_equal(getattr(out, name), getattr(truth, name))
         np.testing.assert_array_equal(getattr(on_device, name).get(), getattr(truth, name))
 
@@ -284,3 +285,37 @@ def test_wrong_input_is_refused(device):
     bound = OP.bind(device, (4, 5), np.float64)
     with pytest.raises(TypeError, match="expected x, y, z, intensity and status, got 1 arrays"):
         bound(x)
+
+
+@pytest.mark.parametrize("along", ["x", "-y"])
+def test_sigma_is_the_effect_of_every_sample(device, rng, along):
+    """The oracle perturbs one height after the other: the sum of (weight sigma)^2, by the float64 reference."""
+    grid = Grid(left=-1.0, top=0.9, cell_x=0.31, cell_y=0.29, columns=7, rows=6)
+    op = Regrid(grid=grid, max_gap=0.5, max_step=5.0, along=along, sigma=True)
+    frames = flat((9, 8), np.float64)
+    frames[:2] = [each + rng.uniform(-0.05, 0.05, each.shape) for each in frames[:2]]
+    frames[4][4, 3] = Status.LOW_SIGNAL
+    if along != "x":
+        frames = [np.ascontiguousarray(np.transpose(each)[:, ::-1]) for each in frames]
+    sigma = rng.uniform(1e-3, 4e-3, frames[0].shape)
+    truth, variance = reference.regrid(op, *frames), np.zeros(grid.shape)
+    for at in np.ndindex(sigma.shape):
+        moved = [each.copy() for each in frames]
+        moved[2][at] += 1e-3
+        weight = (reference.regrid(op, *moved).z - truth.z) / 1e-3
+        variance += (weight * sigma[at]) ** 2
+    made = op(*frames, sigma, device=device)
+    np.testing.assert_array_equal(made.status, truth.status)
+    assert np.isfinite(made.sigma).mean() > 0.6
+    np.testing.assert_allclose(made.sigma, np.sqrt(variance), rtol=1e-9)
+    bound = op.bind(device, sigma.shape, np.float64)
+    for array, frame in zip(bound.inputs, [*frames, sigma], strict=True):
+        array.set(frame)
+    bound().wait()
+    np.testing.assert_array_equal(bound.outputs.sigma.get(), made.sigma)
+    without = dataclasses.replace(op, sigma=False)
+    np.testing.assert_array_equal(without(*frames, device=device).z, made.z)
+    with pytest.raises(TypeError, match=r"Regrid\.sigma"):
+        op(*frames, device=device)
+    with pytest.raises(TypeError, match=r"Regrid\.sigma"):
+        without(*frames, sigma, device=device)

@@ -78,6 +78,9 @@ from .camera.views.known_lens import (
 from .camera.views.planar_calibration import (
     fit_camera as fit_camera,
 )
+from .camera.views.pose_response import (
+    pose_responses as pose_responses,
+)
 from .camera.views.target_views import (
     make_view as make_view,
 )
@@ -246,6 +249,9 @@ from .ranging.regrid import (
 from .ranging.regrid import (
     Regrid as Regrid,
 )
+from .ranging.sensor_geometry import (
+    SensorGeometry as SensorGeometry,
+)
 from .ranging.sheet import (
     BentSheet as BentSheet,
 )
@@ -254,6 +260,21 @@ from .ranging.sheet import (
 )
 from .ranging.sheet import (
     SheetPoints as SheetPoints,
+)
+from .ranging.sheet_calibration import (
+    LaserLine as LaserLine,
+)
+from .ranging.sheet_calibration import (
+    SheetFit as SheetFit,
+)
+from .ranging.sheet_calibration import (
+    fit_sheet as fit_sheet,
+)
+from .ranging.transport_calibration import (
+    TransportFit as TransportFit,
+)
+from .ranging.transport_calibration import (
+    fit_transport as fit_transport,
 )
 from .ranging.triangulation import (
     Triangulation as Triangulation,

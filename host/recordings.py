@@ -392,10 +392,7 @@ class ImageFolder(FrameSource):
 
     def __init__(self, path: str | Path, channel: Channel = "grey") -> None:
         path = Path(path)
-        names = [each for each in path.iterdir() if each.suffix.lower() in _IMAGES and not each.name.startswith(".")]
-        self._files = sorted(names, key=_natural)
-        if not self._files:
-            raise RecordingError(f"{path}: no images in this folder; expected some of {' '.join(_IMAGES)}")
+        self._files = image_files(path)
         self._channel = channel
         first = read_image(self._files[0])
         super().__init__(first.shape[:2], first.dtype)
@@ -412,6 +409,20 @@ class ImageFolder(FrameSource):
         check_frame(image if image.ndim == 2 else image[:, :, 0], self.shape, self.dtype, str(file))
         _picker(self._channel, image.shape, str(file))(image, out)
         self._next += 1
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Return the image files of a folder in natural order; hidden files and files of other types are ignored.
+
+    Raises
+    ------
+    RecordingError
+        The folder has no images.
+    """
+    names = [each for each in folder.iterdir() if each.suffix.lower() in _IMAGES and not each.name.startswith(".")]
+    if not names:
+        raise RecordingError(f"{folder}: no images in this folder; expected some of {' '.join(_IMAGES)}")
+    return sorted(names, key=_natural)
 
 
 def _natural(path: Path) -> list[Any]:

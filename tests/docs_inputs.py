@@ -12,6 +12,7 @@ import trimesh
 
 import board_images
 import gpuvision as gv
+import laser_sensor
 import target_images
 from boards import LAYERS, board_folder
 from floors import floor_image
@@ -38,6 +39,14 @@ def _one_image(folder: Path) -> dict[str, Any]:
 
 def _images(folder: Path) -> dict[str, Any]:
     return {"images": [_dots(25.0, towards) for towards in (0.2, 1.7, 3.3, 4.9)]}
+
+
+def _laser_images(folder: Path) -> dict[str, Any]:
+    shots = folder / "shots"
+    shots.mkdir()
+    laser_sensor.write_images(shots, laser_sensor.sensor(20.0), np.random.default_rng(6), 4, 2)
+    (shots / "moved").rename(folder / "moved")
+    return {}
 
 
 def _part(folder: Path) -> dict[str, Any]:
@@ -68,6 +77,7 @@ INPUTS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "docs/guides/scan_recording.md": _recording,
     "docs/guides/calibrate_lens.md": _one_image,
     "docs/guides/calibrate_tilted_camera.md": _images,
+    "docs/guides/calibrate_sensor.md": _laser_images,
     "docs/guides/simulate_part.md": _part,
     "docs/guides/locate_board.md": _board,
     "docs/guides/locate_robot.md": _floor,

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,16 +22,17 @@ from gpuvision.camera.views.pose_response import pose_responses
 from gpuvision.ranging.sensor_geometry import SensorGeometry
 from gpuvision.ranging.sheet_calibration import LaserLine, fit_sheet
 from gpuvision.ranging.transport_calibration import fit_transport
+from target_images import dots
 
 Float64 = npt.NDArray[np.float64]
-SIZE = (640, 480)
+SIZE = (480, 360)
 GRID = (11, 8)  # columns and rows of the target's points
 PITCH = 0.01
 STEP = 0.2e-3
 PROFILES_BETWEEN = 40
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LaserSensor:
     """Camera (OpenCV's matrix and coefficients), sheet d = bend(G, H) about (origin, g, h), and step per profile."""
 
@@ -73,7 +76,7 @@ class LaserSensor:
 def sensor(tilt_degrees: float, bend: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> LaserSensor:
     """Return a sensor 0.25 m from its sheet, 35 degrees off it, with a sensor tilted by an angle about the columns."""
     alpha, beta = math.radians(tilt_degrees), math.radians(35.0)
-    f = 1000.0
+    f = 750.0
     # The virtual principal point stays near the middle of the image, which moves the axis by f tan(alpha).
     centre = (0.5 * SIZE[0] + 6.0, 0.5 * SIZE[1] + 0.3 * f * math.tan(alpha) - 4.0)
     distortion = np.zeros(14)
@@ -103,6 +106,22 @@ def pose(
     return rotation, middle - rotation @ target().mean(axis=0)
 
 
+def up(truth: LaserSensor) -> Float64:
+    """Return the normal of the stage: perpendicular to the transport, as near to h as possible."""
+    along = truth.step / np.linalg.norm(truth.step)
+    normal = truth.h - (truth.h @ along) * along
+    return normal / np.linalg.norm(normal)
+
+
+def on_stage(truth: LaserSensor, profile: float) -> tuple[Float64, Float64]:
+    """Return the pose of a target that lies on the stage at height 0, at a number of profiles from the sheet."""
+    z = -up(truth)
+    x = truth.g - (truth.g @ z) * z
+    x = x / np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z], axis=1)
+    return rotation, truth.origin + profile * truth.step - rotation @ target().mean(axis=0)
+
+
 def poses(truth: LaserSensor, rng: np.random.Generator, count: int = 12) -> list[tuple[Float64, Float64]]:
     """Return random poses of the target in view of the camera, at heights over the measuring range."""
     found: list[tuple[Float64, Float64]] = []
@@ -125,6 +144,69 @@ def readings(truth: LaserSensor, rotation: Float64, translation: Float64) -> Flo
         for column, row in zip(columns, rows, strict=True)
     ]
     return np.stack([columns, rows], axis=1)[inside]
+
+
+@cache
+def rays(truth: LaserSensor) -> Float64:
+    """Return the directions (rows, columns, 3) of all pixels, z = 1."""
+    pixels = np.stack(np.meshgrid(np.arange(float(SIZE[0])), np.arange(float(SIZE[1]))), axis=-1)
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 60, 1e-12)
+    flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
+    ideal = cv2.undistortPoints(flat, truth.matrix, truth.distortion, None, np.eye(3), np.eye(3), criteria)
+    return np.concatenate([ideal.reshape(-1, 2), np.ones((len(flat), 1))], axis=1).reshape(SIZE[1], SIZE[0], 3)
+
+
+@dataclass(frozen=True)
+class TargetView:
+    """View of the target: pixels to coordinates on the target [pitches], as `target_images` renders it."""
+
+    truth: LaserSensor
+    rotation: Float64
+    translation: Float64
+
+    width = SIZE[0]
+    height = SIZE[1]
+
+    @cached_property
+    def scene(self) -> Float64:
+        """Points (rows, columns, 3) of the target's plane that the pixels see, in the camera's frame."""
+        ray, normal = rays(self.truth), self.rotation[:, 2]
+        return ray * ((normal @ self.translation) / (ray @ normal))[..., None]
+
+    def pattern(self, pixels: Float64) -> Float64:
+        assert pixels.shape[:2] == (self.height, self.width), "the renderer asks for all pixels at once"
+        return ((self.scene - self.translation) @ self.rotation)[..., :2] / PITCH
+
+    def light(self, thickness: float = 0.2e-3) -> Float64:
+        """Return the light on every pixel, 1 in the middle of the sheet: a Gaussian over the distance from it."""
+        offset = self.scene - self.truth.origin
+        g, h, d = np.moveaxis(offset @ np.stack([self.truth.g, self.truth.h, self.truth.normal]).T, -1, 0)
+        gg, gh, hh = self.truth.bend
+        return np.exp(-0.5 * ((d - gg * g * g - gh * g * h - hh * h * h) / thickness) ** 2)
+
+
+def photographs(view: TargetView, rng: np.random.Generator) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+    """Return images of a target of dots without and with the laser."""
+    cover = dots(view, np.ones(GRID[::-1], bool))
+    level = 30.0 + 130.0 * (1.0 - cover)
+    lit = level + 90.0 * view.light() * (1.0 - 0.7 * cover)
+    dark, bright = (
+        np.clip(np.rint(cv2.GaussianBlur(each, (0, 0), 0.8) + rng.normal(0.0, 1.5, each.shape)), 0, 255)
+        for each in (level, lit)
+    )
+    return dark.astype(np.uint8), bright.astype(np.uint8)
+
+
+def write_images(folder: Path, truth: LaserSensor, rng: np.random.Generator, views: int, moved: int) -> None:
+    """Write images of a calibration: pairs without and with laser, and a folder ``moved`` of transport views."""
+    (folder / "moved").mkdir()
+    for number, (rotation, translation) in enumerate(poses(truth, rng, views)):
+        dark, lit = photographs(TargetView(truth, rotation, translation), rng)
+        cv2.imwrite(str(folder / f"pose{number}.png"), dark)
+        cv2.imwrite(str(folder / f"pose{number}_laser.png"), lit)
+    for number in range(moved):
+        pose = on_stage(truth, (number - 1) * PROFILES_BETWEEN)
+        cv2.imwrite(str(folder / "moved" / f"{number}.png"), photographs(TargetView(truth, *pose), rng)[0])
 
 
 def calibrated(

@@ -104,6 +104,7 @@ MODULES = (
     "gpuvision.formats.materials_file",
     "gpuvision.formats.range_image",
     "gpuvision.workflows.calibrating",
+    "gpuvision.workflows.calibrating_sensor",
     "gpuvision.workflows.locating_board",
     "gpuvision.workflows.locating_robot",
     "gpuvision.workflows.scan_result",

@@ -22,6 +22,18 @@ from gpuvision.cli.arguments import (
     reject_unused,
     write_report,
 )
+from gpuvision.cli.calibrate_sensor import (
+    Channel,
+    LaserFolder,
+    LineAxis,
+    OnStage,
+    ProfilesBetween,
+    SensorOption,
+    SensorOptions,
+    Step,
+    TransportFolder,
+    calibrate_sensor,
+)
 from gpuvision.cli.scan import progress_bar
 
 if TYPE_CHECKING:
@@ -107,14 +119,25 @@ def calibrate(
     pitch: Pitch = None,
     focal_length: FocalLength = None,
     loss: Loss = RobustLoss.squared,
+    sensor: SensorOption = False,
+    laser: LaserFolder = None,
+    transport_views: TransportFolder = None,
+    profiles_between: ProfilesBetween = None,
+    on_stage: OnStage = False,
+    step: Step = None,
+    along: LineAxis = None,
+    channel: Channel = None,
     as_json: ReportFile = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Calibrate a lens, or a camera with a tilted (Scheimpflug) sensor, from images of a flat target pattern.
+    """Calibrate a lens, a camera with a tilted (Scheimpflug) sensor, or a laser sensor, from images of a flat target.
 
     Every parameter comes with its standard deviation. The report lists other models that fit equally well and warns of
     parameters that the images do not determine.
     """
+    options = SensorOptions(laser, transport_views, profiles_between, on_stage, step, along, channel)
+    if not sensor:
+        reject_unused("without --sensor", **options._asdict())
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.calibrating import calibrate as run
@@ -132,6 +155,26 @@ def calibrate(
             f"--out is {out}, but the report and the plot get the suffixes .json and .png; give a name such as "
             "lens.toml"
         )
+    if sensor:
+        if method is CalibrationMethod.lines or pattern is TargetPattern.lines:
+            raise ValueError("--sensor needs poses of the target; leave out --method lines and --pattern lines")
+        calibrate_sensor(
+            images,
+            out,
+            options,
+            {
+                "pattern": pattern.value,
+                "model": model,
+                "inner_corners": corners,
+                "pitch": pitch,
+                "focal_length": focal_length,
+                "loss": loss.value,
+            },
+            as_json=as_json,
+            overwrite=overwrite,
+            show=_show,
+        )
+        return
     outputs = Outputs("calibrate", inputs=images, overwrite=overwrite)
     outputs.claim(*calibration_files(out), as_json)
     with progress_bar(f"detecting {pattern.value}") as progress:

@@ -26,9 +26,9 @@ _BEND_STEPS = 4
 class SensorGeometry:
     """Camera, sheet of light and transport of a laser sensor.
 
-    The scene has y along the transport, z up (towards the camera, perpendicular to y, as near to the sheet's h as
-    possible; or the normal of the surface of the stage), and x to the right of both. Its origin is the origin of the
-    sheet, or a point on the surface of the stage.
+    The scene moves with the part. Its y axis is the direction from a profile to the next one, against the movement of
+    the part. z is up: towards the camera, perpendicular to y, as near to the sheet's h as possible; or the normal of
+    the stage. x completes a right-handed frame. The origin is the origin of the sheet, or a point on the stage.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class SensorGeometry:
     sheet : SheetFit
         Sheet of light in the camera's frame.
     transport : TransportFit or None
-        Measured transport; None if it is assumed to be perpendicular to the sheet.
+        Measured transport; None if the part is assumed to move along the sheet's -(g x h).
     step : float
         Transport per profile [m]: measured, or given.
     zero_at_stage : bool
@@ -58,8 +58,11 @@ class SensorGeometry:
 
     @cached_property
     def direction(self) -> Float64:
-        """Unit vector of the transport in the camera's frame."""
-        return -self.sheet.normal if self.transport is None else self.transport.direction
+        """Unit vector from a profile to the next one on the part, in the camera's frame.
+
+        The part moves the other way: the sensor is at rest, and the sheet moves over the part.
+        """
+        return self.sheet.normal if self.transport is None else -self.transport.direction
 
     @cached_property
     def scene_axes(self) -> Float64:

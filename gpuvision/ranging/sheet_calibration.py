@@ -262,7 +262,7 @@ def fit_sheet(
     frame, readings, sigma = _robust_fit(frame, readings, limits)
     plane = _Solution.of(frame, readings, sigma, 3, limits)
     bent = None
-    if _NUMBERS_PER_VIEW * len(readings.lines) > len(SHEET_PARAMETERS):
+    if _freedom(readings) > 0:
         bent = _Solution.of(plane.frame, readings, sigma, len(SHEET_PARAMETERS), limits)
     test = None if bent is None else _test_bend(bent, covariance, limits)
     chosen = bent if bent is not None and test is not None and test.significant else plane
@@ -385,7 +385,7 @@ def _system(frame: _Frame, bend: Float64, readings: _Readings, count: int) -> _S
 
 def _robust_fit(frame: _Frame, readings: _Readings, limits: SheetLimits) -> tuple[_Frame, _Readings, float]:
     """Fit the bent sheet with Tukey's loss; return frame, readings with weights 0 or 1, and the noise [px]."""
-    count = len(SHEET_PARAMETERS) if len(readings.lines) > 2 else 3
+    count = len(SHEET_PARAMETERS) if _freedom(readings) > 0 else 3
     bend, weight, sigma = np.zeros(3), readings.weight, math.inf
     known = readings.weight > 0.0
     for _ in range(limits.max_iterations):
@@ -508,10 +508,15 @@ def _test_bend(bent: _Solution, camera: Float64, limits: SheetLimits) -> BendTes
     """Test whether the bend differs from zero, with the errors of readings, poses and camera."""
     covariance = (bent.noise_covariance + bent.by_camera @ camera @ bent.by_camera.T)[3:, 3:]
     f_value = float(bent.bend @ np.linalg.solve(covariance, bent.bend)) / 3.0
-    freedom = _NUMBERS_PER_VIEW * len(bent.readings.lines) - len(SHEET_PARAMETERS)
-    p_value = float(fdtrc(3, freedom, f_value))
+    p_value = float(fdtrc(3, _freedom(bent.readings), f_value))
     sigmas = np.sqrt(np.diag(covariance))
     return BendTest(_triple(bent.bend), _triple(sigmas), f_value, p_value, p_value < limits.significance)
+
+
+def _freedom(readings: _Readings) -> int:
+    """Return the degrees of freedom of a bent sheet: numbers that the lines of all views give, less its parameters."""
+    counts = np.bincount(readings.view[readings.weight > 0.0], minlength=len(readings.lines))
+    return int(_NUMBERS_PER_VIEW * np.count_nonzero(counts > _NUMBERS_PER_VIEW)) - len(SHEET_PARAMETERS)
 
 
 def _triple(values: Float64) -> tuple[float, float, float]:

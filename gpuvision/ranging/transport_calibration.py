@@ -60,7 +60,7 @@ class TransportFit:
 
     @property
     def direction(self) -> Float64:
-        """Unit vector of the transport."""
+        """Unit vector of the movement."""
         return np.asarray(self.step / self.length)
 
     def covariance(self, camera: npt.ArrayLike) -> Float64:

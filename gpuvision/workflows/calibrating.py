@@ -102,7 +102,7 @@ def calibrate(
     RecordingError
         A file is no image, or the images differ in size.
     """
-    detected, skipped_images, size = _detect_targets([Path(each) for each in images], pattern, inner_corners, progress)
+    detected, skipped_images, size = detect_targets([Path(each) for each in images], pattern, inner_corners, progress)
     grids = [each.grid for each in detected if each.grid is not None]
     if method == "auto":
         method = "views" if len(grids) >= _MIN_VIEWS or (grids and focal_length is not None) else "lines"
@@ -157,10 +157,32 @@ def _check_enough_to_judge(detected: Sequence[DetectedTarget], size: tuple[int, 
         )
 
 
-def _detect_targets(
+def detect_targets(
     files: Sequence[Path], pattern: TargetPattern, inner_corners: tuple[int, int] | None, progress: Progress
 ) -> tuple[list[DetectedTarget], list[tuple[Path, str]], tuple[int, int]]:
-    """Detect the target pattern in every image; return detections, skipped images with reasons, and the image size."""
+    """Detect the target pattern in every image.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Image files of one camera, all of one size. An image with the same pixels as an earlier one is skipped.
+    pattern, inner_corners, progress
+        As in `calibrate`.
+
+    Returns
+    -------
+    list of DetectedTarget
+        Detected patterns, in the order of the files.
+    list of (Path, str)
+        Skipped images, each with the reason.
+    (int, int)
+        Columns and rows of the images.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError, RecordingError
+        As `calibrate`.
+    """
     detected: list[DetectedTarget] = []
     skipped_images: list[tuple[Path, str]] = []
     size: tuple[int, int] | None = None

@@ -79,7 +79,7 @@ def test_exact_readings_give_the_exact_sensor(truth: LaserSensor) -> None:
     found = calibrated(truth, np.random.default_rng(2), sigma=1e-6, line_sigma=1e-6)
     points = found.points(truth.project(truth.surface(FLAT)))
     np.testing.assert_allclose(points, truth.surface(FLAT), rtol=0.0, atol=2e-8)
-    np.testing.assert_allclose(found.direction * found.step, truth.step, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(found.direction * found.step, -truth.step, rtol=0.0, atol=1e-9)
 
 
 def test_derivatives_are_those_of_the_points(truth: LaserSensor, found: SensorGeometry) -> None:
@@ -105,6 +105,8 @@ def test_scene_has_y_along_the_transport_and_z_up(found: SensorGeometry) -> None
     np.testing.assert_allclose(found.scene_axes @ found.scene_axes.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.cross(x, y), z, atol=1e-12)
     np.testing.assert_allclose(y, found.direction, atol=1e-12)
+    assert found.transport is not None
+    assert y @ found.transport.step < 0.0  # the part moves against y
     assert z @ found.sheet.origin < 0.0  # towards the camera
     assert found.covariance.shape == (len(found.names),) * 2
     assert np.linalg.eigvalsh(found.covariance / np.sqrt(np.outer(*[np.diag(found.covariance)] * 2)))[0] > -1e-9
@@ -117,6 +119,6 @@ def test_step_is_within_its_sigma(truth: LaserSensor, found: SensorGeometry) -> 
     error = axes @ (found.transport.step - truth.step)
     chi_square = error @ np.linalg.solve(found.covariance[first:, first:], error)
     assert chi_square < 16.3  # 0.1 % of three normal numbers
-    sigma = np.sqrt(found.transport.direction @ found.transport.covariance(found.camera_covariance) @ found.direction)
+    sigma = np.sqrt(found.direction @ found.transport.covariance(found.camera_covariance) @ found.direction)
     assert sigma * PROFILES_BETWEEN * 4 < 20e-6
     assert abs(found.step - STEP) < 4.0 * sigma

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.views.camera_fit import Pose
-from gpuvision.camera.views.pose_response import PoseResponse
+from gpuvision.camera.views.pose_response import PoseResponse, change_camera
 from gpuvision.ranging.sheet_calibration import LaserLine, SheetFit, fit_sheet
 from laser_sensor import LaserSensor, poses, readings, sensor
 
@@ -34,7 +35,12 @@ def lines_of(truth: LaserSensor, rng: np.random.Generator, count: int = 8, sigma
 def errors_of(found: SheetFit, truth: LaserSensor) -> np.ndarray:
     """Return offset, slopes and, for a bent fit, bends of the true sheet in the frame of the found one."""
     flat = np.stack(np.meshgrid(np.linspace(-0.05, 0.05, 9), np.linspace(-0.03, 0.03, 9)), axis=-1).reshape(-1, 2)
-    offset = truth.surface(flat) - found.origin
+    return parameters_of(found, truth.surface(flat))
+
+
+def parameters_of(found: SheetFit, points: np.ndarray) -> np.ndarray:
+    """Return the parameters of a surface through points, in the frame of a sheet and less its bend."""
+    offset = points - found.origin
     g, h, d = (offset @ np.stack([found.g_axis, found.h_axis, found.normal]).T).T
     gg, gh, hh = found.bend or (0.0, 0.0, 0.0)
     d = d - (gg * g * g + gh * g * h + hh * h * h)
@@ -94,6 +100,28 @@ def test_wrong_poses_widen_the_uncertainty(rng: np.random.Generator) -> None:
     assert doubtful.bend is None
     error = errors_of(doubtful, TRUTH)
     assert error @ np.linalg.solve(doubtful.covariance(np.zeros((0, 0))), error) < 23.0
+
+
+def test_derivative_by_the_camera_predicts_another_fit(rng: np.random.Generator) -> None:
+    """Another k1, and poses that follow it: the sheet moves by its derivative, in the frame of the first fit."""
+    change, camera = 2e-3, camera_of(BENT)
+    first, second = [], []
+    for points, target in lines_of(BENT, rng, sigma=0.01):
+        response = rng.normal(size=(6, 1)) * np.array([[0.05], [0.05], [0.05], [0.01], [0.01], [0.01]])
+        rotation, translation = target.pose
+        turn = Rotation.from_rotvec(change * response[:3, 0]).as_matrix()
+        first.append(LaserLine(points, target._replace(by_camera=response)))
+        moved = Pose(turn @ rotation, translation + change * response[3:, 0])
+        second.append(LaserLine(points, target._replace(pose=moved)))
+    fit = fit_sheet(camera, first, names=("k1",), camera_covariance=[[1e-12]])
+    other = fit_sheet(change_camera(camera, "k1", change), second)
+    flat = np.stack(np.meshgrid(np.linspace(-0.04, 0.04, 5), np.linspace(-0.02, 0.02, 5)), axis=-1).reshape(-1, 2)
+    assert other.bend is not None
+    h, g, d = flat[:, 1], flat[:, 0], flat**2 @ np.array(other.bend)[[0, 2]] + other.bend[1] * flat.prod(axis=1)
+    places = other.origin + np.outer(g, other.g_axis) + np.outer(h, other.h_axis) + np.outer(d, other.normal)
+    moved_by = parameters_of(fit, places)
+    np.testing.assert_allclose(moved_by, change * fit.by_camera[:, 0], rtol=0.05, atol=2e-6)
+    assert np.abs(moved_by[:3]).min() > 2e-6
 
 
 def test_one_target_or_parallel_lines_in_one_place_are_refused(rng: np.random.Generator) -> None:

@@ -1,0 +1,197 @@
+"""``gpuvision calibrate --sensor``: calibrate camera, sheet of light and transport of a laser sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from gpuvision.cli.arguments import echo, named_path, prints_report, write_report
+from gpuvision.cli.scan import progress_bar
+
+if TYPE_CHECKING:
+    from gpuvision.camera.calibration import Calibration
+    from gpuvision.host.recordings import Channel as RecordingChannel
+    from gpuvision.workflows.calibrating_sensor import SensorCalibration
+
+
+class Axis(StrEnum):
+    """Values of ``--along``."""
+
+    columns = "columns"
+    rows = "rows"
+
+
+SensorOption = Annotated[
+    bool,
+    typer.Option(
+        "--sensor",
+        help="Calibrate a laser sensor: camera, sheet of light and transport. --out is then the sensor file for scan.",
+    ),
+]
+LaserFolder = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        parser=named_path,
+        help="With --sensor: folder of the laser images, each in the pose of the target image with the same name or "
+        "number. Default: pose_laser.png among the IMAGES belongs to pose.png.",
+    ),
+]
+TransportFolder = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        parser=named_path,
+        help="With --sensor: folder of images of the whole target on the moving stage, in the order of their names.",
+    ),
+]
+ProfilesBetween = Annotated[
+    float | None,
+    typer.Option(help="Profiles that the stage moves from one transport view to the next one; negative if backward."),
+]
+OnStage = Annotated[
+    bool,
+    typer.Option("--on-stage", help="The target of the transport views lies on the stage: its plane is z = 0."),
+]
+Step = Annotated[
+    float | None,
+    typer.Option(
+        help="With --sensor, without transport views: transport per profile [m], perpendicular to the sheet of light; "
+        "negative for a part that moves the other way.",
+    ),
+]
+LineAxis = Annotated[
+    Axis | None,
+    typer.Option(help="With --sensor: image axis along which the laser line runs. Default: found in the images."),
+]
+Channel = Annotated[
+    str | None,
+    typer.Option(
+        metavar="CHANNEL",
+        help="With --sensor: channel of colour images that holds the laser, such as red or red_difference. Default: "
+        "grey.",
+    ),
+]
+
+
+class SensorOptions(NamedTuple):
+    """Options of the command that only ``--sensor`` uses."""
+
+    laser: Path | None
+    transport_views: Path | None
+    profiles_between: float | None
+    on_stage: bool
+    step: float | None
+    along: Axis | None
+    channel: str | None
+
+
+def calibrate_sensor(
+    images: Sequence[Path],
+    out: Path,
+    options: SensorOptions,
+    camera: dict[str, Any],
+    *,
+    as_json: Path | None,
+    overwrite: bool,
+    show: Callable[[Calibration, bool], None],
+) -> None:
+    """Run the calibration of a laser sensor, print and write its results.
+
+    Parameters
+    ----------
+    images : sequence of Path
+        Target images, and laser images without ``--laser``.
+    out : Path
+        Sensor file.
+    options : SensorOptions
+        Options of ``--sensor``.
+    camera : dict
+        Options of the camera's calibration, as parameters of `gpuvision.workflows.calibrating_sensor`.
+    as_json, overwrite
+        Common options.
+    show : callable
+        Prints the calibration of the camera; the second argument says whether to standard error.
+    """
+    from gpuvision.host.outputs import Outputs
+    from gpuvision.workflows.calibrating_sensor import calibrate_sensor as run
+    from gpuvision.workflows.calibrating_sensor import sensor_calibration_files, write_sensor_calibration
+
+    channel = _checked_channel(options.channel)
+    _check(options, camera)
+    inputs = [*images, *(each for each in (options.laser, options.transport_views) if each is not None)]
+    outputs = Outputs("calibrate", inputs=inputs, overwrite=overwrite)
+    outputs.claim(*sensor_calibration_files(out), as_json)
+    with progress_bar(f"detecting {camera['pattern']}") as progress:
+        done = run(
+            images,
+            laser=options.laser,
+            transport=_transport_views(options),
+            step=options.step,
+            along=None if options.along is None else options.along.value,
+            channel=channel,
+            name=out.stem,
+            progress=progress,
+            **camera,
+        )
+    _show(done, show, to_stderr=prints_report(as_json))
+    write_sensor_calibration(done, out, inputs=inputs, overwrite=overwrite)
+    write_report(as_json, done.report(), outputs)
+    echo(
+        f"next: check {out.with_suffix('.png')}; scan with gpuvision scan RECORDING --sensor {out} --out DIR",
+        err=prints_report(as_json),
+    )
+
+
+def _check(options: SensorOptions, camera: dict[str, Any]) -> None:
+    """Check the options of ``--sensor`` that depend on each other."""
+    if camera["pitch"] is None:
+        raise ValueError("--sensor needs --pitch, the distance of the target's points [m]: it scales all heights")
+    if (options.transport_views is None) == (options.step is None):
+        raise ValueError(
+            "--sensor needs either --transport-views, images of the target on the moving stage, or --step, the "
+            "transport per profile [m]"
+        )
+    if (options.transport_views is None) != (options.profiles_between is None):
+        raise ValueError("--transport-views and --profiles-between need each other; give both")
+    if options.on_stage and options.transport_views is None:
+        raise ValueError("--on-stage has no effect without --transport-views; leave it out")
+
+
+def _checked_channel(name: str | None) -> RecordingChannel:
+    from gpuvision.host.recordings import CHANNELS
+
+    for each in CHANNELS:
+        if each == (name or "grey"):
+            return each
+    raise ValueError(f"--channel is {name!r}, expected one of {', '.join(CHANNELS)}")
+
+
+def _transport_views(options: SensorOptions) -> Any:
+    from gpuvision.workflows.calibrating_sensor import TransportViews
+
+    if options.transport_views is None or options.profiles_between is None:
+        return None
+    return TransportViews(
+        folder=options.transport_views, profiles_between=options.profiles_between, on_stage=options.on_stage
+    )
+
+
+def _show(done: SensorCalibration, show: Callable[[Calibration, bool], None], *, to_stderr: bool) -> None:
+    """Print the camera, then the sheet, the transport and their warnings."""
+    show(done.calibration, to_stderr)
+    echo(done.summary(), err=to_stderr)
+    test = done.geometry.sheet.bend_test
+    if test is not None:
+        verdict = "kept" if test.significant else "not significant, left out"
+        bends = ", ".join(
+            f"{name} {value:.3g} +- {sigma:.2g}"
+            for name, value, sigma in zip(("gg", "gh", "hh"), test.bend, test.sigma, strict=True)
+        )
+        echo(f"bend of the sheet [1/m]: {bends}; p = {test.p_value:.2g} (F test): {verdict}", err=to_stderr)
+    for each in done.warnings[len(done.calibration.fit.warnings) :]:
+        echo(f"warning: {each}", err=to_stderr)

@@ -1,0 +1,459 @@
+"""Calibration of a laser sensor from image files: camera, sheet of light and transport in one sensor file.
+
+Images of a target in several poses calibrate the camera (`gpuvision.workflows.calibrating`). A second image of each
+pose with the laser on gives points of the sheet of light. Images of the target on the moving stage give the direction
+and the step of the transport.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.camera.calibration import Calibration, DetectedTarget, TargetPattern
+from gpuvision.camera.lines.line_statistics import Loss
+from gpuvision.camera.lines.vanishing_points import straightness_px
+from gpuvision.camera.views.camera_fit import CameraFit
+from gpuvision.camera.views.planar_calibration import fit_camera
+from gpuvision.camera.views.pose_response import PoseResponse, pose_responses
+from gpuvision.camera.views.target_views import View, make_view
+from gpuvision.formats.json import json_tree
+from gpuvision.formats.sensor_file import sensor_text
+from gpuvision.host import Device
+from gpuvision.host.files import write_text_atomic
+from gpuvision.host.outputs import Outputs
+from gpuvision.host.recordings import Channel, image_files
+from gpuvision.plots.sensor_calibration import SensorPicture, draw_sensor_calibration
+from gpuvision.ranging.sensor_geometry import SensorGeometry
+from gpuvision.ranging.sheet_calibration import Along, LaserLine, SheetFit, fit_sheet
+from gpuvision.ranging.transport_calibration import TransportFit, fit_transport
+from gpuvision.workflows.calibrating import detect_targets
+from gpuvision.workflows.laser_images import LineImage, line_direction, pair_images, read_line
+
+Float64 = npt.NDArray[np.float64]
+Progress = Callable[[int, int | None], object]
+
+# Share of the readings of a view that the sheet rejects, above which a warning names the view (chosen).
+_MANY_OUTLIERS = 0.5
+# Reduced chi-square of views above which a warning says that they disagree (chosen: three times the predicted scatter).
+_DISAGREEMENT = 9.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransportViews:
+    """Images of the target on the moving stage.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the images, in natural order of their names. The whole target is in view, and the stage moves by the
+        same number of profiles from each image to the next one.
+    profiles_between : float
+        Number of profiles between two images; with an encoder, the movement divided by the movement per profile.
+    on_stage : bool
+        Whether the target lies on the surface of the stage: this surface is then z = 0. Default False.
+    """
+
+    folder: Path
+    profiles_between: float
+    on_stage: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorCalibration:
+    """Calibrated laser sensor with the images that were used.
+
+    Attributes
+    ----------
+    name : str
+        Name of the sensor.
+    calibration : Calibration
+        Camera with its target views: first the views of `lines`, then the transport views.
+    geometry : SensorGeometry
+        Camera, sheet of light and transport with their covariance.
+    along : {"columns", "rows"}
+        Image axis along which the laser line runs.
+    channel : str
+        Channel of colour images that holds the laser.
+    lines : tuple of LineImage or None
+        Laser line of each target view; None without a laser image.
+    cell : float
+        Cell of the height map for scans [m].
+    warnings : tuple of str
+        Doubts about sheet and transport, after those about the camera.
+    """
+
+    name: str
+    calibration: Calibration
+    geometry: SensorGeometry
+    along: Along
+    channel: Channel
+    lines: tuple[LineImage | None, ...]
+    cell: float
+    warnings: tuple[str, ...]
+
+    def summary(self) -> str:
+        """Return one line: readings, residual, bend and step."""
+        sheet, geometry = self.geometry.sheet, self.geometry
+        used = sum(each is not None for each in self.lines)
+        readings = sum(map(len, sheet.residuals))
+        shape = "flat" if sheet.bend is None else "bent by " + ", ".join(f"{each:.3g}" for each in sheet.bend) + " /m"
+        how = "given" if geometry.transport is None else f"+- {self.step_sigma * 1e9:.2g} nm"
+        return (
+            f"laser line on {used} targets, {readings} readings ({sheet.outliers} rejected): residual "
+            f"{sheet.rms_px:.3g} px rms, sheet {shape}; step {geometry.step * 1e6:.6g} um ({how})"
+        )
+
+    @property
+    def step_sigma(self) -> float:
+        """Standard deviation of the step [m]; 0 if the step was given."""
+        transport = self.geometry.transport
+        if transport is None:
+            return 0.0
+        covariance = transport.covariance(self.geometry.camera_covariance)
+        return float(math.sqrt(transport.direction @ covariance @ transport.direction))
+
+    def report(self) -> dict[str, Any]:
+        """Return the calibration as a tree of numbers and strings for JSON."""
+        geometry = self.geometry
+        return {
+            "name": self.name,
+            "camera": self.calibration.report(),
+            "along": self.along,
+            "channel": self.channel,
+            "sheet": _sheet_report(geometry.sheet, geometry.camera_covariance),
+            "laser_images": [
+                {"name": each.image.name, "readings": len(each.points), "threshold": each.threshold, "note": each.note}
+                for each in self.lines
+                if each is not None
+            ],
+            "transport": None if geometry.transport is None else self._transport_report(geometry.transport),
+            "step": geometry.step,
+            "cell": self.cell,
+            "scene": {"axes": geometry.scene_axes.tolist(), "origin": geometry.scene_origin.tolist()},
+            "covariance": {"names": list(geometry.names), "matrix": geometry.covariance.tolist()},
+            "warnings": list(self.warnings),
+        }
+
+    def _transport_report(self, transport: TransportFit) -> dict[str, Any]:
+        return {
+            "step": transport.step.tolist(),
+            "step_sigma": self.step_sigma,
+            "residuals": transport.residuals.tolist(),
+            "rotations": transport.rotations.tolist(),
+            "view_ratio": transport.view_ratio,
+        }
+
+
+def calibrate_sensor(
+    images: Sequence[str | Path],
+    *,
+    pitch: float,
+    laser: str | Path | None = None,
+    transport: TransportViews | None = None,
+    step: float | None = None,
+    pattern: TargetPattern = "dots",
+    model: str = "auto",
+    inner_corners: tuple[int, int] | None = None,
+    focal_length: float | None = None,
+    loss: Loss = "squared",
+    along: Along | None = None,
+    channel: Channel = "grey",
+    name: str = "",
+    device: Device | None = None,
+    progress: Progress = lambda done, of: None,
+) -> SensorCalibration:
+    """Calibrate camera, sheet of light and transport of a laser sensor from images of a flat target.
+
+    Parameters
+    ----------
+    images : sequence of path
+        Images of the target in different poses, and without a folder `laser` the laser images of the same poses
+        (``pose1.png``, ``pose1_laser.png``).
+    pitch : float
+        Distance between neighbouring points on the target [m].
+    laser : path, optional
+        Folder of the laser images, matched by name or by the last number in the name.
+    transport : TransportViews, optional
+        Images of the target on the moving stage. Default: the transport is perpendicular to the sheet.
+    step : float, optional
+        Transport per profile [m]; required without `transport`, which measures it. The part moves along -(g x h) of the
+        sheet, or along g x h if the step is negative.
+    pattern, model, inner_corners, focal_length, loss
+        As in `gpuvision.workflows.calibrating.calibrate`; the pattern is a grid ("dots" or "chessboard").
+    along : {"columns", "rows"}, optional
+        Image axis along which the laser line runs. Default: found in the images.
+    channel : str
+        Channel of colour images that holds the laser. Default "grey".
+    name : str
+        Name of the sensor.
+    device : Device, optional
+        Device of the line readout. Default: the best.
+    progress : callable
+        Called with the number of processed images and the number of images.
+
+    Returns
+    -------
+    SensorCalibration
+
+    Raises
+    ------
+    FileNotFoundError
+        A file does not exist.
+    ValueError
+        The images do not determine the sensor; the message names the missing data.
+    RecordingError
+        A file is no image, or the images differ in size.
+    """
+    if pattern == "lines":
+        raise ValueError("pattern 'lines' gives no poses of the target; use 'dots' or 'chessboard'")
+    if (transport is None) == (step is None):
+        raise ValueError("give either transport views, which measure the step, or the step [m per profile]")
+    if step is not None and (step == 0.0 or not math.isfinite(step)):
+        raise ValueError(f"step is {step}, expected metres per profile, not 0")
+    pairs = pair_images([Path(each) for each in images], None if laser is None else Path(laser))
+    moved = [] if transport is None else image_files(transport.folder)
+    detected, skipped, size = detect_targets([*pairs.targets, *moved], pattern, inner_corners, progress)
+    _check_transport_targets(detected, skipped, moved)
+    views = [make_view(_grid(each), pitch) for each in detected]
+    fit = fit_camera(views, size, model=model, focal_length=focal_length, loss=loss)
+    targets = dict(zip((each.image for each in detected), pose_responses(fit, views), strict=True))
+    lit = _lit_targets(detected, dict(zip(pairs.targets, pairs.lasers, strict=True)))
+    along = along or line_direction(lit, channel)
+    lines = {each.image: read_line(each, file, along=along, channel=channel, device=device) for each, file in lit}
+    geometry = _geometry(fit, views, detected, targets, lines, along, transport, moved, step)
+    calibration = _camera_calibration(fit, detected, skipped, size, pattern)
+    return SensorCalibration(
+        name=name,
+        calibration=calibration,
+        geometry=geometry,
+        along=along,
+        channel=channel,
+        lines=tuple(lines.get(each.image) for each in detected),
+        cell=_cell(geometry, list(lines.values()), along),
+        warnings=(*fit.warnings, *_warnings(geometry, list(lines.values()), along)),
+    )
+
+
+def _geometry(
+    fit: CameraFit,
+    views: Sequence[View],
+    detected: Sequence[DetectedTarget],
+    targets: dict[Path, PoseResponse],
+    lines: dict[Path, LineImage],
+    along: Along,
+    transport: TransportViews | None,
+    moved: Sequence[Path],
+    step: float | None,
+) -> SensorGeometry:
+    """Fit the sheet to the laser lines, and the transport to the transport views."""
+    sheet = fit_sheet(
+        fit.camera,
+        [LaserLine(line.points, targets[image]) for image, line in lines.items()],
+        along=along,
+        names=fit.names,
+        camera_covariance=fit.covariance,
+    )
+    motion = None
+    if transport is not None:
+        first = [each.image for each in detected].index(moved[0])
+        numbers = np.arange(len(moved)) * transport.profiles_between
+        motion = fit_transport([targets[each] for each in moved], numbers, views[first].target.mean(axis=0))
+    return SensorGeometry(
+        camera=fit.camera,
+        camera_names=fit.names,
+        camera_covariance=fit.covariance,
+        sheet=sheet,
+        transport=motion,
+        step=motion.length if motion is not None else float(step or 0.0),
+        zero_at_stage=transport is not None and transport.on_stage,
+    )
+
+
+def _camera_calibration(
+    fit: CameraFit,
+    detected: list[DetectedTarget],
+    skipped: list[tuple[Path, str]],
+    size: tuple[int, int],
+    pattern: TargetPattern,
+) -> Calibration:
+    families = tuple(family for each in detected for family in each.families)
+    return Calibration(
+        fit=fit,
+        pattern=pattern,
+        image_size=size,
+        detected_targets=tuple(detected),
+        skipped_images=tuple(skipped),
+        straightness_px=(straightness_px(families), straightness_px(families, fit.camera)),
+    )
+
+
+def _grid(target: DetectedTarget) -> Float64:
+    assert target.grid is not None, "only grids have poses"
+    return target.grid
+
+
+def _check_transport_targets(
+    detected: Sequence[DetectedTarget], skipped: Sequence[tuple[Path, str]], moved: Sequence[Path]
+) -> None:
+    """Refuse transport views without the whole target: its points would get other numbers, and the target a shift."""
+    reasons = dict(skipped)
+    shapes = {}
+    for file in moved:
+        if file in reasons:
+            raise ValueError(f"{file}: the transport needs the target in every view of its folder; {reasons[file]}")
+        grid = next(_grid(each) for each in detected if each.image == file)
+        shapes[file] = grid.shape[:2]
+        if shapes[file] != shapes[moved[0]] or not np.isfinite(grid).all():
+            raise ValueError(
+                f"{file}: {np.count_nonzero(np.isfinite(grid[..., 0]))} points in a grid of {grid.shape[1]} x "
+                f"{grid.shape[0]}, {moved[0].name} shows {shapes[moved[0]][1]} x {shapes[moved[0]][0]}; the transport "
+                "needs the whole target in every view"
+            )
+
+
+def _lit_targets(
+    detected: Sequence[DetectedTarget], lasers: dict[Path, Path | None]
+) -> list[tuple[DetectedTarget, Path]]:
+    """Return the detected targets that have a laser image."""
+    found = []
+    for each in detected:
+        laser = lasers.get(each.image)
+        if laser is not None:
+            found.append((each, laser))
+    if len(found) < 2:
+        raise ValueError(
+            f"{len(found)} target images with a laser image show the target, expected two at least, at different "
+            "distances"
+        )
+    return found
+
+
+def _cell(geometry: SensorGeometry, lines: Sequence[LineImage], along: Along) -> float:
+    """Return a cell size: the larger one of the step and the distance of samples, rounded up to two digits [m]."""
+    middle = np.median(np.concatenate([each.points for each in lines]), axis=0)
+    ahead = np.array([1.0, 0.0] if along == "columns" else [0.0, 1.0])
+    sample = float(np.linalg.norm(geometry.points(middle + ahead) - geometry.points(middle)))
+    largest = max(sample, abs(geometry.step))
+    digit = 10.0 ** (math.floor(math.log10(largest)) - 1)
+    return float(f"{math.ceil(largest / digit) * digit:.2g}")
+
+
+def _warnings(geometry: SensorGeometry, lines: Sequence[LineImage], along: Along) -> list[str]:
+    """Return doubts about sheet and transport."""
+    warnings = [f"{each.image.name}: {each.note}" for each in lines if each.note]
+    sheet, transport = geometry.sheet, geometry.transport
+    for each, residual in zip(lines, sheet.residuals, strict=True):
+        if len(residual) and np.mean(np.isnan(residual)) > _MANY_OUTLIERS:
+            warnings.append(
+                f"{each.image.name}: the sheet rejects {np.count_nonzero(np.isnan(residual))} of {len(residual)} "
+                "readings; did the target move between its two images?"
+            )
+    if sheet.view_ratio > _DISAGREEMENT:
+        warnings.append(
+            f"the laser lines scatter {math.sqrt(sheet.view_ratio):.1f} times as much from view to view as readings "
+            "and poses predict; the uncertainties include it"
+        )
+    if transport is None:
+        warnings.append(
+            "no transport views: the part is taken to move perpendicular to the sheet, along -(g x h); a negative step "
+            "turns it round"
+        )
+    elif transport.view_ratio > _DISAGREEMENT:
+        warnings.append(
+            f"the transport views scatter {math.sqrt(transport.view_ratio):.1f} times as much about a straight uniform "
+            "motion as their poses predict; the uncertainties include it"
+        )
+    return warnings
+
+
+def _sheet_report(sheet: SheetFit, camera_covariance: Float64) -> dict[str, Any]:
+    test = sheet.bend_test
+    sigmas = np.sqrt(np.diag(sheet.covariance(camera_covariance)))
+    return {
+        "origin": sheet.origin.tolist(),
+        "g_axis": sheet.g_axis.tolist(),
+        "h_axis": sheet.h_axis.tolist(),
+        "bend": None if sheet.bend is None else list(sheet.bend),
+        "bend_test": None if test is None else test._asdict(),
+        "sigma": dict(zip(sheet.names, sigmas.tolist(), strict=True)),
+        "sigma_px": sheet.sigma_px,
+        "rms_px": sheet.rms_px,
+        "readings": sum(map(len, sheet.residuals)),
+        "outliers": sheet.outliers,
+        "view_ratio": sheet.view_ratio,
+    }
+
+
+def sensor_calibration_files(path: Path) -> tuple[Path, Path, Path]:
+    """Return the files that `write_sensor_calibration` writes: sensor file, report and picture."""
+    return path, path.with_suffix(".json"), path.with_suffix(".png")
+
+
+def write_sensor_calibration(
+    calibration: SensorCalibration, path: Path, *, inputs: Sequence[Path] = (), overwrite: bool = False
+) -> None:
+    """Write sensor file (TOML), report (.json) and picture (.png) into one folder; after an error no file is written.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+        Result of `calibrate_sensor`.
+    path : Path
+        Sensor file to write.
+    inputs : sequence of Path
+        Files and folders that were read and are never replaced, besides the images of the calibration.
+    overwrite : bool
+        Whether files may be replaced that no earlier calibration wrote. Default False.
+
+    Raises
+    ------
+    FileExistsError
+        A file is an input; or it exists, and is not an unchanged output of an earlier calibration.
+    """
+    used = calibration.calibration
+    images = [each.image for each in used.detected_targets] + [each for each, _ in used.skipped_images]
+    images += [each.image for each in calibration.lines if each is not None]
+    text = sensor_text(
+        calibration.geometry,
+        name=calibration.name,
+        size=used.image_size,
+        along=calibration.along,
+        channel=calibration.channel,
+        cell=calibration.cell,
+    )
+    report = json.dumps(json_tree(calibration.report()), indent=1) + "\n"
+    outputs = Outputs("calibrate", inputs=[*images, *inputs], overwrite=overwrite)
+    with outputs.folder(path.parent) as inside:
+        sensor_file, report_file, picture = sensor_calibration_files(inside / path.name)
+        write_text_atomic(report_file, report)
+        draw_sensor_calibration(picture, _picture(calibration))
+        write_text_atomic(sensor_file, text)
+
+
+def _picture(calibration: SensorCalibration) -> SensorPicture:
+    """Return the plain data of the picture; its image is the laser image with the most readings."""
+    known = [
+        (target, line)
+        for target, line in zip(calibration.calibration.detected_targets, calibration.lines, strict=True)
+        if line is not None
+    ]
+    target, line = max(known, key=lambda each: len(each[1].points))
+    sheet = calibration.geometry.sheet
+    return SensorPicture(
+        title=f"{calibration.calibration.summary()}\n{calibration.summary()}",
+        image=line.image,
+        grid=_grid(target),
+        line=line.points,
+        lines=tuple(each.points for _, each in known),
+        coordinates=sheet.coordinates,
+        residuals=sheet.residuals,
+        sigma_px=sheet.sigma_px,
+    )

@@ -1,0 +1,230 @@
+"""From images of a target and a laser line to a sensor file: the command ``calibrate --sensor``, end to end.
+
+The written file is judged by float64 oracles of OpenCV and NumPy against the rendered sensor.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from gpuvision.cli.main import application
+from gpuvision.workflows.calibrating_sensor import TransportViews, calibrate_sensor
+from gpuvision.workflows.laser_images import pair_images
+from laser_sensor import PITCH, PROFILES_BETWEEN, LaserSensor, sensor, up, write_images
+
+Float64 = npt.NDArray[np.float64]
+BEND = (0.06, -0.02, 0.03)
+TRUTH = sensor(25.0, BEND)
+VIEWS, MOVED = 7, 3
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Render the images of a calibration."""
+    folder = tmp_path_factory.mktemp("shots")
+    write_images(folder, TRUTH, np.random.default_rng(4), VIEWS, MOVED)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def written(images: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run the command; return the sensor file."""
+    out = tmp_path_factory.mktemp("calibrated") / "sensor.toml"
+    run(*command(images), "--out", out)
+    return out
+
+
+def command(images: Path) -> list[object]:
+    between = ["--transport-views", images / "moved", "--profiles-between", PROFILES_BETWEEN, "--on-stage"]
+    return ["calibrate", *sorted(images.glob("*.png")), "--sensor", *between, "--pitch", PITCH]
+
+
+def run(*arguments: object) -> None:
+    application()([str(each) for each in arguments], standalone_mode=False)
+
+
+def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    return tomllib.loads(path.read_text()), json.loads(path.with_suffix(".json").read_text())
+
+
+def scene_points(table: dict[str, Any], pixels: Float64, profile: float) -> Float64:
+    """Return points (n, 3) of the scene by the keys of a sensor file: OpenCV's rays, and bisection along each ray."""
+    camera, sheet, transport = table["camera"], table["triangulation"], table["transport"]
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
+    distortion = np.array([camera.get(name, 0.0) for name in names])
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 60, 1e-13)
+    flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
+    eye = np.eye(3)
+    ideal = cv2.undistortPoints(flat, np.array(camera["matrix"]), distortion, None, eye, eye, criteria)
+    ray = np.concatenate([ideal.reshape(-1, 2), np.ones((len(flat), 1))], axis=1)
+    axes = np.array([sheet["g_axis"], sheet["h_axis"], np.cross(sheet["g_axis"], sheet["h_axis"])])
+    gg, gh, hh = sheet.get("bend", (0.0, 0.0, 0.0))
+
+    def side(depth: Float64) -> tuple[Float64, Float64]:
+        g, h, d = ((ray * depth[:, None] - sheet["sheet_origin"]) @ axes.T).T
+        return np.stack([g, h, d], axis=1), d - (gg * g * g + gh * g * h + hh * h * h)
+
+    near, far = np.full(len(ray), 0.15), np.full(len(ray), 0.4)
+    sign = np.sign(side(near)[1])
+    for _ in range(60):
+        middle = 0.5 * (near + far)
+        before = np.sign(side(middle)[1]) == sign
+        near, far = np.where(before, middle, near), np.where(before, far, middle)
+    g, h, d = side(near)[0].T
+    g_axis, h_axis = np.array(transport["g_axis"]), np.array(transport["h_axis"])
+    moved = profile * transport["step"] * np.array(transport["direction"]) + transport["origin"]
+    return np.outer(g, g_axis) + np.outer(h, h_axis) + np.outer(d, np.cross(g_axis, h_axis)) + moved
+
+
+def readings(truth: LaserSensor, height: float, profile: float) -> Float64:
+    """Return the light on a plane parallel to the stage, for a part that has moved by `profile` steps."""
+    rows = truth.line(up(truth), truth.origin + height * up(truth) + profile * truth.step)
+    columns = np.arange(60.0, 420.0, 4.0)
+    return np.stack([columns, rows[columns.astype(int)]], axis=1)
+
+
+def test_parameters_are_within_their_sigma(written: Path) -> None:
+    table, report = read(written)
+    sigma = dict(zip(report["covariance"]["names"], np.sqrt(np.diag(report["covariance"]["matrix"])), strict=True))
+    camera = {"f": table["camera"]["matrix"][0][0], "cx": table["camera"]["matrix"][0][2], **table["camera"]}
+    truth = {"f": TRUTH.matrix[0, 0], "cx": TRUTH.matrix[0, 2], "k1": TRUTH.distortion[0], "tauX": TRUTH.distortion[12]}
+    for name, value in truth.items():
+        assert abs(camera[name] - value) < 4.0 * sigma[name], name
+    # A rotation of the axes in the sheet keeps gg + hh.
+    bend = table["triangulation"]["bend"]
+    assert abs(bend[0] + bend[2] - BEND[0] - BEND[2]) < 4.0 * np.hypot(sigma["gg"], sigma["hh"])
+    step = float(np.linalg.norm(TRUTH.step))
+    assert abs(table["transport"]["step"] - step) < 4.0 * report["transport"]["step_sigma"] < 1e-7
+    assert report["sheet"]["bend_test"]["significant"]
+
+
+def test_step_block_is_measured_to_a_fiftieth_of_a_pixel(written: Path) -> None:
+    """Steps of 6 mm on the stage: heights over the stage, and their differences."""
+    table, _ = read(written)
+    rng = np.random.default_rng(8)
+    middle = readings(TRUTH, 0.0, 0.0)[40:41]
+    pixel = np.linalg.norm(scene_points(table, middle + np.array([0.0, 1.0]), 0.0) - scene_points(table, middle, 0.0))
+    heights = []
+    for height in (-0.012, -0.006, 0.0, 0.006, 0.012, 0.018):
+        points = np.concatenate([readings(TRUTH, height, each) for each in np.arange(-4.0, 5.0)])
+        noisy = points + rng.normal(0.0, 0.05, points.shape) * [0.0, 1.0]
+        heights.append(float(np.mean(scene_points(table, noisy, 0.0)[:, 2])))
+    assert np.abs(np.diff(heights) - 0.006).max() < 0.02 * pixel
+    assert np.abs(np.array(heights) - np.arange(-0.012, 0.019, 0.006)).max() < 0.1 * pixel
+
+
+def test_parts_keep_their_shape(written: Path) -> None:
+    """Points of a part pass through the sheet one after the other: the scene shows the part, and no mirror image."""
+    table, _ = read(written)
+    axes = np.stack([TRUTH.g, TRUTH.h, TRUTH.normal])
+    part = np.array([[0.0, 0.0, 0.0], [0.02, 0.001, 0.003], [-0.01, 0.004, -0.03], [0.005, 0.015, 0.02]]) @ axes
+    found = []
+    for place in TRUTH.origin + part:
+        profile = 0.0
+        for _ in range(30):  # the profile at which the point has moved into the bent sheet
+            g, h, d = axes @ (place + profile * TRUTH.step - TRUTH.origin)
+            distance = d - (BEND[0] * g * g + BEND[1] * g * h + BEND[2] * h * h)
+            profile -= distance / (TRUTH.normal @ TRUTH.step)
+        pixel = TRUTH.project((place + profile * TRUTH.step)[None])
+        found.append(scene_points(table, pixel, profile)[0])
+    for first in range(3):
+        for second in range(first + 1, 4):
+            apart = np.linalg.norm(part[second] - part[first])
+            assert np.linalg.norm(found[second] - found[first]) == pytest.approx(apart, abs=2e-5)
+    volumes = [np.linalg.det(np.array(each)[1:] - np.array(each)[0]) for each in (found, part)]
+    assert volumes[0] == pytest.approx(volumes[1], rel=2e-3)
+    assert abs(volumes[1]) > 1e-6
+
+
+def test_report_and_picture_belong_to_the_file(written: Path) -> None:
+    table, report = read(written)
+    assert table["transport"]["step"] == report["step"]
+    assert table["triangulation"]["sheet_origin"] == report["sheet"]["origin"]
+    assert len(report["laser_images"]) == VIEWS
+    assert sum(each["readings"] for each in report["laser_images"]) == report["sheet"]["readings"] > 1000
+    assert len(report["camera"]["images"]) == VIEWS + MOVED
+    assert len(report["covariance"]["names"]) == len(report["covariance"]["matrix"]) == 7 + 6 + 3
+    assert report["warnings"] == []
+    assert table["line"]["along"] == "columns"
+    picture = cv2.imread(str(written.with_suffix(".png")))
+    assert picture is not None
+    # Cyan of the grid, red of the laser line.
+    blue, _, red = np.moveaxis(picture[: len(picture) // 2, : picture.shape[1] // 2].astype(int), -1, 0)
+    assert np.count_nonzero((blue > 150) & (red < 100)) > 500
+    assert np.count_nonzero((red > 180) & (blue < 90)) > 200
+
+
+def test_inputs_are_not_replaced(images: Path) -> None:
+    with pytest.raises(FileExistsError, match=r"pose0\.png"):
+        run(*command(images), "--out", images / "pose0.toml", "--overwrite")
+    with pytest.raises(FileExistsError, match=r"1\.png"):
+        run(*command(images), "--out", images / "moved" / "1.toml", "--overwrite")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--sensor",), "--sensor needs --pitch"),
+        (("--sensor", "--pitch", 0.01), "--sensor needs either --transport-views"),
+        (("--sensor", "--pitch", 0.01, "--transport-views", "x"), "need each other"),
+        (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--on-stage"), "--on-stage has no effect"),
+        (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--channel", "pink"), "--channel is 'pink'"),
+        (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--method", "lines"), "--sensor needs poses|--pitch has no"),
+        (("--step", 1e-3), "--step has no effect without --sensor"),
+        (("--laser", "x"), "--laser has no effect without --sensor"),
+    ],
+)
+def test_options_that_miss_each_other_are_refused(options: tuple[object, ...], said: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=said):
+        run("calibrate", tmp_path / "a.png", *options, "--out", tmp_path / "sensor.toml")
+
+
+def test_pairs_are_found_by_name_and_number(tmp_path: Path) -> None:
+    targets = [tmp_path / f"target_{number}.png" for number in (2, 10)]
+    lasers = tmp_path / "laser"
+    lasers.mkdir()
+    for name in ("laser010.png", "target_2.png"):
+        (lasers / name).touch()
+    assert pair_images(targets, lasers).lasers == (lasers / "target_2.png", lasers / "laser010.png")
+    beside = [*targets, tmp_path / "target_2_laser.png"]
+    assert pair_images(beside, None).lasers == (tmp_path / "target_2_laser.png", None)
+    with pytest.raises(ValueError, match="no laser images"):
+        pair_images(targets, None)
+    with pytest.raises(ValueError, match=r"other_laser\.png is the laser image of 0 target images"):
+        pair_images([*targets, tmp_path / "other_laser.png"], None)
+    (lasers / "010_laser.png").touch()
+    with pytest.raises(ValueError, match="has two laser images"):
+        pair_images(targets, lasers)
+
+
+def test_cut_off_transport_view_is_refused(images: Path, tmp_path: Path) -> None:
+    """A target that leaves the image would get other point numbers, and the stage a wrong step."""
+    moved = tmp_path / "moved"
+    shutil.copytree(images / "moved", moved)
+    view = cv2.imread(str(moved / "1.png"), cv2.IMREAD_GRAYSCALE)
+    assert view is not None
+    view[:, :150] = 160
+    cv2.imwrite(str(moved / "1.png"), view)
+    pair = [images / "pose0.png", images / "pose0_laser.png"]
+    with pytest.raises(ValueError, match=r"1\.png: .* needs the whole target in every view"):
+        calibrate_sensor(pair, pitch=PITCH, transport=TransportViews(folder=moved, profiles_between=1.0))
+
+
+@pytest.mark.slow
+def test_given_step_takes_the_transport_along_the_normal(images: Path) -> None:
+    shots = sorted(images.glob("*.png"))
+    done = calibrate_sensor(shots, pitch=PITCH, step=1e-3)
+    np.testing.assert_allclose(done.geometry.direction, done.geometry.sheet.normal)
+    assert done.geometry.step == 1e-3
+    assert done.cell == 1e-3
+    assert any("no transport views" in each for each in done.warnings)
+    assert done.report()["transport"] is None

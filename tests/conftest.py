@@ -12,7 +12,7 @@ from __future__ import annotations
 import gc
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -167,6 +167,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 def _counts(labels: Mapping[str, int]) -> str:
     return ", ".join(f"{label} {count}" for label, count in sorted(labels.items()))
+
+
+@pytest.fixture
+def draws(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
+    """Number of draws of a statistic by tier: ``draws(fast, full)``."""
+    in_fast = request.config.getoption("tier") == "fast"
+    return lambda fast, full: fast if in_fast else full
 
 
 @pytest.fixture

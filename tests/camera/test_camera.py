@@ -102,7 +102,7 @@ def test_a_tilt_in_closed_form(degrees: float) -> None:
         assert differ < FEW_ROUNDINGS if sign > 0.0 else differ > 10.0
 
 
-@settings(deadline=None, max_examples=120)
+@settings(deadline=None, max_examples=60)
 @given(
     radial=st.tuples(*(st.floats(-0.4, 0.4),) * 6),
     decentred=st.tuples(*(st.floats(-0.01, 0.01),) * 6),

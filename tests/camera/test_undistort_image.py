@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -88,17 +89,22 @@ def assert_right(
             assert np.abs(values[clear] - clipped[clear]).max(initial=0.0) <= 0.5 + slack
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
+@pytest.mark.parametrize(
+    "kernel",
+    list(itertools.product(("bilinear", "bicubic"), (1, 3), VARIANTS)),
+    ids=lambda each: "-".join(map(str, each)),
+)
 # The code for borders is the same for every type.
 @pytest.mark.parametrize(
-    ("dtype", "border"),
+    "source",
     [(dtype, border) for dtype in DTYPES for border in (BORDERS if dtype == np.float32 else ["mask", "constant"])],
+    ids=lambda each: f"{each[0].__name__}-{each[1]}",
 )
 def test_a_batch_against_the_oracle(
-    device: Device, dtype: Any, border: Any, interpolation: Any, channels: int, variant: Any, rng: np.random.Generator
+    device: Device, source: tuple[Any, Any], kernel: tuple[Any, int, Any], rng: np.random.Generator
 ) -> None:
+    dtype, border = source
+    interpolation, channels, variant = kernel
     lens = Lens(k1=4e-6, k2=1e-11, centre=(60.0, 41.0))
     op = UndistortImage(
         model=lens,
@@ -241,10 +247,14 @@ def test_whole_shifts_are_exact(
         )
 
 
-@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    "kernel",
+    list(itertools.product(("bilinear", "bicubic"), DTYPES)),
+    ids=lambda each: f"{each[0]}-{each[1].__name__}",
+)
 @pytest.mark.parametrize("border", ["constant", "replicate", "reflect"])
-def test_against_opencv(device: Device, border: str, dtype: Any, interpolation: Any, rng: np.random.Generator) -> None:
+def test_against_opencv(device: Device, border: str, kernel: tuple[Any, Any], rng: np.random.Generator) -> None:
+    interpolation, dtype = kernel
     image = pixels(rng, (90, 123), dtype)
     positions = map_of((70, 144), image.shape, turn=3.0, scale=1.1).astype(np.float32)
     flags = {"constant": cv2.BORDER_CONSTANT, "replicate": cv2.BORDER_REPLICATE, "reflect": cv2.BORDER_REFLECT_101}

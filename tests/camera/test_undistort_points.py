@@ -99,11 +99,18 @@ def assert_as_expected(operation: UndistortPoints, result: UndistortedPoints, po
     return good
 
 
-@TWO_WAYS
-@pytest.mark.parametrize("inverse", [False, True], ids=["undistort", "distort"])
-def test_as_the_host_says(
-    device: Device, model: Any, dtype: Any, variant: Any, inverse: bool, rng: np.random.Generator
-) -> None:
+@pytest.mark.parametrize(
+    "kernel",
+    [
+        ("vector", np.float32, False),
+        ("work_item", np.float64, True),
+        ("vector", np.float32, True),
+        ("work_item", np.float64, False),
+    ],
+    ids=lambda each: f"{each[0]}-{each[1].__name__}-{'distort' if each[2] else 'undistort'}",
+)
+def test_as_the_host_says(device: Device, model: Any, kernel: tuple[Any, ...], rng: np.random.Generator) -> None:
+    variant, dtype, inverse = kernel
     operation = UndistortPoints(model=model, variant=variant, inverse=inverse)
     points = image_points(rng).astype(dtype)
     result = operation(points, device=device)

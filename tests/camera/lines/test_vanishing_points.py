@@ -53,8 +53,8 @@ def test_exact_lines_give_the_lens(rng: np.random.Generator, border: float, tilt
 
 
 @pytest.mark.parametrize("lines", ["free", "vanishing"])
-@pytest.mark.parametrize("tilt", [0.0, 20.0, 45.0])
-@pytest.mark.parametrize("border", [0.3, 3.0, 20.0])
+@pytest.mark.parametrize("tilt", [0.0, pytest.param(20.0, marks=pytest.mark.slow), 45.0])
+@pytest.mark.parametrize("border", [0.3, pytest.param(3.0, marks=pytest.mark.slow), 20.0])
 def test_predicted_errors_are_the_bound(rng: np.random.Generator, border: float, tilt: float, lines: str) -> None:
     """Predicted errors are at most 10 % above the Cramer-Rao bound."""
     lens = radial_lens(border)

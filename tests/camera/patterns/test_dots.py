@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gpuvision.camera.patterns.dots import find_dots
-from target_images import View, dots, matched, photo, view
+from target_images import dots, matched, photo, view
 
 Float64 = np.ndarray
 SIZE = (700, 600)
@@ -35,7 +35,14 @@ def _rms(errors: Float64) -> float:
 # Noise in grey levels of a contrast of 180. The centre of gravity of a disc of radius r over a ground that its window
 # holds too has about 0.5 sigma / contrast times (window / r)^2; a tenth more for sharp edges between pixels' centres
 # (0.004 px, noise-free), and for the ground's slope.
-@pytest.mark.parametrize(("noise", "limit"), [(0.0, 0.004), (1.8, 0.007), (9.0, 0.03), (18.0, 0.06), (36.0, 0.15)])
+@pytest.mark.parametrize(
+    ("noise", "limit"),
+    [
+        (0.0, 0.004),
+        (9.0, 0.03),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((1.8, 0.007), (18.0, 0.06), (36.0, 0.15))),
+    ],
+)
 @pytest.mark.parametrize("pitch", [14.0, 28.0])
 def test_error_follows_the_noise(noise: float, limit: float, pitch: float, rng: np.random.Generator) -> None:
     rows, columns = int(500 / pitch), int(600 / pitch)
@@ -62,9 +69,16 @@ VIEWS = {
 }
 
 
-@pytest.mark.parametrize("camera", VIEWS.values(), ids=VIEWS.keys())
-@pytest.mark.parametrize("dark", [True, False])
-def test_whatever_the_view(camera: View, dark: bool, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(
+    ("name", "dark"),
+    [
+        *((name, True) for name in VIEWS),
+        ("plain", False),
+        *(pytest.param(name, False, marks=pytest.mark.slow) for name in VIEWS if name != "plain"),
+    ],
+)
+def test_whatever_the_view(name: str, dark: bool, rng: np.random.Generator) -> None:
+    camera = VIEWS[name]
     rows, columns = (16, 18) if camera is VIEWS["turned"] else (18, 21)
     found = find_dots(photo(dots(camera, _all(rows, columns)), rng, dark=dark, shade=0.5))
     truth = camera.nodes(rows, columns)

@@ -59,8 +59,8 @@ def check(made, fit, sigma):
 
 @pytest.mark.parametrize("tilt", TILTS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_cold_start_never_fails(kind, tilt):
-    for seed in range(10 if kind == "grid" else 5):
+def test_a_cold_start_never_fails(kind, tilt, draws):
+    for seed in range(draws(4, 10) if kind == "grid" else draws(2, 5)):
         made, views, sigma = random_scene(kind, tilt, seed)
         check(made, fit_camera(views, made.size, model="tilt"), sigma)
 
@@ -242,8 +242,8 @@ def test_tukey_on_clean_points_costs_five_percent(rng):
 
 @pytest.mark.parametrize("tilt", TILTS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_one_view_with_a_known_focal_length(kind, tilt):
-    for seed in range(10):
+def test_one_view_with_a_known_focal_length(kind, tilt, draws):
+    for seed in range(draws(3, 10)):
         rng = np.random.default_rng(seed)
         made = scene(rng, kind, tilt, corner_px=10.0, views=1, weakest=5.0)
         fit = fit_camera(made.views(rng, 0.05), made.size, model="tilt", focal_length=made.truth[0])

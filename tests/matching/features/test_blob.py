@@ -85,7 +85,7 @@ def test_every_shape_without_noise(device: Device, variant: Any, shape: Any) -> 
 
 
 @VARIANTS
-@pytest.mark.parametrize("shape", ["circle", "ring", "square", "cross"])
+@pytest.mark.parametrize("shape", ["circle", pytest.param("ring", marks=pytest.mark.slow), "square", "cross"])
 def test_matched_as_least_squares_have_it(device: Device, variant: Any, shape: Any, rng: np.random.Generator) -> None:
     """SciPy's least squares, same pixels, exact profiles: the difference is at most half the deviation by noise.
 
@@ -130,10 +130,8 @@ def test_edges_alone_as_their_circle_has_it(device: Device, variant: Any, radius
     assert abs(blobs.size[0] - radius) < 0.01
 
 
-@pytest.mark.parametrize(
-    ("spokes", "match"),
-    [(8, True), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((20, True), (44, False)))],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("spokes", "match"), [(8, True), (20, True), (44, False)])
 def test_any_number_of_rulers(device: Device, spokes: int, match: bool) -> None:
     """Numbers of fiducials that fill the kernel's vectors, and other numbers."""
     blobs = replace(PLAIN, spokes=spokes, match=match)(a_disc().astype(np.float32), place(), device=device)
@@ -214,18 +212,19 @@ def test_not_chasing_what_lies_beyond(device: Device, rng: np.random.Generator) 
         assert np.isnan(far.x[0])
 
 
-def test_contrast_reversed(device: Device) -> None:
+@pytest.mark.parametrize(("polarity", "sign"), [("bright", 1.0), pytest.param("dark", -1.0, marks=pytest.mark.slow)])
+def test_contrast_reversed(device: Device, polarity: Any, sign: float) -> None:
     """Reversed contrast is refused, or found if both polarities are allowed, for each fiducial separately."""
     bright, dark = a_disc().astype(np.float32), (200.0 - a_disc()).astype(np.float32)
-    either = replace(PLAIN, polarity="either")
-    for image, polarity, sign in ((bright, "bright", 1.0), (dark, "dark", -1.0)):
-        assert replace(PLAIN, polarity=polarity)(image, place(), device=device).status[0] == 0
-        other = "dark" if polarity == "bright" else "bright"
-        assert replace(PLAIN, polarity=other)(image, place(), device=device).status[0] == Status.LOW_SIGNAL
-        blobs = either(image, place(), device=device)
+    image, reversed_image = (bright, dark) if sign > 0.0 else (dark, bright)
+    one, either = replace(PLAIN, polarity=polarity), replace(PLAIN, polarity="either")
+    assert one(image, place(), device=device).status[0] == 0
+    assert one(reversed_image, place(), device=device).status[0] == Status.LOW_SIGNAL
+    for each, contrast in ((image, sign * 100.0), (reversed_image, -sign * 100.0)):
+        blobs = either(each, place(), device=device)
         assert blobs.status[0] == 0
         assert np.hypot(*(centre(blobs) - TRUE)) < 2e-3
-        assert abs(blobs.contrast[0] - sign * 100.0) < 0.2
+        assert abs(blobs.contrast[0] - contrast) < 0.2
 
 
 @VARIANTS

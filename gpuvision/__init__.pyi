@@ -3,6 +3,18 @@
 from .camera.camera import (
     Camera as Camera,
 )
+from .camera.correction_uncertainty import (
+    CorrectionMap as CorrectionMap,
+)
+from .camera.correction_uncertainty import (
+    correction_covariance as correction_covariance,
+)
+from .camera.correction_uncertainty import (
+    correction_map as correction_map,
+)
+from .camera.correction_uncertainty import (
+    correction_sigma as correction_sigma,
+)
 from .camera.image_map import (
     PixelMap as PixelMap,
 )

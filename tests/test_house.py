@@ -172,6 +172,7 @@ FLOORS = (
     ("camera",),
     ("camera.patterns",),
     ("camera.lines", "camera.views"),
+    ("camera.correction_uncertainty",),
     ("camera.calibration",),
     ("ranging", "matching"),
     ("matching.artwork",),

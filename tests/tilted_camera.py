@@ -20,14 +20,14 @@ def tilt(tau_x, tau_y):
 def project_virtual(internal, rotation, translation, points):
     """Project points (n, 3) with a pose in the *sensor's* frame; also for complex arguments.
 
-    ``internal``: f and aspect of the virtual camera, v, tauX, tauY, k1, k2, p1, p2, k3.
+    ``internal``: f and aspect of the virtual camera, v, tauX, tauY, k1, k2, p1, p2, k3, k4, k5, k6.
     """
-    f, aspect, v_column, v_row, tau_x, tau_y, k1, k2, p1, p2, k3 = internal
+    f, aspect, v_column, v_row, tau_x, tau_y, k1, k2, p1, p2, k3, k4, k5, k6 = internal
     r = tilt(tau_x, tau_y)
     ray = (points @ rotation.T + translation) @ r
     x, y = ray[:, 0] / ray[:, 2], ray[:, 1] / ray[:, 2]
     q = x * x + y * y
-    stretch = 1 + k1 * q + k2 * q**2 + k3 * q**3
+    stretch = (1 + k1 * q + k2 * q**2 + k3 * q**3) / (1 + k4 * q + k5 * q**2 + k6 * q**3)
     xd = x * stretch + 2 * p1 * x * y + p2 * (q + 2 * x * x)
     yd = y * stretch + p1 * (q + 2 * y * y) + 2 * p2 * x * y
     out = np.stack([xd, yd, np.ones_like(xd)], axis=1) @ r.T

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
 from gpuvision.camera.camera import COEFFICIENT_NAMES, Camera
+from gpuvision.camera.correction_uncertainty import CorrectionMap, correction_map, largest_sigma
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.lines.lens_fit import LensFit
 from gpuvision.camera.patterns.pattern import LineFamilies
@@ -93,6 +95,11 @@ def image_coverage(detected: Sequence[DetectedTarget], size: tuple[int, int]) ->
     return min(float(hull.volume) / (size[0] * size[1]), 1.0)
 
 
+# Sigma of the correction [px] above which the model counts as extrapolated. Chosen: a tenth of a pixel, about the
+# error of a single measured point of a usual target.
+_MAX_CORRECTION_SIGMA_PX = 0.1
+
+
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
     """Calibrated camera model with its detected target patterns.
@@ -130,6 +137,12 @@ class Calibration:
     def coverage(self) -> float:
         """Part of the image inside the convex hull of all points, 0 to 1; outside the model is extrapolated."""
         return image_coverage(self.detected_targets, self.image_size)
+
+    @functools.cached_property
+    def correction_map(self) -> CorrectionMap:
+        """Uncertainty of the correction over the image; extrapolated above 0.1 px or outside the measured points."""
+        measured = [line for each in self.detected_targets for family in each.families for line in family]
+        return correction_map(self.fit, self.image_size, measured, max_sigma_px=_MAX_CORRECTION_SIGMA_PX)
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
@@ -191,7 +204,9 @@ class Calibration:
             f"{self.pattern} in {used} of {used + len(self.skipped_images)} images, {points} points "
             f"over {100.0 * self.coverage:.0f} % of the image; "
             f"model {self.fit.model}: residual {self.fit.rms_px:.3g} px rms; deviation from straight lines "
-            f"{before:.3g} px, corrected {after:.3g} px"
+            f"{before:.3g} px, corrected {after:.3g} px; "
+            f"the correction is known to {largest_sigma(self.correction_map, inside=True):.2g} px, and extrapolated in "
+            f"{100.0 * self.correction_map.extrapolated.mean():.0f} % of the image"
         )
 
     def report(self) -> dict[str, Any]:
@@ -208,6 +223,14 @@ class Calibration:
             "covariance": {"names": list(fit.names), "matrix": fit.covariance.tolist()},
             "alternatives": [each._asdict() for each in self.alternatives],
             "warnings": list(fit.warnings),
+            "error_model": fit.error_model,
+            "lack_of_fit": fit.lack_of_fit and asdict(fit.lack_of_fit),
+            "correction": {
+                "max_sigma_px": largest_sigma(self.correction_map, inside=False),
+                "max_sigma_inside_px": largest_sigma(self.correction_map, inside=True),
+                "extrapolated": float(self.correction_map.extrapolated.mean()),
+                "max_allowed_sigma_px": _MAX_CORRECTION_SIGMA_PX,
+            },
             "images": [
                 {"name": each.image.name, "rms_px": _rms(errors)}
                 for each, (_, errors) in zip(self.detected_targets, self.residuals, strict=True)
@@ -215,11 +238,10 @@ class Calibration:
             "skipped_images": {path.name: reason for path, reason in self.skipped_images},
         }
         if isinstance(fit, LensFit):
-            lack_of_fit = {"error_model": fit.error_model, "lack_of_fit": fit.lack_of_fit and asdict(fit.lack_of_fit)}
-            return table | {"sigma_px": fit.sigma_px, "lines": fit.lines} | lack_of_fit
+            return table | {"sigma_px": fit.sigma_px, "lines": fit.lines}
         tilt = {"alpha_rad": fit.sensor.alpha, "alpha_sigma_rad": fit.alpha_sigma}
         poses = [{"rotation": p.rotation.tolist(), "translation": p.translation.tolist()} for p in fit.poses]
-        return table | {"sigma_px": fit.sigma_px, "tilt": tilt, "poses": poses}
+        return table | {"sigma_px": fit.sigma_px, "tilt": tilt, "poses": poses, "view_p_value": fit.view_p_value}
 
 
 def _rms(errors: Float64) -> float:

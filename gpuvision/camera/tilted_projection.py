@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 
-INTERNAL = ("f", "aspect", "v_column", "v_row", "tauX", "tauY", "k1", "k2", "p1", "p2", "k3")
+INTERNAL = ("f", "aspect", "v_column", "v_row", "tauX", "tauY", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 COLUMNS = len(INTERNAL) + 6
 """Number of Jacobian columns: `INTERNAL`, then the pose (a rotation vector applied from the left, a translation)."""
 
@@ -66,7 +66,7 @@ def project(
     Parameters
     ----------
     internal : numpy.ndarray
-        (11,): the parameters named in `INTERNAL` [px], [rad], and OpenCV's distortion coefficients.
+        (14,): the parameters named in `INTERNAL` [px], [rad], and OpenCV's distortion coefficients.
     rotations, translations : numpy.ndarray
         (views, 3, 3) and (views, 3): from the target to the *sensor's* frame.
     target : numpy.ndarray
@@ -78,7 +78,7 @@ def project(
     -------
     Projection
     """
-    f, aspect, v_column, v_row, tau_x, tau_y, k1, k2, p1, p2, k3 = internal.tolist()
+    f, aspect, v_column, v_row, tau_x, tau_y, k1, k2, p1, p2, k3, k4, k5, k6 = internal.tolist()
     m = tilt_matrix(tau_x, tau_y)
     rotated = rotations @ target
     p = rotated + translations[:, :, None]
@@ -88,7 +88,8 @@ def project(
         x, y = q[:, 0] * depth, q[:, 1] * depth
         xx, yy, xy = x * x, y * y, x * y
         r2 = xx + yy
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        divisor = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * divisor
         xd = x * radial + 2.0 * p1 * xy + p2 * (r2 + 2.0 * xx)
         yd = y * radial + p1 * (r2 + 2.0 * yy) + 2.0 * p2 * xy
         inverse = 1.0 / (m[2, 0] * xd + m[2, 1] * yd + m[2, 2])
@@ -98,7 +99,7 @@ def project(
     in_front = bool((depth > 0.0).all() and (inverse > 0.0).all() and np.isfinite(points).all())
     if not derivatives or not in_front:
         return Projection(points, in_front, None)
-    jacobian = _jacobian(internal, m, rotated, p, _Rays(depth, x, y, radial, inverse, u, w))
+    jacobian = _jacobian(internal, m, rotated, p, _Rays(depth, x, y, radial, divisor, inverse, u, w))
     return Projection(points, in_front, jacobian)
 
 
@@ -113,6 +114,8 @@ class _Rays(NamedTuple):
         Undistorted normalised coordinates.
     radial
         Factor of the radial distortion.
+    divisor
+        1 / denominator of that factor (k4, k5, k6).
     inverse
         1 / denominator of the projection on the tilted sensor.
     u, w
@@ -123,6 +126,7 @@ class _Rays(NamedTuple):
     x: Floats
     y: Floats
     radial: Floats
+    divisor: Floats
     inverse: Floats
     u: Floats
     w: Floats
@@ -130,12 +134,13 @@ class _Rays(NamedTuple):
 
 def _jacobian(internal: Floats, m: Floats, rotated: Floats, p: Floats, rays: _Rays) -> Floats:
     """Return the derivatives (views, columns, 2, n) of the image points."""
-    f, aspect, _, _, _, _, k1, k2, p1, p2, k3 = internal.tolist()
-    depth, x, y, radial, inverse, u, w = rays
+    f, aspect, _, _, _, _, k1, k2, p1, p2, k3, k4, k5, k6 = internal.tolist()
+    depth, x, y, radial, divisor, inverse, u, w = rays
     xx, yy, xy = x * x, y * y, x * y
     r2 = xx + yy
     jacobian = np.zeros((len(rotated), COLUMNS, 2, rotated.shape[-1]))
-    slope = k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2)
+    # Derivative of the factor by r^2, for a quotient of polynomials.
+    slope = (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2) - radial * (k4 + r2 * (2.0 * k5 + 3.0 * k6 * r2))) * divisor
     # The 2 x 2 Jacobian of the distortion is symmetric.
     lens_xx = radial + 2.0 * xx * slope + 2.0 * p1 * y + 6.0 * p2 * x
     lens_yy = radial + 2.0 * yy * slope + 6.0 * p1 * y + 2.0 * p2 * x
@@ -146,16 +151,17 @@ def _jacobian(internal: Floats, m: Floats, rotated: Floats, p: Floats, rays: _Ra
         out = jacobian[:, :, row]
         scale = focal * inverse
         by_xd, by_yd = scale * (m[row, 0] - coordinate * m[2, 0]), scale * (m[row, 1] - coordinate * m[2, 1])
-        along = by_xd * x + by_yd * y
+        along = (by_xd * x + by_yd * y) * divisor
         out[:, 6] = along * r2
         out[:, 7] = along * r4
         out[:, 8] = by_xd * p1_x + by_yd * p1_y
         out[:, 9] = by_xd * p2_x + by_yd * p2_y
         out[:, 10] = out[:, 7] * r2
+        out[:, 11:14] = -radial[:, None] * out[:, (6, 7, 10)]
         by_x, by_y = (by_xd * lens_xx + by_yd * lens_xy) * depth, (by_xd * lens_xy + by_yd * lens_yy) * depth
         g = m @ np.stack([by_x, by_y, -(by_x * x + by_y * y)], axis=1)
-        out[:, 14:] = g
-        _cross(rotated, g, out[:, 11:14])
+        out[:, 17:] = g
+        _cross(rotated, g, out[:, 14:17])
         _tilt_columns(m, focal * _by_ray_rotation(row, u, w), p, g, out[:, 4:6])
     jacobian[:, 0, 0], jacobian[:, 0, 1] = u, aspect * w
     jacobian[:, 1, 1] = f * w

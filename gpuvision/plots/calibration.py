@@ -1,4 +1,4 @@
-"""Plot of a calibration: residuals of the points, and the distortion over the image."""
+"""Plot of a calibration: residuals of the points, the distortion over the image, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from gpuvision.camera.calibration import Calibration
@@ -25,7 +26,7 @@ _SCALE_PERCENTILE = 98
 
 
 def draw_calibration(path: str | Path, calibration: Calibration, *, overwrite: bool = False) -> None:
-    """Draw residuals and distortion side by side as PNG. On an error no file is left behind.
+    """Draw residuals, distortion and its uncertainty side by side as PNG. On an error no file is left behind.
 
     Parameters
     ----------
@@ -36,12 +37,13 @@ def draw_calibration(path: str | Path, calibration: Calibration, *, overwrite: b
     overwrite : bool
         Whether an existing file may be replaced. Default False.
     """
-    figure = Figure(figsize=(13.0, 5.6), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(19.0, 5.6), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2)
-    _draw_residuals(left, calibration)
-    _draw_distortion(right, calibration)
-    for axes in (left, right):
+    panels = figure.subplots(1, 3)
+    _draw_residuals(panels[0], calibration)
+    _draw_distortion(panels[1], calibration)
+    _draw_uncertainty(panels[2], calibration)
+    for axes in panels:
         columns, rows = calibration.image_size
         axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), aspect="equal")
         axes.set(xlabel="column [px]", ylabel="row [px]")
@@ -92,6 +94,24 @@ def _draw_distortion(axes: Axes, calibration: Calibration) -> None:
         )  # fmt: skip
     _mark_centre(axes, calibration)
     axes.set_title("correction by the model: from measured to ideal positions", fontsize=9)
+
+
+def _draw_uncertainty(axes: Axes, calibration: Calibration) -> None:
+    found = calibration.correction_map
+    x, y = np.moveaxis(found.points, -1, 0)
+    known = np.isfinite(found.sigma_px)
+    largest = float(found.sigma_px[known].max()) if known.any() else 0.0
+    if largest > 0.0:
+        levels = np.geomspace(max(float(found.sigma_px[known].min()), 1e-3 * largest), largest, 13)
+        shown = axes.contourf(
+            x, y, np.ma.masked_where(~known, np.maximum(found.sigma_px, levels[0])), levels=np.unique(levels),
+            cmap="cividis", norm=LogNorm(levels[0], max(largest, 1.001 * levels[0])), extend="max",
+        )  # fmt: skip
+        axes.figure.colorbar(shown, ax=axes, label="1 sigma of the correction [px]", shrink=0.8, format="%.2g")
+    axes.contourf(
+        x, y, found.extrapolated.astype(float), levels=[0.5, 1.5], colors="none", hatches=["///"]
+    )  # fmt: skip
+    axes.set_title("uncertainty of the correction; hatched: extrapolated", fontsize=9)
 
 
 def _mark_centre(axes: Axes, calibration: Calibration) -> None:

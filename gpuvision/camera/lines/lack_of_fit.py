@@ -35,6 +35,7 @@ from gpuvision.camera.lines.line_families import Float64, Index, PackedLines
 from gpuvision.camera.lines.line_statistics import image_normals, p_value_of_gain
 from gpuvision.camera.lines.straightness import ResidualJacobian, line_coefficients, projected_columns
 from gpuvision.camera.lines.variable_projection import Minimum
+from gpuvision.camera.smooth_field import LackOfFit, mode_variances, not_below
 
 # Degrees of the smooth field. Lines absorb the linear part. Degree 7 resolves a third of the image.
 _DEGREES = (2, 7)
@@ -43,34 +44,8 @@ _FREEDOM_PER_MODE = 4
 # Mean square of a mode that lines and lens leave over, relative to the mode, below which the data do not show the mode.
 # Measured: below 1e-4 the rest of a mode is its nonlinearity, which follows the noise of the lines' directions.
 _SEEN_MODE = 1e-3
-# Share of a degree's field that must be seen for an estimate of its variance; else it is extrapolated.
-_SEEN_DEGREE = 0.05
-# Exponent of the amplitude over the degree: bending energy grows with the fourth power of the degree.
-_SPECTRUM = 2.0
 # Blocks along each side of the image for the clusters.
 _BLOCKS = 4
-
-
-@dataclass(frozen=True, kw_only=True)
-class LackOfFit:
-    """Smooth field in the residuals of a lens fit.
-
-    Attributes
-    ----------
-    p_value : float
-        p-value of the test that the residuals are independent noise, against a free smooth field.
-    rms_px : float
-        Root mean square of the smooth field in the residuals [px], less the part that noise explains.
-    noise_px : float
-        Standard deviation of the remaining residuals [px].
-    modes : int
-        Number of modes of the field that the data show; 0 if there are too few points for the test.
-    """
-
-    p_value: float
-    rms_px: float
-    noise_px: float
-    modes: int
 
 
 @dataclass(frozen=True)
@@ -169,13 +144,17 @@ def correlated_covariance(packed: PackedLines, found: Minimum, smooth: SmoothRes
     columns = _lens_columns(packed, found)[kept] * scale[:, None]
     normal = columns @ columns.T
     shifts = np.linalg.lstsq(normal, columns @ smooth.columns.T, rcond=None)[0]
-    field = (shifts * _mode_variances(smooth)[smooth.degree]) @ shifts.T
+    seen = smooth.seen @ smooth.seen.T
+    by_degree = mode_variances(
+        smooth.degree, seen, smooth.seen @ smooth.residual, smooth.variance, len(smooth.residual)
+    )
+    field = (shifts * by_degree[smooth.degree]) @ shifts.T
     block = _blocks(packed)
     clusters = (packed.line, block, packed.line * _BLOCKS**2 + block)
     by_line, by_block, by_both = (_jackknife(columns, normal, smooth.rest, each) for each in clusters)
     least = white[np.ix_(kept, kept)] / np.outer(scale, scale)
     total = np.array(white)
-    total[np.ix_(kept, kept)] = (field + _not_below(by_line + by_block - by_both, least)) * np.outer(scale, scale)
+    total[np.ix_(kept, kept)] = (field + not_below(by_line + by_block - by_both, least)) * np.outer(scale, scale)
     return total
 
 
@@ -213,32 +192,6 @@ def _field(packed: PackedLines, found: Minimum, most: int) -> tuple[Float64, npt
     return field, np.array(degree)
 
 
-def _mode_variances(smooth: SmoothResiduals) -> Float64:
-    """Return the variance of a mode by its degree, index 0 to the largest degree.
-
-    Of a degree that is seen: by moments, sum of squared products with the residuals less the part of the noise, plus
-    one standard error, since the few modes of a low degree give a rough estimate. Each variance is at least the
-    variance of each higher degree, extrapolated by the spectrum.
-    """
-    found = np.zeros(int(smooth.degree.max(initial=0)) + 1)
-    for degree in np.unique(smooth.degree):
-        modes = smooth.seen[smooth.degree == degree]
-        gram = modes @ modes.T
-        if np.trace(gram) < _SEEN_DEGREE * len(modes) * len(smooth.residual):
-            continue
-        product = modes @ smooth.residual
-        squares = float(np.sum(gram * gram))
-        estimate = max(float(product @ product - smooth.variance * np.trace(gram)) / squares, 0.0)
-        # Covariance of the products; the sum of their squares has the variance 2 |covariance|^2.
-        of_products = estimate * (gram @ gram) + smooth.variance * gram
-        found[degree] = estimate + math.sqrt(2.0) * float(np.linalg.norm(of_products)) / squares
-    degrees = np.arange(1, len(found))
-    for degree in degrees[::-1]:
-        higher = np.arange(degree, len(found))
-        found[degree] = np.max(found[higher] * (higher / degree) ** (2.0 * _SPECTRUM))
-    return found
-
-
 def _blocks(packed: PackedLines) -> Index:
     """Return the image block (n,) of each point: 4 x 4 equal parts of the bounding box."""
     column, row = (
@@ -259,13 +212,3 @@ def _jackknife(columns: Float64, normal: Float64, residual: Float64, cluster: In
     # The pseudoinverse: a cluster may hold all points that determine a parameter.
     shifts = np.einsum("cij,jc->ci", np.linalg.pinv(left, hermitian=True), scores)
     return np.asarray(shifts.T @ shifts * ((len(shifts) - 1) / len(shifts)))
-
-
-def _not_below(matrix: Float64, least: Float64) -> Float64:
-    """Return a covariance that is at least ``least`` in every direction: raise the variances that are smaller."""
-    values, vectors = np.linalg.eigh(least)
-    root = vectors * np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))
-    inner = np.linalg.solve(root, np.linalg.solve(root, matrix).T)
-    values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
-    raised = root @ vectors
-    return np.asarray((raised * np.maximum(values, 1.0)) @ raised.T)

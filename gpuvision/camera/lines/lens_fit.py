@@ -10,10 +10,10 @@ from typing import Literal
 import numpy as np
 
 from gpuvision.camera.lens import Lens
-from gpuvision.camera.lines.lack_of_fit import LackOfFit
 from gpuvision.camera.lines.line_families import Float64, LineFamilies, PackedLines
 from gpuvision.camera.lines.straightness import pencil_basis
 from gpuvision.camera.lines.variable_projection import Minimum, vanishing_start
+from gpuvision.camera.smooth_field import LackOfFit
 
 LensModel = Literal["none", "k1", "k1,k2", "k1,k2,k3", "k1,k2,k3,k4"]
 LineConstraint = Literal["auto", "vanishing", "free"]

@@ -102,7 +102,7 @@ class FitState:
     Attributes
     ----------
     values
-        (11,): the parameters named in `parameters.FIT_PARAMETERS`.
+        (14,): the parameters named in `parameters.FIT_PARAMETERS`.
     rotations, translations
         (views, 3, 3) and (views, 3): from the target to the sensor's frame.
     cost

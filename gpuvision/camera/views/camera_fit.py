@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.scheimpflug import TiltedSensor
+from gpuvision.camera.smooth_field import LackOfFit
 from gpuvision.camera.tilted_projection import Floats, tilt_matrix
 from gpuvision.camera.views.bundle_adjustment import (
     FitState,
@@ -22,6 +23,7 @@ from gpuvision.camera.views.bundle_adjustment import (
     robust_scale,
     solve_step,
 )
+from gpuvision.camera.views.correlated_errors import CorrelatedErrors
 from gpuvision.camera.views.parameters import OPENCV, FreeParameters, internal_parameters, opencv_parameters
 
 
@@ -53,7 +55,8 @@ class CameraAlternative(NamedTuple):
         Number of free camera parameters.
     p_value : float
         p-value of the F test against the largest model: the probability of at least this increase of the residual if
-        this model is true.
+        this model is true. If the residuals of the largest model are correlated, its further parameters are tested
+        against their covariance for correlated errors (Wald's test).
     aic : float
         Akaike information criterion.
     centre : (float, float)
@@ -86,7 +89,7 @@ class CameraFit:
     names : tuple of str
         Names of the free camera parameters, as in OpenCV; ``f`` is fx = fy.
     covariance : numpy.ndarray
-        (m, m): covariance of these parameters [px], [rad].
+        (m, m): covariance of these parameters [px], [rad], by ``error_model``.
     pose_covariance : numpy.ndarray
         (views, 6, 6): covariance of a rotation vector [rad], applied from the left in the camera's frame, and of the
         translation [m].
@@ -98,6 +101,13 @@ class CameraFit:
         Per view (n, 2): measured minus projected points [px]; NaN for missing points.
     iterations : int
         Number of steps of the final fit.
+    lack_of_fit : LackOfFit
+        Smooth field in the residuals that is fixed in the image: a lens that the model does not describe.
+    view_p_value : float
+        p-value of the test that one camera explains all views: a bent or moving target makes it small.
+    error_model : {"independent", "correlated"}
+        "correlated" if one of the two tests has a p-value below `CalibrationLimits.lack_of_fit_significance`: the
+        covariance then has clusters by view (five views or more), and the part of the smooth field.
     alternatives : tuple of CameraAlternative
         CameraAlternative models, smallest first.
     warnings : tuple of str
@@ -114,6 +124,9 @@ class CameraFit:
     sigma_px: float
     residuals: tuple[Floats, ...]
     iterations: int
+    lack_of_fit: LackOfFit
+    view_p_value: float
+    error_model: Literal["independent", "correlated"]
     alternatives: tuple[CameraAlternative, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -151,7 +164,7 @@ def camera_from_parameters(values: Floats) -> Camera:
     # Adding 0.0 turns -0.0 into 0.0.
     return Camera(
         matrix=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)),
-        distortion=(*coefficients, *(0.0,) * 7, tau_x + 0.0, tau_y + 0.0),
+        distortion=(*coefficients, *(0.0,) * 4, tau_x + 0.0, tau_y + 0.0),
     )
 
 
@@ -173,24 +186,47 @@ def residual_sigma(views: PackedViews, free_parameters: FreeParameters, state: F
 
 
 def covariances(
-    views: PackedViews, free_parameters: FreeParameters, state: FitState, loss: RobustLoss, sigma: float | None
+    views: PackedViews,
+    free_parameters: FreeParameters,
+    state: FitState,
+    loss: RobustLoss,
+    sigma: float | None,
+    correlated: CorrelatedErrors | None = None,
 ) -> tuple[Floats, Floats, float]:
     """Return the covariances of camera parameters and poses, and the relative standard deviation of f.
 
     `names` are the names of the camera parameters in OpenCV's order; the poses are in the lens' frame. The covariances
     are valid to first order; under a robust loss they are Huber's, for points of equal noise. Parameters that the data
     do not determine have a very large, finite variance. f is the virtual camera's focal length: the data can determine
-    it even if they do not determine tilt, centre and f'.
+    it even if they do not determine tilt, centre and f'. With ``correlated`` the camera's covariance is that of
+    correlated errors; the errors of the points within a view count as independent for the pose of the view.
     """
     system = linearise(views, free_parameters, state, loss, stiffness=True)
     assert system is not None, "the fit ended with every point in front of the camera"
     variance = residual_variance_factor(views, free_parameters, state, loss, sigma)
     inverse, on_poses, pose_inverse = _invert(system)
     to_names = _derivative_of_names(free_parameters, state)
+    if correlated is not None:
+        inverse = correlated.covariance(variance * inverse) / variance
     camera = variance * to_names @ inverse @ to_names.T
     by_f = free_parameters.derivative(state.values)[0]
     focus = math.sqrt(max(variance * by_f @ inverse @ by_f, 0.0)) / float(state.values[0])
     return camera, variance * _lens_pose_covariance(free_parameters, state, inverse, on_poses, pose_inverse), focus
+
+
+def free_covariance(
+    views: PackedViews,
+    free_parameters: FreeParameters,
+    state: FitState,
+    loss: RobustLoss,
+    sigma: float | None,
+    correlated: CorrelatedErrors,
+) -> Floats:
+    """Return the covariance of the free parameters for errors by view, in the coordinates of the fit."""
+    system = linearise(views, free_parameters, state, loss, stiffness=True)
+    assert system is not None, "the fit ended with every point in front of the camera"
+    variance = residual_variance_factor(views, free_parameters, state, loss, sigma)
+    return correlated.covariance_by_view(variance * _invert(system)[0])
 
 
 def residual_variance_factor(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpuvision.camera.views.camera_fit import CameraAlternative, CameraFit
+from gpuvision.camera.views.correlated_errors import MIN_VIEWS
 
 # Points tested along each side of the image's border.
 _BORDER_POINTS = 17
@@ -46,6 +47,12 @@ class CalibrationLimits:
         Largest share of points outside the image; a larger one indicates a wrong ``image_size``.
     sufficient_noise_ratio : float
         Ratio of the residual to that of free homographies, up to which no other start is tried.
+    lack_of_fit_significance : float
+        p-value of the smooth field, or of the test between views, below which the residuals count as correlated.
+        Chosen: with two tests, one of 500 calibrations with independent errors.
+    max_lack_of_fit : float
+        Ratio of the smooth residuals to the noise above which a warning names the lack of fit. Chosen: below 0.5 they
+        add less than 12 % to the residual.
     """
 
     significance: float = 0.001
@@ -61,6 +68,8 @@ class CalibrationLimits:
     min_view_share: float = 0.25
     max_outside_share: float = 0.05
     sufficient_noise_ratio: float = 1.3
+    lack_of_fit_significance: float = 0.001
+    max_lack_of_fit: float = 0.5
 
 
 DEFAULT_LIMITS = CalibrationLimits()
@@ -104,6 +113,8 @@ def diagnose(
         _possible_tilt(fit, size, limits),
         *(_equal_alternative(fit, each, limits) for each in fit.alternatives),
         _small_tilt(fit, limits),
+        _lack_of_fit(fit, limits),
+        _differing_views(fit, limits),
     ]
     if _folds(fit, size):
         warnings.append("the lens polynomial folds within the image: points beyond the fold cannot be undistorted")
@@ -193,6 +204,29 @@ def _equal_alternative(fit: CameraFit, other: CameraAlternative, limits: Calibra
     return (
         f"model {other.model!r} fits as well (rms {other.rms_px:.4f} px, p = {other.p_value:.2g}) "
         f"with its centre {other.centre_distance_px:.1f} px away"
+    )
+
+
+def _lack_of_fit(fit: CameraFit, limits: CalibrationLimits) -> str:
+    """Warn of a smooth pattern in the residuals, which the model does not describe."""
+    lack = fit.lack_of_fit
+    if lack.p_value >= limits.lack_of_fit_significance or lack.rms_px <= limits.max_lack_of_fit * lack.noise_px:
+        return ""
+    return (
+        f"the residuals form a smooth pattern of {lack.rms_px:.3g} pixels rms over the image, beside "
+        f"{lack.noise_px:.3g} pixels of noise: the lens is not of model {fit.model}, or the target is not flat; the "
+        "uncertainties include the pattern"
+    )
+
+
+def _differing_views(fit: CameraFit, limits: CalibrationLimits) -> str:
+    """Warn of views that differ, where they are too few for a covariance by view."""
+    if fit.view_p_value >= limits.lack_of_fit_significance or len(fit.poses) >= MIN_VIEWS:
+        return ""
+    return (
+        f"the views differ by more than independent errors explain (p = {fit.view_p_value:.2g}), and {len(fit.poses)} "
+        f"views are too few to include it in the uncertainties: give {MIN_VIEWS} or more, and check that the target is "
+        "flat and still"
     )
 
 

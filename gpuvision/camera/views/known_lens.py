@@ -35,7 +35,7 @@ from gpuvision.camera.views.camera_fit import (
     residual_sigma,
 )
 from gpuvision.camera.views.initialization import fit_homographies, tilt_closed_form
-from gpuvision.camera.views.parameters import FreeParameters
+from gpuvision.camera.views.parameters import FIT_PARAMETERS, FreeParameters
 from gpuvision.camera.views.target_views import pack
 from gpuvision.camera.views.tsai import fit_tsai
 
@@ -122,7 +122,7 @@ def fit_tilt(
             "no tilt and f' fit these views: check lens and direction; the target must be oblique to the sensor"
         )
     f = radius * closed[0]
-    values = np.zeros(11)
+    values = np.zeros(len(FIT_PARAMETERS))
     values[:6] = [f, 1.0, *(centre + radius * closed[1]), *centre]
     free_parameters = FreeParameters(
         coefficients=(), tilt=True, centre=False, direction=direction, focal_length=focal_length

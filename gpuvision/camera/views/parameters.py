@@ -14,10 +14,25 @@ import numpy as np
 
 from gpuvision.camera.tilted_projection import INTERNAL, Floats
 
-FIT_PARAMETERS = ("f", "aspect", "v_column", "v_row", "c_column", "c_row", "k1", "k2", "p1", "p2", "k3")
+FIT_PARAMETERS = (
+    "f",
+    "aspect",
+    "v_column",
+    "v_row",
+    "c_column",
+    "c_row",
+    "k1",
+    "k2",
+    "p1",
+    "p2",
+    "k3",
+    "k4",
+    "k5",
+    "k6",
+)
 """Coordinates of the fit."""
-OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "tauX", "tauY")
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
+OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "tauX", "tauY")
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +64,7 @@ class FreeParameters:
 
     @property
     def basis(self) -> Floats:
-        """Linear map (11, free) from free parameters to `FIT_PARAMETERS`. Without a tilt v follows the centre."""
+        """Linear map (14, free) from free parameters to `FIT_PARAMETERS`. Without a tilt v follows the centre."""
         names = [] if self.focal_length is not None else ["f"]
         names += ["aspect"] if self.aspect else []
         names += ["v_column"] if self.tilt else []
@@ -89,7 +104,7 @@ class FreeParameters:
         return result
 
     def derivative(self, values: Floats) -> Floats:
-        """Return d(`FIT_PARAMETERS`) / d(free parameters), (11, free)."""
+        """Return d(`FIT_PARAMETERS`) / d(free parameters), (14, free)."""
         derivative = self.basis
         if not self.tilt:
             derivative[2:4] = derivative[4:6]
@@ -102,7 +117,7 @@ class FreeParameters:
 
 
 def internal_parameters(values: Floats) -> tuple[Floats, Floats]:
-    """Return the parameters of `tilted_projection.project`, and their derivative (11, 11) by `FIT_PARAMETERS`."""
+    """Return the parameters of `tilted_projection.project`, and their derivative (14, 14) by `FIT_PARAMETERS`."""
     f, aspect, v_column, v_row, c_column, c_row = values[:6].tolist()
     g = np.array([c_column - v_column, (c_row - v_row) / aspect, f])
     by_parameters = np.zeros((3, len(FIT_PARAMETERS)))
@@ -123,7 +138,7 @@ def internal_parameters(values: Floats) -> tuple[Floats, Floats]:
 
 
 def opencv_parameters(values: Floats) -> tuple[Floats, Floats]:
-    """Return the parameters named in `OPENCV`, and their derivative (11, 11) by `FIT_PARAMETERS`."""
+    """Return the parameters named in `OPENCV`, and their derivative (14, 14) by `FIT_PARAMETERS`."""
     internal, to_internal = internal_parameters(values)
     f, aspect, v_column, v_row, c_column, c_row = values[:6].tolist()
     g = np.array([c_column - v_column, (c_row - v_row) / aspect, f])
@@ -136,6 +151,6 @@ def opencv_parameters(values: Floats) -> tuple[Floats, Floats]:
     derivative[1] = aspect * derivative[0]
     derivative[1, 1] += fx
     derivative[2, 4] = derivative[3, 5] = 1.0
-    derivative[4:9, 6:] = np.eye(5)
-    derivative[9:] = to_internal[4:6]
+    derivative[4:12, 6:] = np.eye(8)
+    derivative[12:] = to_internal[4:6]
     return result, derivative

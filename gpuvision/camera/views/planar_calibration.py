@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,10 +19,12 @@ from gpuvision.camera.views.camera_fit import (
     CameraFit,
     camera_from_parameters,
     covariances,
+    free_covariance,
     poses_in_lens_frame,
     residual_sigma,
     residual_variance_factor,
 )
+from gpuvision.camera.views.correlated_errors import MIN_VIEWS, CorrelatedErrors, correlated_errors
 from gpuvision.camera.views.diagnosis import DEFAULT_LIMITS, CalibrationLimits, determines_focal_length, diagnose
 from gpuvision.camera.views.initialization import (
     UndistortedHomographies,
@@ -30,7 +33,7 @@ from gpuvision.camera.views.initialization import (
     tilt_closed_form,
     zhang_closed_form,
 )
-from gpuvision.camera.views.parameters import COEFFICIENTS, FreeParameters, internal_parameters
+from gpuvision.camera.views.parameters import COEFFICIENTS, FIT_PARAMETERS, FreeParameters, internal_parameters
 from gpuvision.camera.views.target_views import Mask, pack
 from gpuvision.validation import finite, numbers
 
@@ -38,9 +41,13 @@ LossName = Literal["squared", "huber", "tukey"]
 
 AUTOMATIC_MODELS = ("none", "k1", "k1,k2", "tilt,k1", "tilt")
 """Candidates of ``model="auto"``, smallest first; "tilt" is "tilt,k1,k2"."""
+FURTHER_MODELS = (("k1,k2,k3", "tilt,k1,k2,k3"), ("k1,k2,k3,k4,k5,k6", "tilt,k1,k2,k3,k4,k5,k6"))
+"""Further candidates, without and with a tilt. Each pair is tried if the test rejects all models before it."""
 # Robust scale: largest number of re-estimations, and the relative change that ends them.
 _MAX_RESCALINGS = 10
 _SAME_SCALE = 0.01
+# Relative size below which a direction of the coordinates is rounding.
+_SINGULAR = 1e-9
 # Residuals [px] at rounding level, which cannot distinguish models.
 _EXACT_PX = 1e-6
 
@@ -78,10 +85,16 @@ class _Task:
 class _Candidate:
     """Fit of one model."""
 
+    views: PackedViews
     model: str
     free_parameters: FreeParameters
     state: FitState
     loss: RobustLoss
+
+    @functools.cached_property
+    def correlated(self) -> CorrelatedErrors:
+        """Tests of the residuals for correlation."""
+        return correlated_errors(self.views, self.free_parameters, self.state, self.loss)
 
 
 def fit_camera(
@@ -105,10 +118,12 @@ def fit_camera(
     image_size : (int, int)
         Columns and rows [px].
     model : str
-        Free parameters besides focal length and centre: "none", or terms out of k1, k2, p1, p2, k3 and tilt, joined by
-        commas; "tilt" alone is "tilt,k1,k2". "auto" (default): the smallest of "none", "k1", "k1,k2", "tilt,k1" and
-        "tilt" that an F test at 0.1 % accepts. Tangential terms together with a tilt are refused: their effects cannot
-        be separated.
+        Free parameters besides focal length and centre: "none", or terms out of k1, k2, p1, p2, k3, k4, k5, k6 (the
+        denominator of OpenCV's rational model) and tilt, joined by commas; "tilt" alone is "tilt,k1,k2". "auto"
+        (default): the smallest of "none", "k1", "k1,k2", "tilt,k1" and "tilt" that a test at 0.1 % accepts; if it
+        rejects "tilt", also k3, and then k4 to k6, without and with a tilt. The test is an F test, or Wald's test if
+        the residuals are correlated. Tangential terms together with a tilt are refused: their effects cannot be
+        separated.
     focal_length : float, optional
         Known f' (fx of a tilted camera) [px]; one view is then enough. Default: estimated.
     centre : (float, float), optional
@@ -147,8 +162,26 @@ def fit_camera(
     task = _prepare(views, image_size, focal_length, centre, loss, sigma, free_aspect, limits)
     models = _check_enough(task, models)
     largest = _fit_from_starts(task, models[-1])
+    if model == "auto":
+        models, largest = _with_further_terms(task, models, largest)
     candidates = [_fit_smaller_model(task, each, largest) for each in models[:-1]] + [largest]
     return _smallest_accepted(task, candidates, loss)
+
+
+def _with_further_terms(task: _Task, models: list[str], largest: _Candidate) -> tuple[list[str], _Candidate]:
+    """Add models with further coefficients as long as the test rejects the largest one; return models and largest."""
+    for further in FURTHER_MODELS:
+        free_parameters = task.free_parameters(further[-1])
+        if free_parameters.count + 6 * len(task.masks) > task.views.coordinates:
+            break
+        state = adjust(task.views, free_parameters, largest.state, largest.loss)
+        larger = _Candidate(task.views, further[-1], free_parameters, state, largest.loss)
+        if not state.converged or not _is_invertible(task, state):
+            break
+        if _p_value(task, largest, larger) >= task.limits.significance:
+            break
+        models, largest = [*models, *further], larger
+    return models, largest
 
 
 def _smallest_accepted(task: _Task, candidates: list[_Candidate], loss: LossName) -> CameraFit:
@@ -282,7 +315,7 @@ def _starting_state(task: _Task, free_parameters: FreeParameters, f: float, aspe
     """Return the state of a virtual camera in units of the image's radius, about its middle or the known centre."""
     rotations, translations = poses_from_homographies(task.homography_fit.homographies, f, aspect, v)
     square = f * f + float(v @ v)
-    values = np.zeros(11)
+    values = np.zeros(len(FIT_PARAMETERS))
     values[:6] = [f * task.radius, aspect, *(v * task.radius + task.origin), *task.origin]
     if not free_parameters.tilt and free_parameters.centre:
         values[4:6] = values[2:4]
@@ -299,7 +332,7 @@ def _fit_from_starts(task: _Task, model: str) -> _Candidate:
     free_parameters = task.free_parameters(model)
     best: _Candidate | None = None
     for start in _starting_states(task, free_parameters):
-        tried = _minimise_loss(task, _Candidate(model, free_parameters, start, task.loss))
+        tried = _minimise_loss(task, _Candidate(task.views, model, free_parameters, start, task.loss))
         if not np.isfinite(tried.state.cost) or not _is_invertible(task, tried.state):
             continue
         if best is None or tried.state.cost < best.state.cost:
@@ -362,14 +395,18 @@ def _fit_smaller_model(task: _Task, model: str, largest: _Candidate) -> _Candida
     if not state.converged:
         cold = adjust(task.views, free_parameters, next(_starting_states(task, free_parameters)), largest.loss)
         state = min(state, cold, key=lambda end: end.cost)
-    return _Candidate(model, free_parameters, state, largest.loss)
+    return _Candidate(task.views, model, free_parameters, state, largest.loss)
 
 
 def _result(task: _Task, chosen: _Candidate, alternatives: tuple[CameraAlternative, ...]) -> CameraFit:
     """Return the result of the chosen fit, with covariances and warnings."""
     state, free_parameters = chosen.state, chosen.free_parameters
     noise = residual_sigma(task.views, free_parameters, state, chosen.loss)
-    covariance, pose_covariance, focus = covariances(task.views, free_parameters, state, chosen.loss, task.sigma)
+    correlated = chosen.correlated
+    is_correlated = correlated.is_correlated(task.limits.lack_of_fit_significance)
+    covariance, pose_covariance, focus = covariances(
+        task.views, free_parameters, state, chosen.loss, task.sigma, correlated if is_correlated else None
+    )
     if task.focal_length is not None:
         focus = 0.0
     errors = residuals(task.views, state)
@@ -384,6 +421,9 @@ def _result(task: _Task, chosen: _Candidate, alternatives: tuple[CameraAlternati
         sigma_px=noise if task.sigma is None else task.sigma,
         residuals=_unpacked(task, errors),
         iterations=state.iterations,
+        lack_of_fit=correlated.lack_of_fit,
+        view_p_value=correlated.view_p_value,
+        error_model="correlated" if is_correlated else "independent",
         alternatives=alternatives,
     )
     if not determines_focal_length(fit, focus, converged=state.converged, limits=task.limits):
@@ -421,16 +461,48 @@ def _unpacked(task: _Task, errors: Floats) -> tuple[Floats, ...]:
 
 
 def _p_value(task: _Task, small: _Candidate, large: _Candidate) -> float:
-    """Return the p-value of the F test of a model against a larger one."""
+    """Return the p-value of a model against a larger one.
+
+    The F test assumes independent errors. If the residuals of the larger model are correlated, Wald's test compares
+    its further parameters with their covariance for correlated errors. Whether there is a lens at all remains a
+    question for the F test, and so does everything with too few views for a covariance by view.
+    """
     additional = large.free_parameters.count - small.free_parameters.count
     if additional == 0:
         return 1.0
+    by_view = len(task.masks) >= MIN_VIEWS and bool(small.free_parameters.coefficients)
+    if by_view and large.correlated.is_correlated(task.limits.lack_of_fit_significance):
+        return _wald_p_value(task, small, large)
     free = task.views.coordinates - large.free_parameters.count - 6 * len(task.masks)
     if free <= 0:
         return 1.0
     rise = max(small.state.cost - large.state.cost, 0.0) / additional
     noise = residual_variance_factor(task.views, large.free_parameters, large.state, large.loss)
     return float(fdtrc(additional, free, rise / max(noise, _EXACT_PX**2)))
+
+
+def _wald_p_value(task: _Task, small: _Candidate, large: _Candidate) -> float:
+    """Return the p-value of Wald's test of the further parameters of the larger model, with errors by view.
+
+    The smooth field in the image is not part of these errors: further terms of the lens may describe it.
+    """
+    free_parameters = large.free_parameters
+    covariance = free_covariance(task.views, free_parameters, large.state, large.loss, task.sigma, large.correlated)
+    values = large.state.values.copy()
+    derivative, of_small = free_parameters.derivative(values), small.free_parameters.derivative(values)
+    # A tilt moves v away from the centre; a known f' makes f follow from both.
+    values[2:4] -= values[4:6]
+    values[4:6] = 0.0
+    if task.focal_length is not None:
+        derivative[0] = of_small[0] = 0.0
+    # Directions of the coordinates that the larger model can move and the smaller one cannot.
+    basis = np.linalg.qr(of_small)[0]
+    vectors, sizes, _ = np.linalg.svd(derivative - basis @ (basis.T @ derivative))
+    further = vectors[:, : np.count_nonzero(sizes > _SINGULAR * sizes[0])].T
+    effect = further @ derivative
+    shift = further @ values
+    statistic = float(shift @ np.linalg.solve(effect @ covariance @ effect.T, shift)) / len(further)
+    return float(fdtrc(len(further), len(task.masks) - 1, statistic))
 
 
 def _alternative(task: _Task, other: _Candidate, p_value: float, chosen: FitState) -> CameraAlternative:

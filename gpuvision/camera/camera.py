@@ -135,7 +135,12 @@ class Camera:
         return self._table(real, direction, source, target, self._principal_region)
 
     def packed_correction(
-        self, real: npt.DTypeLike, first: npt.ArrayLike, pitch: npt.ArrayLike, unit: npt.ArrayLike, region: Region
+        self,
+        real: npt.DTypeLike,
+        first: npt.ArrayLike,
+        pitch: npt.ArrayLike,
+        unit: npt.ArrayLike,
+        region: Region | None = None,
     ) -> npt.NDArray[Any]:
         """Return the table of ``camera_correction`` in ``kernels/common/camera.h`` for other coordinates than pixels.
 
@@ -147,8 +152,9 @@ class Camera:
             Measured coordinates of the kernel: ``(column, row) = first + pitch * coordinate``.
         unit : (2,) array_like
             Units of the corrections that the focal lengths of the table give, columns and rows [px].
-        region : ((column, column), (row, row))
-            Region of the sensor that is measured [px].
+        region : ((column, column), (row, row)), optional
+            Region of the sensor that is measured [px]; positions outside of it take more time. Default: a sensor that
+            the principal point halves.
 
         Returns
         -------
@@ -161,7 +167,7 @@ class Camera:
         source[:2] /= pitch[:, None]
         source[:2, 2] -= first / pitch
         target[:2] /= unit[:, None]
-        return self._table(real, "undistort", source, target, region)
+        return self._table(real, "undistort", source, target, region or self._principal_region)
 
     def _table(
         self, real: npt.DTypeLike, direction: Direction, source: Float64, target: Float64, region: Region
@@ -190,7 +196,7 @@ class Camera:
         """Return CAMERA_STEPS for ``camera_undistort``: Newton steps after which most pixels have converged."""
         return _inverse_start(self, self._principal_region).newton_steps(real)
 
-    def correction_defines(self, real: npt.DTypeLike, unit: float, region: Region) -> dict[str, Define]:
+    def correction_defines(self, real: npt.DTypeLike, unit: float, region: Region | None = None) -> dict[str, Define]:
         """Return the defines of ``kernels/common/camera.h`` for ``camera_correction``.
 
         Parameters
@@ -200,10 +206,10 @@ class Camera:
         unit : float
             Unit of the corrections [px]. If a number of steps is known to leave errors below a quarter of the unit's
             rounding in the whole region, the kernel takes these steps, often none, without a test.
-        region : ((column, column), (row, row))
-            Region of the sensor that is measured [px].
+        region : ((column, column), (row, row)), optional
+            As for `packed_correction`.
         """
-        start = _inverse_start(self, region)
+        start = _inverse_start(self, region or self._principal_region)
         largest_focal = max(self.matrix[0][0], self.matrix[1][1])
         sure = start.sure_steps(_SHARE_OF_ROUNDING * float(np.finfo(np.dtype(real)).eps) * unit / largest_focal)
         steps = start.newton_steps(real) if sure is None else sure
@@ -288,6 +294,11 @@ class Camera:
         focal = np.diag(self.matrix)[:2]
         slopes: Float64 = focal[:, None] * np.linalg.inv(tilt @ lens_jacobian) / focal
         return slopes
+
+    @property
+    def distorts(self) -> bool:
+        """Whether any coefficient differs from 0."""
+        return any(self.distortion)
 
     @property
     def invertible_radius(self) -> float:

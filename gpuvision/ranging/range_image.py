@@ -22,8 +22,10 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.host import (
+    Define,
     Device,
     FloatArray,
     Launch,
@@ -32,6 +34,7 @@ from gpuvision.host import (
     StatusArray,
     Variant,
     WorkSize,
+    flags,
     round_up,
     type_defines,
 )
@@ -113,11 +116,13 @@ class RotatingTable(NamedTuple):
     e3: npt.ArrayLike
     position_origin: float
     sample_origin: float
-    scale: float
+    position_scale: float
+    sample_scale: float
     horizon: float
     normal: npt.ArrayLike
     reach: npt.ArrayLike
     lens: npt.ArrayLike
+    camera: npt.ArrayLike
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,16 +202,15 @@ class StraightTransport:
         """Number of profile arrays that `RangeImage` takes: 2 (g and h)."""
         return 2
 
-    @property
-    def defines(self) -> dict[str, None]:
-        """Build options of ``kernels/range_image/range_image.cl`` for this geometry."""
+    def defines(self, real: npt.DTypeLike) -> dict[str, Define]:
+        """Return the options of ``kernels/range_image/range_image.cl`` for a kernel with the real type ``real``."""
         return {} if self.bend is None else {"SHEET_BENT": None}
 
-    def packed(self) -> npt.NDArray[np.float64]:
-        """Return the part of the kernel's parameter table after the limits."""
+    def packed(self, real: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
+        """Return the part of the kernel's parameter table after the limits, of type ``real``."""
         straight = StraightTable(origin=self.origin, e1=self.g_axis, e2=self.h_axis, e3=self.direction)
         if self.bend is None:
-            return np.hstack(straight)
+            return np.hstack(straight).astype(real)
         # The kernel's terms and normal are in units of the distance of the pinhole.
         distance = self.bend.pinhole[2]
         bent = BentTable(
@@ -214,7 +218,7 @@ class StraightTransport:
             pinhole=self.bend.pinhole[:2],
             across=distance * np.cross(self.g_axis, self.h_axis),
         )
-        return np.hstack([*straight, *bent])
+        return np.hstack([*straight, *bent]).astype(real)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, lists and tables, as in a TOML file."""
@@ -248,10 +252,13 @@ class RotatingSheet:
 
     Parameters
     ----------
-    focal_length_px : float
-        Focal length [px], positive.
-    principal_point_px : (column, row)
-        Image of the optical axis [px]; a region of interest shifts it.
+    camera : Camera, optional
+        Calibrated camera, with its distortion and the tilt of its sensor; `Camera.in_window` gives the camera of a
+        region of interest. Without it ``focal_length_px`` and ``principal_point_px`` are required.
+    focal_length_px : float, optional
+        Focal length of a camera that is not calibrated [px], positive.
+    principal_point_px : (column, row), optional
+        Image of its optical axis [px]; a region of interest shifts it.
     axis_point, axis_direction : (3,) array_like
         A point [m] on the axis of rotation and the direction of the axis, in the camera frame.
     sheet_normal : (3,) array_like
@@ -265,7 +272,7 @@ class RotatingSheet:
         Image axis along which the samples of a profile run, default ``"rows"``: one sample per row, the position is a
         column (a vertical line). ``"columns"``: one sample per column, the position is a row.
     lens : Lens, optional
-        Radial lens distortion, corrected in the positions; ``None`` for a pinhole camera.
+        Radial lens distortion of a camera that is not calibrated, corrected in the positions.
     scene_axes : (3, 3) array_like
         Axes x, y and z of the scene in the camera frame, orthonormal: the rows of the rotation camera -> scene.
     scene_origin : (3,) array_like
@@ -276,15 +283,17 @@ class RotatingSheet:
     Raises
     ------
     ValueError
-        A number is not finite or out of its range, the axes are not orthonormal, or the normal of the sheet lies along
-        the axis, so that turning does not move the sheet.
+        A number is not finite or out of its range, the axes are not orthonormal, the normal of the sheet lies along the
+        axis, so that turning does not move the sheet, or a camera is given together with a focal length, a principal
+        point or a lens.
     """
 
-    focal_length_px: float
-    principal_point_px: tuple[float, float]
     axis_point: Vector
     axis_direction: Vector
     sheet_normal: Vector
+    camera: Camera | None = None
+    focal_length_px: float | None = None
+    principal_point_px: tuple[float, float] | None = None
     sheet_offset: float = 0.0
     first_angle: float = 0.0
     angle_step: float | None = None
@@ -295,18 +304,40 @@ class RotatingSheet:
     horizon: float = 1e-4
 
     def __post_init__(self) -> None:
-        for name in ("focal_length_px", "sheet_offset", "first_angle", "horizon"):
+        self._check_camera()
+        for name in ("sheet_offset", "first_angle", "horizon"):
             object.__setattr__(self, name, finite(getattr(self, name), f"RotatingSheet.{name}"))
-        for name in ("focal_length_px", "horizon"):
-            if getattr(self, name) <= 0.0:
-                raise ValueError(f"RotatingSheet.{name} is {getattr(self, name)}, expected a number above 0")
+        if self.horizon <= 0.0:
+            raise ValueError(f"RotatingSheet.horizon is {self.horizon}, expected a number above 0")
         if self.angle_step is not None:
             object.__setattr__(self, "angle_step", finite(self.angle_step, "RotatingSheet.angle_step"))
         if self.along not in ("rows", "columns"):
             raise ValueError(f"RotatingSheet.along is {self.along!r}, expected 'rows' or 'columns'")
-        point = numbers(self.principal_point_px, (2,), "RotatingSheet.principal_point_px (column, row)")
-        object.__setattr__(self, "principal_point_px", point)
         self._check_directions()
+
+    def _check_camera(self) -> None:
+        pinhole = (self.focal_length_px, self.principal_point_px)
+        if self.camera is not None:
+            if (*pinhole, self.lens) != (None, None, None):
+                raise ValueError(
+                    "RotatingSheet has a camera and focal_length_px, principal_point_px or lens; the camera has them"
+                )
+            return
+        if None in pinhole:
+            raise ValueError("RotatingSheet needs a camera, or focal_length_px and principal_point_px")
+        focal = finite(self.focal_length_px, "RotatingSheet.focal_length_px")
+        if focal <= 0.0:
+            raise ValueError(f"RotatingSheet.focal_length_px is {focal}, expected a number above 0")
+        point = numbers(self.principal_point_px, (2,), "RotatingSheet.principal_point_px (column, row)")
+        object.__setattr__(self, "focal_length_px", focal)
+        object.__setattr__(self, "principal_point_px", point)
+
+    def _intrinsics(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return the focal lengths and the principal point of columns and rows [px]."""
+        if self.camera is not None:
+            matrix = np.array(self.camera.matrix)
+            return np.diag(matrix)[:2], matrix[:2, 2]
+        return np.full(2, self.focal_length_px, dtype=np.float64), np.array(self.principal_point_px)
 
     def _check_directions(self) -> None:
         for name in ("axis_point", "scene_origin"):
@@ -342,19 +373,25 @@ class RotatingSheet:
         """Number of profile arrays that `RangeImage` takes: 1 (the position)."""
         return 1
 
-    @property
-    def defines(self) -> dict[str, None]:
-        """Build options of ``kernels/range_image/range_image.cl`` for this geometry."""
-        return {"GEOMETRY_ROTATING": None} | ({} if self.lens is None else self.lens.defines)
+    def defines(self, real: npt.DTypeLike) -> dict[str, Define]:
+        """Return the options of ``kernels/range_image/range_image.cl`` for a kernel with the real type ``real``."""
+        options: dict[str, Define] = {"GEOMETRY_ROTATING": None}
+        if self.lens is not None:
+            options |= self.lens.defines
+        if self.camera is not None and self.camera.distorts:
+            # Normalised coordinates are corrected: their unit is the focal length.
+            options |= self.camera.correction_defines(real, min(self._intrinsics()[0]))
+            options |= flags(SAMPLES_ARE_COLUMNS=self.along == "columns")
+        return options
 
-    def packed(self) -> npt.NDArray[np.float64]:
-        """Return the part of the kernel's parameter table after the limits."""
+    def packed(self, real: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
+        """Return the part of the kernel's parameter table after the limits, of type ``real``."""
         # The kernel's coordinates are (position, sample) instead of (column, row).
         order = [0, 1, 2] if self.along == "rows" else [1, 0, 2]
         to_scene, normals = np.array(self.scene_axes), self.normals()
         reach = normals @ np.array(self.axis_point) + self.sheet_offset * np.array([1.0, 0.0, 0.0])
-        middle = np.array(self.principal_point_px)[order[:2]]
-        scale = 1.0 / self.focal_length_px
+        focal, centre = (each[order[:2]] for each in self._intrinsics())
+        scale = 1.0 / focal
         lens = self.lens if self.lens is None or self.along == "rows" else self.lens.swapped()
         e1, e2, e3 = to_scene.T[order]
         table = RotatingTable(
@@ -362,22 +399,30 @@ class RotatingSheet:
             e1=e1,
             e2=e2,
             e3=e3,
-            position_origin=middle[0],
-            sample_origin=middle[1],
-            scale=scale,
+            position_origin=centre[0],
+            sample_origin=centre[1],
+            position_scale=scale[0],
+            sample_scale=scale[1],
             horizon=self.horizon,
             normal=normals[:, order].ravel(),
             reach=reach,
-            lens=np.empty(0) if lens is None else lens.packed(middle.tolist(), scale),
+            lens=np.empty(0) if lens is None else lens.packed(centre.tolist(), scale[0]),
+            camera=np.empty(0) if self.camera is None else self._correction(real, self.camera),
         )
-        return np.hstack(table)
+        return np.hstack(table).astype(real)
+
+    def _correction(self, real: npt.DTypeLike, camera: Camera) -> npt.NDArray[Any]:
+        """Return the table of ``camera_correction`` for normalised coordinates; empty without distortion."""
+        if not camera.distorts:
+            return np.empty(0)
+        return camera.packed_correction(real, first=(0.0, 0.0), pitch=(1.0, 1.0), unit=self._intrinsics()[0])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists, as in a TOML file."""
         table: dict[str, Any] = {}
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
-            if isinstance(value, Lens):
+            if isinstance(value, Lens | Camera):
                 table[name] = value.to_dict()
             elif value is not None:
                 table[name] = np.array(value).tolist() if isinstance(value, tuple) else value
@@ -385,17 +430,19 @@ class RotatingSheet:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> RotatingSheet:
-        """Build a rotating sheet from a table; its keys are names of parameters, and the lens is a table.
+        """Build a rotating sheet from a table; its keys are names of parameters; lens and camera are tables.
 
         Raises
         ------
         TypeError, ValueError
             A key is unknown or missing, or a value has the wrong type or range.
         """
-        required = ("focal_length_px", "principal_point_px", "axis_point", "axis_direction", "sheet_normal")
+        required = ("axis_point", "axis_direction", "sheet_normal")
         values = dict(check_keys(table, cls.__dataclass_fields__, required, "rotating sheet"))
         if "lens" in values:
             values["lens"] = Lens.from_dict(values["lens"])
+        if "camera" in values:
+            values["camera"] = Camera.from_dict(values["camera"])
         return cls(**values)
 
 
@@ -450,7 +497,7 @@ class RangeImage(VisionOperation[RangePoints]):
         # Finite limits exclude infinite results by the same comparisons.
         largest = np.finfo(np.dtype(real)).max
         limits = np.clip(np.array(self.limits).T.ravel(), -largest, largest)
-        return np.concatenate([limits, self.geometry.packed()]).astype(real)
+        return np.concatenate([limits.astype(real), self.geometry.packed(real)])
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -469,6 +516,6 @@ class RangeImage(VisionOperation[RangePoints]):
             work=work,
             more_inputs=[*more_coordinates, ((profiles,), dtype), (shape, np.dtype(np.uint8))],
             outputs=build.outputs({"x": shape, "y": shape, "z": shape, "status": shape}),
-            defines={**self.geometry.defines, **type_defines("INPUT", dtype, 16)},
+            defines={**self.geometry.defines(build.real), **type_defines("INPUT", dtype, 16)},
             arguments=[self.packed(build.real), np.uint32(samples)],
         )

@@ -173,4 +173,4 @@ def check_orthonormal(axes: Sequence[npt.ArrayLike], what: str) -> None:
     """
     matrix = np.array(axes, dtype=np.float64)
     if np.max(np.abs(matrix @ matrix.T - np.eye(len(matrix)))) > _ORTHONORMAL:
-        raise ValueError(f"{what} are not orthonormal vectors")
+        raise ValueError(f"{what} are not {'two' if len(matrix) == 2 else 'three'} orthonormal vectors")

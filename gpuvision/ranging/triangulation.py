@@ -152,7 +152,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         options: dict[str, Define] = {} if self.covariance is None else {"SHEET_COVARIANCE": None}
         if self.lens is not None:
             options |= self.lens.defines
-        if self.camera is not None and any(self.camera.distortion):
+        if self.camera is not None and self.camera.distorts:
             _, half = self._centre_and_half_extent()
             options |= self.camera.correction_defines(real, float(half[0]), self._image_region)
             options |= flags(SHEET_ROWS=self.along == "rows")
@@ -181,7 +181,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         if self.sensor_lens is not None:
             # The two scales differ by a rounding only, which moves a distorted point by less than a rounding.
             lens = self.sensor_lens.packed(start, 1.0 / half[0])
-        if self.camera is not None and any(self.camera.distortion):
+        if self.camera is not None and self.camera.distorts:
             to_image = [1, 0] if self.along == "columns" else [0, 1]
             camera = self.camera.packed_correction(
                 real, first[to_image], pitch[to_image], (pitch / scale)[to_image], self._image_region

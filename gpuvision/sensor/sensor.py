@@ -219,9 +219,7 @@ class Sensor:
         )
         axes = SampleAxes() if is_rotating else _axes(top.optional_section("axes"))
         optics = read_optics(top, kind, frame, along, axes)
-        if is_rotating and optics.camera is not None:
-            raise top.error("[camera] goes with a straight transport; a rotating sheet takes [lens]")
-        transport, encoder = read_transport(moving, optics.lens, along, is_rotating=is_rotating)
+        transport, encoder = read_transport(moving, optics, along, is_rotating=is_rotating)
         if not is_rotating:
             region = _region(kind, top, frame, along, axes, readout)
             sheet, bend = read_triangulation(top.section("triangulation"), optics, region, along)

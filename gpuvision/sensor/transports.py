@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.lens import Lens
 from gpuvision.formats.encoder_file import read_encoder
 from gpuvision.ranging.encoder import EncoderStatistics, not_advancing
 from gpuvision.ranging.range_image import RotatingSheet, StraightTransport, Vector
 from gpuvision.ranging.triangulation import Along
 from gpuvision.schema import Section
+from gpuvision.sensor.optics import Optics
 
 Transport = StraightTransport | RotatingSheet
 
@@ -59,7 +59,7 @@ class Encoder:
 
 
 def read_transport(
-    table: Section, lens: Lens | None, along: Along, *, is_rotating: bool
+    table: Section, optics: Optics, along: Along, *, is_rotating: bool
 ) -> tuple[Transport, Encoder | None]:
     """Read the table ``[transport]``.
 
@@ -67,8 +67,8 @@ def read_transport(
     ----------
     table : Section
         The table; its key ``kind`` was read.
-    lens : Lens or None
-        Lens of the camera, in pixels, for a rotating sheet.
+    optics : Optics
+        Camera, or lens in pixels, for a rotating sheet.
     along : {"columns", "rows"}
         Image axis along which the samples of a profile run.
     is_rotating : bool
@@ -87,7 +87,7 @@ def read_transport(
     RecordingError
         The encoder file cannot be read.
     """
-    made = _rotating(table, lens, along) if is_rotating else _straight(table)
+    made = _rotating(table, optics, along) if is_rotating else _straight(table)
     table.finish()
     return made
 
@@ -113,17 +113,20 @@ def _straight(table: Section) -> tuple[StraightTransport, Encoder | None]:
     return transport, encoder
 
 
-def _rotating(table: Section, lens: Lens | None, along: Along) -> tuple[RotatingSheet, Encoder | None]:
-    column, row = table.numbers("principal_point_px", "pixel", (2,))
+def _rotating(table: Section, optics: Optics, along: Along) -> tuple[RotatingSheet, Encoder | None]:
+    pinhole: dict[str, Any] = {}
+    if optics.camera is None:
+        pinhole["focal_length_px"] = table.number("focal_length_px", "pixel", above=0.0)
+        pinhole["principal_point_px"] = table.numbers("principal_point_px", "pixel", (2,))
     identity = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     first_angle = table.number("first_angle", "rad", at_least=-2 * math.pi, at_most=2 * math.pi)
     encoder = _encoder(table, first_angle, "radians_per_count", "rad per count", "angle_step")
     limits: dict[str, Any] = {"above": -math.pi, "below": math.pi}
     sheet = RotatingSheet(
         along=along,
-        lens=lens,
-        focal_length_px=table.number("focal_length_px", "pixel", above=0.0),
-        principal_point_px=(column, row),
+        lens=optics.lens,
+        camera=optics.camera,
+        **pinhole,
         axis_point=read_vector(table, "axis_point", "m"),
         axis_direction=read_vector(table, "axis_direction", ""),
         sheet_normal=read_vector(table, "sheet_normal", ""),

@@ -13,12 +13,13 @@
 //          given       (profiles, samples) uchar: status flags of the readout
 //          table       RangeTable
 // Outputs: x, y, z     (profiles, samples) real [m]; NaN under a flag other than SATURATED and AMBIGUOUS
-// status      (profiles, samples) uchar: the given flags, and NOT_FINITE, NOT_INVERTIBLE, HORIZON, OUT_OF_RANGE Build
-// options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, SHEET_BENT, GEOMETRY_ROTATING, LENS, LENS_K2, LENS_K3, LENS_K4,
-//          PAST_CACHES, VECTOR_VARIANT.
+//          status      (profiles, samples) uchar: the given flags, and NOT_FINITE, NOT_INVERTIBLE, HORIZON, OUT_OF_RANGE
+// Build options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, SHEET_BENT, GEOMETRY_ROTATING, LENS, LENS_K2,
+//          LENS_K3, LENS_K4, CAMERA and its options (common/camera.h) with SAMPLES_ARE_COLUMNS where the samples run
+//          along the columns axis of the image, PAST_CACHES, VECTOR_VARIANT.
 // Work:    vector variant: global size (strips of SAMPLES_PER_STRIP samples, profiles), the last strip up to twice as
-// long.
-//          Otherwise: one work-item per sample, (samples, profiles).
+//          long. Otherwise: one work-item per sample, (samples, profiles).
+#include "common/camera.h"
 #include "common/lens.h"
 #include "common/load.h"
 #include "common/status.h"
@@ -40,12 +41,16 @@ typedef struct {
     real across[3];                   // normal of the plane, of length D [m]
 #endif
 #ifdef GEOMETRY_ROTATING
-    real position_origin, sample_origin, scale;  // a = (position - position_origin) scale, b = (sample - ...) scale
+    real position_origin, sample_origin;  // a = (position - position_origin) position_scale, b likewise
+    real position_scale, sample_scale;
     real horizon;                     // smallest n.r that counts
     real normal[9];                   // n = normal[0..2] + normal[3..5] cos(angle) + normal[6..8] sin(angle)
     real reach[3];                    // e + n.p, in the same way [m]
 #ifdef LENS
     real lens[7];                     // table of lens.h, for (a, b)
+#endif
+#ifdef CAMERA
+    real camera[63];                  // table of camera.h: pixels are positions and samples, the output is (a, b)
 #endif
 #endif
 } RangeTable;
@@ -87,13 +92,22 @@ static inline Pose pose_of(real angle, constant RangeTable *table) {
 }
 
 // Compute the point of a light position. `missed`: the ray does not meet the sheet; `folded`: beyond the fold of the
-// lens.
+// lens, or behind the tilted sensor.
 static inline void locate(reals position, reals sample, Pose pose, constant RangeTable *table, reals *x, reals *y,
                           reals *z, masks *missed, masks *folded) {
-    reals a = (position - table->position_origin) * table->scale;
-    reals b = (sample - table->sample_origin) * table->scale;
-#ifdef LENS
+    reals a = (position - table->position_origin) * table->position_scale;
+    reals b = (sample - table->sample_origin) * table->sample_scale;
+#if defined(LENS)
     *folded = mask_of(LANED(lens_undistort)(&a, &b, table->lens));
+#elif defined(CAMERA)
+    reals back_a, back_b;
+#ifdef SAMPLES_ARE_COLUMNS
+    *folded = LANED(camera_correction)(sample, position, table->camera, &back_b, &back_a);
+#else
+    *folded = LANED(camera_correction)(position, sample, table->camera, &back_a, &back_b);
+#endif
+    a += back_a;
+    b += back_b;
 #else
     *folded = 0;
 #endif

@@ -12,6 +12,7 @@ import pytest
 from hypothesis.extra import numpy as hnp
 
 from gpuvision import Device, Status
+from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
 from gpuvision.ranging.sheet import BentSheet
@@ -163,11 +164,11 @@ def test_points_of_a_bent_sheet_and_rays_that_miss_it(device):
 
 
 def test_a_wrong_bent_sheet_is_refused():
-    with pytest.raises(ValueError, match=r"g_axis and h_axis of a bent sheet are not orthonormal"):
+    with pytest.raises(ValueError, match=r"g_axis and h_axis of a bent sheet are not two orthonormal"):
         dataclasses.replace(BENT, h_axis=(math.tan(0.3), 0.0, 1.0))
     with pytest.raises(ValueError, match=r"pinhole lies in the mean plane"):
         BentSheet(terms=(0.1, 0.0, 0.0), pinhole=(0.1, 0.2, 0.0))
-    with pytest.raises(ValueError, match=r"from_pose: g_axis and h_axis are not orthonormal"):
+    with pytest.raises(ValueError, match=r"from_pose: g_axis and h_axis are not two orthonormal"):
         BentSheet.from_pose((0.1, 0.0, 0.0), origin=(0, 0, 1), g_axis=(1, 0, 0), h_axis=(0, 0.5, 0))
 
 
@@ -191,6 +192,48 @@ def test_a_rotating_sheet_meets_the_rays(device, rng, lens, along, dtype, varian
     made = RangePoints(*(np.where(edge, np.nan, each) for each in made[:3]), np.where(edge, 0, made.status))
     points[edge], status[edge] = np.nan, 0
     close(made, points, status, depth_tolerance(op, points, facing, dtype))
+
+
+TILTED_CAMERA = Camera(
+    matrix=((910.0, 0.0, 511.5), (0.0, 900.0, 380.25), (0.0, 0.0, 1.0)),
+    distortion=(-0.08, 0.03, 3e-4, -2e-4, *(0.0,) * 8, 0.2, -0.15),
+)
+CALIBRATED = dataclasses.replace(HEAD, focal_length_px=None, principal_point_px=None, camera=TILTED_CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "along", "variant"),
+    [(np.float32, "rows", "vector"), (np.float64, "columns", "vector"), (np.float32, "columns", "work_item")],
+)
+def test_a_rotating_sheet_before_a_calibrated_camera(device, rng, along, dtype, variant):
+    shape = (2, 760) if along == "rows" else (2, 1020)
+    position = rng.uniform(0, 1020 if along == "rows" else 760, shape).astype(dtype)
+    op = RangeImage(geometry=dataclasses.replace(CALIBRATED, along=along), variant=variant)
+    angles = np.array([-0.4, 0.3], dtype)
+    given = np.zeros(shape, np.uint8)
+    points, status, facing = expect_rotating(op, position, angles, given)
+    made = op(position, angles, given, device=device)
+    clear = np.abs(facing - op.geometry.horizon) > 1e-5
+    assert clear.mean() > 0.99
+    assert 0.3 < np.mean(status[clear] == 0) < 1.0
+    points[~clear], status[~clear] = np.stack(made[:3], -1)[~clear], made.status[~clear]
+    close(made, points, status, 2.0 * depth_tolerance(op, points, facing, dtype))
+
+
+def test_a_camera_without_distortion_is_the_pinhole(device, rng):
+    pinhole = Camera(matrix=((900.0, 0.0, 511.5), (0.0, 900.0, 380.25), (0.0, 0.0, 1.0)))
+    position, angles = rng.uniform(0, 1000, (3, 700)).astype(np.float32), np.array([-0.2, 0.0, 0.2], np.float32)
+    given = np.zeros(position.shape, np.uint8)
+    operations = [RangeImage(geometry=each) for each in (HEAD, dataclasses.replace(CALIBRATED, camera=pinhole))]
+    made, same = (each(position, angles, given, device=device) for each in operations)
+    for values, others in zip(made, same, strict=True):
+        np.testing.assert_array_equal(values, others)
+    folding = dataclasses.replace(TILTED_CAMERA, distortion=(-1.0, *(0.0,) * 13))
+    op = RangeImage(geometry=dataclasses.replace(CALIBRATED, camera=folding))
+    # The image of k1 = -1 ends at 2/3 of 3^-1/2; the samples are rows around the principal point.
+    position = 511.5 + 910.0 * np.array([[0.1, 0.3, 0.42, 2.0, np.nan, -np.inf]]).repeat(381, 0).T[:, -1:]
+    status = op(np.repeat(position, 381, 1), np.zeros(6), np.zeros((6, 381), np.uint8), device=device).status[:, -1]
+    assert status.tolist() == [0, 0, 128, 128, 8, 8]
 
 
 def test_a_point_of_the_scene_comes_back_from_where_the_camera_sees_it(device, rng):
@@ -327,6 +370,8 @@ def test_double_is_asked_for_by_precision(device):
         ({"along": "row"}, "expected 'rows' or 'columns'"),
         ({"scene_axes": 5}, r"scene_axes has shape \(\), expected \(3, 3\)"),
         ({"scene_axes": ((1, 0, 0), (0, 1, 0), (0, 1, 0))}, "not three orthonormal vectors"),
+        ({"camera": TILTED_CAMERA}, "has a camera and focal_length_px, principal_point_px or lens"),
+        ({"focal_length_px": None}, "needs a camera, or focal_length_px and principal_point_px"),
     ],
 )
 def test_a_wrong_rotating_sheet_is_refused(change, message):
@@ -365,7 +410,9 @@ def test_wrong_input_is_refused(device):
         op(g, transport, given, device=device)
 
 
-@pytest.mark.parametrize("geometry", [TILTED, BENT, dataclasses.replace(HEAD, lens=Lens(k1=1e-8, centre=(4.0, 5.0)))])
+@pytest.mark.parametrize(
+    "geometry", [TILTED, BENT, CALIBRATED, dataclasses.replace(HEAD, lens=Lens(k1=1e-8, centre=(4.0, 5.0)))]
+)
 def test_a_geometry_survives_its_table(geometry):
     assert type(geometry).from_dict(geometry.to_dict()) == geometry
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpuvision.reference.camera import undistort_pixels
 from gpuvision.reference.triangulation import is_beyond_fold, undistort
 
 SATURATED, OUT_OF_RANGE, NOT_FINITE, AMBIGUOUS, HORIZON, NOT_INVERTIBLE = 2, 4, 8, 16, 32, 128
@@ -109,7 +110,7 @@ def points_of_rotating_sheet(
     facing : numpy.ndarray
         Scalar product of the sheet's normal and the ray (x, y, 1), positive where the point is in front of the camera.
     folded : numpy.ndarray
-        Whether the pixel lies beyond the radius at which the lens polynomial folds.
+        Whether the pixel lies beyond the fold of the lens, or behind the tilted sensor.
     """
     profiles, samples = position.shape
     across = np.broadcast_to(np.arange(samples, dtype=np.float64), position.shape)
@@ -123,7 +124,13 @@ def points_of_rotating_sheet(
         folded = is_beyond_fold(pixel[..., 0], pixel[..., 1], *lens)
         pixel = np.stack(undistort(pixel[..., 0], pixel[..., 1], *lens), axis=-1)
     rays = np.ones((profiles, samples, 3))
-    rays[..., :2] = (pixel - geometry.principal_point_px) / geometry.focal_length_px
+    if geometry.camera is None:
+        rays[..., :2] = (pixel - geometry.principal_point_px) / geometry.focal_length_px
+    else:
+        (fx, _, cx), (_, fy, cy), _ = geometry.camera.matrix
+        ideal = undistort_pixels(pixel.reshape(-1, 2), geometry.camera.matrix, geometry.camera.distortion)
+        folded = np.isnan(ideal[:, 0]).reshape(position.shape)
+        rays[..., :2] = (ideal.reshape(pixel.shape) - (cx, cy)) / (fx, fy)
 
     points, facing = np.empty_like(rays), np.empty(position.shape)
     for profile, angle in enumerate(angles.astype(np.float64)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import tomllib
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -522,12 +523,23 @@ def test_the_bend_of_a_sheet_reaches_the_transport() -> None:
     assert bent.readout.triangulation == flat.readout.triangulation
     assert isinstance(flat.transport, StraightTransport)
     assert flat.transport.bend is None
-    with pytest.raises(DescriptionError, match=r"triangulation: .* g_axis and h_axis are not orthonormal"):
+    with pytest.raises(DescriptionError, match=r"triangulation: .* g_axis and h_axis are not two orthonormal"):
         with_camera(
             TILTED_CAMERA.to_dict(), triangulation=SHEET_POSE | {"bend": [0.2, 0.1, 0.3], "g_axis": [1.0, 0.1, 0.0]}
         )
     with pytest.raises(DescriptionError, match=r"unknown key 'triangulation\.bend'"):
         sensor_of(changed("camera_line", triangulation__bend=[0.2, 0.1, 0.3]))
+
+
+def test_a_calibrated_camera_before_a_rotating_sheet() -> None:
+    table = changed("corner_scene", transport__focal_length_px=None, transport__principal_point_px=None)
+    shipped = Sensor.load("corner_scene").transport
+    assert isinstance(shipped, RotatingSheet)
+    sensor = sensor_of(table | {"camera": TILTED_CAMERA.to_dict()})
+    expected = replace(shipped, focal_length_px=None, principal_point_px=None, camera=TILTED_CAMERA)
+    assert sensor.transport == expected
+    with pytest.raises(DescriptionError, match=r"unknown key 'transport\.focal_length_px'"):
+        sensor_of(changed("corner_scene") | {"camera": TILTED_CAMERA.to_dict()})
 
 
 def test_errors_of_a_calibrated_camera(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import subprocess
@@ -48,13 +49,14 @@ def tests_of(fault: Fault, budget: float) -> list[str]:
     The recorded tests run the lines of the fault and take up to `budget` seconds together. Lines that run only at
     import have no recorded tests; for them, take all tests that run any line of the file. For a kernel, take the test
     file of its name and the tests of the operations that launch it; for a header of many kernels, at most `_MAX_FILES`
-    files.
+    files, the first file of each operation before the second ones.
     """
     path = ROOT / fault.file
     is_code = path.suffix == ".py"
     places = [(path, fault.lines(path.read_text()))] if is_code else list(_launches(fault.file))
     own = [] if is_code else [str(file.relative_to(ROOT)) for file in _tests() if file.name == f"test_{path.stem}.py"]
-    others = [file for files in dict.fromkeys(_test_files(file) for file, _ in places) for file in files]
+    by_operation = itertools.zip_longest(*dict.fromkeys(_test_files(file) for file, _ in places))
+    others = [file for files in by_operation for file in files if file is not None]
     files = list(dict.fromkeys([*own, *others]))[:_MAX_FILES]
     chosen: list[str] = []
     if budget:

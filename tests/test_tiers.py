@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gpuvision.host import Device
-from tiers import collected_items, device_of, function_of, select_fast
+from tiers import collected_items, device_of, function_of, select_fast, without_other_variants
 
 ROOT = Path(__file__).resolve().parents[1]
 PLANTED = tomllib.loads((ROOT / "tests" / "mutants" / "planted.toml").read_text())["fault"]
@@ -25,3 +25,20 @@ def test_the_fast_tier_has_each_killing_test(request: pytest.FixtureRequest, nam
     chosen = named.intersection(select_fast(of_file, best).chosen)
     # A run of other files collects none of them.
     assert not named or any(device_of(item) in (None, *best) for item in chosen)
+
+
+def test_the_fast_tier_holds_each_value_of_each_parameter(request: pytest.FixtureRequest) -> None:
+    best = Device.all()[:1]
+    items = [item for item in collected_items(request.session) if device_of(item) in best]
+    fast = [item for item in items if item.get_closest_marker("slow") is None]
+    expected = _values(list(without_other_variants(fast)))
+    assert _values(select_fast(items, best).chosen) == expected
+
+
+def _values(items: list[pytest.Item]) -> set[tuple[object, ...]]:
+    return {
+        (item.parent, function_of(item), name, repr(value))
+        for item in items
+        if hasattr(item, "callspec")
+        for name, value in item.callspec.params.items()
+    }

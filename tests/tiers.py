@@ -63,7 +63,7 @@ def select_fast(items: Sequence[pytest.Item], best: Collection[Device]) -> Selec
     functions of a file, cases beyond a covering design and, on all devices but the best, tests beyond the smoke set.
     """
     fast = [item for item in items if item.get_closest_marker("slow") is None]
-    designed = set(_designed(list(_of_variants(fast))))
+    designed = set(_designed(list(without_other_variants(fast))))
     selection = Selection([], [], set())
     seen = set()
     for item in items:
@@ -85,8 +85,8 @@ def collected_items(session: pytest.Session) -> list[pytest.Item]:
     return [*session.items, *session.config.stash.get(LEFT, [])]
 
 
-def _of_variants(items: Sequence[pytest.Item]) -> Iterator[pytest.Item]:
-    """Yield all tests but those of a device's other kernel variant beyond the first functions of each file.
+def without_other_variants(items: Sequence[pytest.Item]) -> Iterator[pytest.Item]:
+    """Yield the tests but those of a device's other kernel variant beyond the first functions of each file.
 
     A function without cases of the device's default variant keeps its cases.
     """
@@ -112,19 +112,44 @@ def _designed(items: Sequence[pytest.Item], *, pairs: bool = False) -> Iterator[
 
     Most of a kernel test's time is compilation, once for each kernel variant, dtype and option. Of a test with two
     parameters the design holds each value, of a test with more each pair of values; the device is not a parameter.
-    With `pairs`, and in ``tests/host``, which compiles little, it holds each pair in both cases.
+    Parameters that one mark lists together count as one, if the design is smaller then. With `pairs`, and in
+    ``tests/host``, which compiles little, it holds each pair of values in all cases.
     """
     functions: dict[Any, list[pytest.Item]] = {}
     for item in items:
         functions.setdefault((item.parent, function_of(item), device_of(item)), []).append(item)
     for (_, _, device), cases in functions.items():
-        parameters = [
-            {name: value for name, value in _parameters_of(item).items() if name != "device"} for item in cases
-        ]
-        varying = [name for name in parameters[0] if len({repr(each[name]) for each in parameters}) > 1]
-        strength = 1 if len(varying) == 2 and not (pairs or _is_of_host(cases[0])) else 2
-        is_product = device is not None and len(parameters[0]) > 1 and len(varying) > 1
-        yield from (cases[k] for k in (covering(parameters, strength) if is_product else range(len(cases))))
+        single = [{name: value for name, value in _parameters_of(item).items() if name != "device"} for item in cases]
+        if device is None or _varying(single) < 2:
+            yield from cases
+            continue
+        design = covering(single, 2)
+        if not (pairs or _is_of_host(cases[0])):
+            design = min(
+                (design, *(covering(each, 1) for each in (single, _joined(cases)) if _varying(each) == 2)), key=len
+            )
+        yield from (cases[k] for k in design)
+
+
+def _varying(cases: Sequence[Mapping[str, Any]]) -> int:
+    """Return the number of parameters that do not have the same value in all cases."""
+    return sum(len({repr(each[name]) for each in cases}) > 1 for name in cases[0])
+
+
+def _joined(items: Sequence[pytest.Item]) -> list[dict[str, Any]]:
+    """Return the parameters of each case, where the parameters of one ``parametrize`` mark are one."""
+    listed = [mark.args[0] for mark in items[0].iter_markers("parametrize")]
+    groups = [[name.strip() for name in (each.split(",") if isinstance(each, str) else each)] for each in listed]
+    group_of = {name: "-".join(group) for group in groups for name in group}
+    joined = []
+    for item in items:
+        case: dict[str, Any] = {}
+        for name, value in _parameters_of(item).items():
+            if name != "device":
+                key = group_of.get(name, name)
+                case[key] = (*case.get(key, ()), value)
+        joined.append(case)
+    return joined
 
 
 def _smoke_case(item: pytest.Item) -> tuple[Any, ...] | None:

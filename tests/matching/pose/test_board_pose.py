@@ -83,6 +83,26 @@ def test_rulers_lie_where_they_say() -> None:
 
 
 @VARIANTS
+def test_rulers_that_find_nothing(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    image, (rulers, lines) = picture(rng), board_rulers()
+    image[:120, 0:120] = 90
+    rulers[1, 2:] = np.nan
+    rulers[2, 1:] = np.nan
+    rulers[3, 0, :2] = [-50.0, 20.0]
+    result = operation(variant)(image, rulers, lines, device=device)
+    assert result.status == Status.OK
+    np.testing.assert_array_equal(result.edge_status[0], Status.LOW_SIGNAL)
+    np.testing.assert_array_equal(result.edge_status[1, 2:], Status.NOT_FINITE)
+    assert result.edge_status[3, 0] == Status.OUT_OF_RANGE
+    assert np.isnan(result.edges[0]).all()
+    assert np.isnan(result.residuals[0]).all()
+    # One edge is one row.
+    np.testing.assert_array_equal(np.isfinite(result.residuals[1:4]), [[True, True], [True, False], [True, True]])
+    assert not result.edge_weights[0].any()
+    assert (np.abs(error(result)) < 5.0 * np.sqrt(np.diag(result.covariance))).all()
+
+
+@VARIANTS
 def test_as_its_parts(device: Device, variant: Any, rng: np.random.Generator) -> None:
     image, (rulers, lines) = picture(rng), board_rulers()
     fix = operation(variant)
@@ -123,26 +143,6 @@ def test_covariance_is_what_is_measured(device: Device, variant: Any, rng: np.ra
     assert (ratio > 0.7).all()
     squares = np.einsum("bi,bij,bj->b", np.array(found), np.linalg.inv(covariance), np.array(found))
     assert squares.max() < 49.0
-
-
-@VARIANTS
-def test_rulers_that_find_nothing(device: Device, variant: Any, rng: np.random.Generator) -> None:
-    image, (rulers, lines) = picture(rng), board_rulers()
-    image[:120, 0:120] = 90
-    rulers[1, 2:] = np.nan
-    rulers[2, 1:] = np.nan
-    rulers[3, 0, :2] = [-50.0, 20.0]
-    result = operation(variant)(image, rulers, lines, device=device)
-    assert result.status == Status.OK
-    np.testing.assert_array_equal(result.edge_status[0], Status.LOW_SIGNAL)
-    np.testing.assert_array_equal(result.edge_status[1, 2:], Status.NOT_FINITE)
-    assert result.edge_status[3, 0] == Status.OUT_OF_RANGE
-    assert np.isnan(result.edges[0]).all()
-    assert np.isnan(result.residuals[0]).all()
-    # One edge is one row.
-    np.testing.assert_array_equal(np.isfinite(result.residuals[1:4]), [[True, True], [True, False], [True, True]])
-    assert not result.edge_weights[0].any()
-    assert (np.abs(error(result)) < 5.0 * np.sqrt(np.diag(result.covariance))).all()
 
 
 @VARIANTS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -86,21 +87,22 @@ def test_errors_are_those_promised(drawn: BoardFix, device: Device, rng: np.rand
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_wrong_pose_of_a_disturbed_board(
-    drawn: BoardFix, kind: str, device: Device, rng: np.random.Generator
+    drawn: BoardFix, kind: str, device: Device, rng: np.random.Generator, draws: Callable[[int, int], int]
 ) -> None:
+    count = draws(30, 60)
     board = replace(drawn, motion_px=5.0 if kind == "motion" else 0.0)
     pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else 4)]
-    fixes = board.fixes(pictures, 60, device, rng)
+    fixes = board.fixes(pictures, count, device, rng)
     if kind == "reversed":
         # Dark copper: no pose if bright copper is searched, all poses if dark copper is searched.
         assert not fixes.good.any()
-        fixes = board.fixes(pictures, 60, device, rng, polarity="rising")
+        fixes = board.fixes(pictures, count, device, rng, polarity="rising")
     # Boards on which few rulers determine a degree of freedom are refused in all images.
     assert np.mean(fixes.good) > (0.2 if kind in ("missing", "outliers") else 0.99)
     assert fixes.squares.max() < GROSS
     assert_as_promised(fixes.scatter / fixes.predicted, band(int(fixes.good.sum())))
     if kind == "motion":
-        assert_as_promised(fixes.scatter / board.chosen.sigmas, band(60))
+        assert_as_promised(fixes.scatter / board.chosen.sigmas, band(count))
 
 
 @pytest.mark.slow

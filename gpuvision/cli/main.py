@@ -35,6 +35,7 @@ def application() -> typer.Typer:
     from gpuvision.cli.calibrate import calibrate
     from gpuvision.cli.demo import demo
     from gpuvision.cli.devices import devices
+    from gpuvision.cli.inspect import inspect
     from gpuvision.cli.locate import locate
     from gpuvision.cli.locate_robot import locate_robot
     from gpuvision.cli.profile import profile
@@ -52,7 +53,19 @@ def application() -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback()(root)
-    for command in (scan, simulate, calibrate, undistort, select, locate, locate_robot, demo, devices, profile):
+    for command in (
+        scan,
+        simulate,
+        calibrate,
+        undistort,
+        select,
+        locate,
+        locate_robot,
+        inspect,
+        demo,
+        devices,
+        profile,
+    ):
         app.command()(command)
     return app
 

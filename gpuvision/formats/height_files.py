@@ -113,9 +113,7 @@ def read_heights(path: str | os.PathLike[str], scale: ImageScale | None = None) 
         return read_scaled_image(path, scale)
     if ending == ".npz":
         return _scanned_map(path)
-    if ending == ".csv":
-        return HeightMapFile(*read_gocator(path))
-    found = read_png16(path) if ending == ".png" else read_tiff(path)
+    found = {".csv": read_gocator, ".png": read_png16}.get(ending, read_tiff)(path)
     if found.grid is None:
         raise ReadError(f"{path}: states no grid; expected a height map with the size of its cells")
     return HeightMapFile(found.z, found.grid)

@@ -83,7 +83,7 @@ class BoardPlacement:
         """(2, 2) linear part of the transform from the board to the height map."""
         cos, sin = math.cos(self.theta), math.sin(self.theta)
         mirror = -1.0 if self.side == "bottom" else 1.0
-        return np.array([[cos, -sin], [sin, cos]]) * np.array([mirror, 1.0])
+        return np.array([[mirror * cos, -sin], [mirror * sin, cos]])
 
     def to_map(self, points: Float64) -> Float64:
         """Return points (..., 2) [m] of the board in the height map."""

@@ -232,7 +232,7 @@ def measure_deposits(
         correlated = _correlation_area(rings)
     else:
         correlated = finite(correlation_area, "correlation_area", minimum=1.0)
-    to_board = np.linalg.inv(placement.matrix)
+    to_board = np.asarray(np.linalg.inv(placement.matrix), np.float64)
     rows = [
         _measure(heights, sigmas, grid, aperture, window, surface, settings, correlated, to_board)
         for aperture, window, surface in zip(moved, windows, surfaces, strict=True)
@@ -293,7 +293,7 @@ def aperture_windows(apertures: Sequence[Aperture], grid: Grid, margin: float) -
     owner = np.zeros(grid.shape, np.int32)
     boxes = []
     for number, aperture in enumerate(apertures, 1):
-        rows, columns = _cells_of(aperture.bounds, grid, 0.0)
+        rows, columns = cells_of(aperture.bounds, grid, 0.0)
         inside = covered(aperture.shapes, x[columns], y[rows])
         owner[rows, columns][inside] = number
         low, high = aperture.bounds
@@ -306,7 +306,7 @@ def aperture_windows(apertures: Sequence[Aperture], grid: Grid, margin: float) -
             windows.append(None)
             continue
         # Cells up to twice the margin away: the nearest aperture of a cell within the margin is not farther.
-        rows, columns = _cells_of(aperture.bounds, grid, 2 * margin + 2 * max(grid.cell_x, grid.cell_y))
+        rows, columns = cells_of(aperture.bounds, grid, 2 * margin + 2 * max(grid.cell_x, grid.cell_y))
         near = owner[rows, columns]
         core = near == number
         distance, place = distance_transform_edt(near == 0, sampling=(grid.cell_y, grid.cell_x), return_indices=True)
@@ -315,7 +315,7 @@ def aperture_windows(apertures: Sequence[Aperture], grid: Grid, margin: float) -
     return windows
 
 
-def _cells_of(bounds: Float64, grid: Grid, margin: float) -> tuple[slice, slice]:
+def cells_of(bounds: Float64, grid: Grid, margin: float) -> tuple[slice, slice]:
     """Return the rows and columns whose centres lie in bounds (2, 2) [m] with a margin."""
     low, high = bounds[0] - margin, bounds[1] + margin
     first = max(math.ceil((low[0] - grid.left) / grid.cell_x), 0)
@@ -331,7 +331,7 @@ def _reference(
     """Return the surface through the board in a ring around an aperture, wider where it has too few cells."""
     ring = settings.ring
     for _ in range(_DOUBLINGS + 1):
-        rows, columns = _cells_of(aperture.bounds, grid, settings.margin + ring)
+        rows, columns = cells_of(aperture.bounds, grid, settings.margin + ring)
         row, column = np.nonzero(free[rows, columns])
         if len(row) >= settings.least_reference:
             x, y = grid.x[columns][column], grid.y[rows][row]
@@ -396,7 +396,7 @@ def _measure(
         return "holes", [*nothing, valid, level]
     share = np.zeros(part.shape)
     for each in strata:
-        share[used & each] = np.count_nonzero(each) / max(np.count_nonzero(used & each), 1)
+        share[used & each] = int(np.count_nonzero(each)) / max(int(np.count_nonzero(used & each)), 1)
     row, column = np.nonzero(used)
     x, y = grid.x[window.columns][column], grid.y[window.rows][row]
     weight, basis = share[used], surface.basis(x, y)

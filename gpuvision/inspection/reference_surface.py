@@ -33,8 +33,8 @@ class ReferenceSurface(NamedTuple):
         Covariance of the coefficients [m^2] for independent cells.
     scale
         Robust standard deviation of the cells about the surface [m].
-    count
-        Number of cells.
+    cells
+        Number of fitted cells.
     """
 
     centre: Float64
@@ -43,7 +43,7 @@ class ReferenceSurface(NamedTuple):
     coefficients: Float64
     covariance: Float64
     scale: float
-    count: int
+    cells: int
 
     def basis(self, x: Float64, y: Float64) -> Float64:
         """Return the terms of the polynomial (n, ...) at places [m]."""

@@ -16,25 +16,13 @@ _LEAST_FOR_CURVED = 10  # cells of a patch for a paraboloid, which has 6 coeffic
 
 
 class TopHeight(NamedTuple):
-    """Height of a top, its standard deviation for independent cells, and its place.
-
-    Attributes
-    ----------
-    height, sigma
-        Height and standard deviation, in the unit of the heights; NaN if no patch has enough cells.
-    row, column
-        Place of the top in cells.
-    """
+    """Height of a top, and its standard deviation for independent cells; NaN if no patch has enough cells."""
 
     height: float
     sigma: float
-    row: float
-    column: float
 
 
-def top_height(
-    z: Float64, allowed: npt.NDArray[np.bool_], sigma: Float64, half: int, *, reach: npt.NDArray[np.bool_] | None = None
-) -> TopHeight:
+def top_height(z: Float64, allowed: npt.NDArray[np.bool_], sigma: Float64, half: int) -> TopHeight:
     """Measure the height of the highest patch.
 
     The cells are split like the fields of a chessboard. The cells of one colour choose the place with the highest
@@ -52,30 +40,29 @@ def top_height(
         Standard deviations of the heights.
     half : int
         Half width of a patch in cells, 1 or more: it has (2 half + 1)^2 cells.
-    reach : numpy.ndarray, optional
-        bool, cells that a patch may read. Default: all.
 
     Returns
     -------
     TopHeight
     """
-    rows, columns = np.indices(z.shape)
-    valid = np.isfinite(z) if reach is None else np.isfinite(z) & reach
+    rows, columns = np.arange(z.shape[0])[:, None], np.arange(z.shape[1])[None, :]
+    valid = np.isfinite(z)
     dark = (rows + columns) % 2 == 0
     found = []
-    for choosing in (dark, ~dark):
+    for choosing in (dark, np.logical_not(dark)):
         place = _highest(z, valid & choosing, allowed, half)
         if place is None:
-            return TopHeight(math.nan, math.nan, math.nan, math.nan)
-        near = (np.abs(rows - place[0]) <= half) & (np.abs(columns - place[1]) <= half) & valid & ~choosing
-        weights = _evaluation_weights(rows[near] - place[0], columns[near] - place[1])
+            return TopHeight(math.nan, math.nan)
+        near = (
+            (np.abs(rows - place[0]) <= half) & (np.abs(columns - place[1]) <= half) & valid & np.logical_not(choosing)
+        )
+        row, column = np.nonzero(near)
+        weights = _evaluation_weights(row - place[0], column - place[1])
         if not len(weights):
-            return TopHeight(math.nan, math.nan, math.nan, math.nan)
-        found.append((weights @ z[near], float(np.sum((weights * sigma[near]) ** 2)), *place))
-    heights, variances, at_row, at_column = np.array(found).T
-    return TopHeight(
-        float(heights.mean()), math.sqrt(variances.sum()) / 2, float(at_row.mean()), float(at_column.mean())
-    )
+            return TopHeight(math.nan, math.nan)
+        found.append((float(weights @ z[near]), float(np.sum((weights * sigma[near]) ** 2))))
+    (one, one_variance), (other, other_variance) = found
+    return TopHeight((one + other) / 2, math.sqrt(one_variance + other_variance) / 2)
 
 
 def _highest(
@@ -90,8 +77,8 @@ def _highest(
     if not enough.any():
         return None
     mean = np.where(enough, total / np.where(enough, filled, 1.0), -np.inf)
-    row, column = np.unravel_index(np.argmax(mean), mean.shape)
-    return int(row), int(column)
+    row, column = divmod(int(mean.argmax()), int(mean.shape[1]))
+    return row, column
 
 
 def _evaluation_weights(u: npt.NDArray[np.int64], v: npt.NDArray[np.int64]) -> Float64:

@@ -110,6 +110,7 @@ def main() -> None:
     write_npz(SEEDS / "result.npz", {"z": z}, {"z": "m"})
     cv2.imwrite(str(SEEDS / "levels.png"), (1000 * z).astype(np.uint16))
     (SEEDS / "surface.csv").write_text(_SURFACE)
+    (SEEDS / "leads.csv").write_text(_LEADS)
     write_npz(SEEDS / "map.npz", {"map_x": grid.x, "map_y": grid.y, "map_z": z}, dict.fromkeys(_MAP, "m"))
     _write_light(z)
     (SEEDS / "points.csv").write_text("0.5,1.0\n-0.5,2e-1\n0.0,0.3\n")
@@ -120,6 +121,7 @@ def main() -> None:
 
 
 _MAP = ("map_x", "map_y", "map_z")
+_LEADS = "name,x,y,width,height,angle\nA1,1e-3,2e-3,4e-4,2e-4,1.5\nA2,0,0,1e-3,1e-3,0\n"
 _SURFACE = """Info
 CSV Version,Sensor Count
 2,1

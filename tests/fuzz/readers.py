@@ -15,6 +15,7 @@ from gpuvision.formats.encoder_file import read_encoder
 from gpuvision.formats.features_file import read_features
 from gpuvision.formats.field_file import read_field
 from gpuvision.formats.height_files import ImageScale, read_heights
+from gpuvision.formats.leads_file import read_leads
 from gpuvision.formats.materials_file import read_materials
 from gpuvision.formats.range_image import read_npz, read_ply, read_png16, read_tiff
 from gpuvision.host import GpuVisionError, open_recording
@@ -130,6 +131,7 @@ _ALL = (
     Reader("levels.png", lambda path: read_heights(path, ImageScale(cell_x=1e-5, cell_y=1e-5, step=1e-7))),
     Reader("surface.csv", read_heights),
     Reader("map.npz", read_heights),
+    Reader("leads.csv", read_leads),
     Reader("points.ply", read_ply),
     Reader("result.npz", read_npz),
     Reader("light.npz", LightBlock.from_file),

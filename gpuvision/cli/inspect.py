@@ -1,0 +1,338 @@
+"""``gpuvision inspect``: measure solder paste, or the coplanarity of leads, in a height map."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from gpuvision.cli.arguments import (
+    LayerNames,
+    Overwrite,
+    ReportFile,
+    echo,
+    layers_of,
+    named_path,
+    prints_report,
+    quantities,
+    reject_unused,
+    write_report,
+)
+from gpuvision.cli.select import Side
+
+if TYPE_CHECKING:
+    from gpuvision.formats.height_files import ImageScale
+    from gpuvision.inspection.apertures import Aperture
+    from gpuvision.workflows.inspecting import LeadInspection, PasteInspection
+
+Heights = Annotated[
+    Path,
+    typer.Argument(
+        metavar="HEIGHTS",
+        parser=named_path,
+        help="Height map: TIFF, PNG or NPZ file of `gpuvision scan`, CSV file of a Gocator, or an image with --cell "
+        "and --height-step.",
+    ),
+]
+Results = Annotated[
+    Path,
+    typer.Option(
+        metavar="DIR",
+        parser=named_path,
+        help="Folder for paste.csv, report.json and the picture volume.png; with --leads for leads.csv, report.json "
+        "and coplanarity.png.",
+    ),
+]
+Board = Annotated[
+    Path | None,
+    typer.Option(metavar="GERBERS", parser=named_path, help="Folder or ZIP of the board's Gerber files."),
+]
+Stencil = Annotated[
+    str | None, typer.Option(metavar="LENGTH", help="Thickness of the stencil, such as 120um: the expected height.")
+]
+Pose = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,THETA",
+        help="Known place of the board: position of the origin of its files in the height map and direction of its x "
+        "axis, such as 1mm,2mm,90deg. Default: found by the paste.",
+    ),
+]
+InitialPose = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,THETA", help="Place where the search begins. Default: the paste layer centred in the height map."
+    ),
+]
+SearchRange = Annotated[
+    str | None,
+    typer.Option(metavar="LENGTH,ANGLE", help="Largest shift and rotation of the search. Default: 2mm,3deg."),
+]
+Threshold = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LENGTH", help="Height from which on a cell counts to the area. Default: half of the stencil."
+    ),
+]
+Margin = Annotated[
+    str | None,
+    typer.Option(metavar="LENGTH", help="Distance from an aperture up to which paste belongs to it. Default: 50um."),
+]
+Ring = Annotated[
+    str | None,
+    typer.Option(metavar="LENGTH", help="Width of the ring in which the board is the reference. Default: 0.2mm."),
+]
+Order = Annotated[
+    int | None, typer.Option(min=0, max=2, help="Order of the reference surface: 1 (default) is a plane.")
+]
+PadHeight = Annotated[
+    str | None, typer.Option(metavar="LENGTH", help="Height of the bare pad above the reference surface. Default: 0.")
+]
+MinimumVolume = Annotated[
+    float | None,
+    typer.Option(min=0.0, help="Least volume that passes, as a fraction of the expected one. Default: 0.5."),
+]
+MaximumVolume = Annotated[
+    float | None,
+    typer.Option(min=0.0, help="Largest volume that passes, as a fraction of the expected one. Default: 1.5."),
+]
+Leads = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE.csv|PART",
+        help="Measure the coplanarity of leads or balls instead of paste: a CSV file "
+        "(name,x,y,width,height[,angle] in m and rad), or a part of --board at --pose, such as U3. The height map "
+        "shows the leads from their tips.",
+    ),
+]
+Centre = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y", help="Centre of gravity in the coordinates of the leads. Default: mean of the leads."),
+]
+MaximumGap = Annotated[
+    str | None, typer.Option(metavar="LENGTH", help="Largest distance from the seating plane that passes.")
+]
+Sigma = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LENGTH",
+        help="Random standard deviation of the heights. Default: that of the height map, or else estimated.",
+    ),
+]
+CorrelationArea = Annotated[
+    float | None,
+    typer.Option(min=1.0, help="Number of cells whose noise is common. Default: estimated; with --leads 1."),
+]
+ScaleSigmas = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HEIGHT,LATERAL",
+        help="Relative standard deviations of the scales of heights and of x and y, such as 0.002,0.001: systematic "
+        "errors, stated apart.",
+    ),
+]
+Cell = Annotated[
+    str | None, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel of an image of heights, in x and y.")
+]
+HeightStep = Annotated[
+    str | None, typer.Option(metavar="LENGTH", help="Height of one grey level of an image of heights.")
+]
+HeightOffset = Annotated[
+    str | None, typer.Option(metavar="LENGTH", help="Height of the grey level 0 of an image of heights. Default: 0.")
+]
+Hole = Annotated[
+    float | None, typer.Option(help="Grey level of pixels without a height, of an image of heights. Default: 0.")
+]
+
+
+def inspect(
+    heights: Heights,
+    out: Results,
+    board: Board = None,
+    stencil: Stencil = None,
+    side: Annotated[Side | None, typer.Option(help="Side of the board that carries the paste. Default: top.")] = None,
+    layers: LayerNames = None,
+    pose: Pose = None,
+    initial_pose: InitialPose = None,
+    search_range: SearchRange = None,
+    threshold: Threshold = None,
+    margin: Margin = None,
+    ring: Ring = None,
+    reference_order: Order = None,
+    pad_height: PadHeight = None,
+    minimum_volume: MinimumVolume = None,
+    maximum_volume: MaximumVolume = None,
+    leads: Leads = None,
+    centre: Centre = None,
+    maximum_gap: MaximumGap = None,
+    sigma: Sigma = None,
+    correlation_area: CorrelationArea = None,
+    scale_sigma: ScaleSigmas = None,
+    cell: Cell = None,
+    height_step: HeightStep = None,
+    height_offset: HeightOffset = None,
+    hole: Hole = None,
+    as_json: ReportFile = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure solder paste on a board, or the coplanarity of leads, in a height map; every number has a sigma.
+
+    Of each aperture of the board's paste layer: volume, area, mean and largest height, offset. Of each lead or ball:
+    distance from the seating plane and from the least-squares plane.
+    """
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    from gpuvision.formats.height_files import read_heights
+    from gpuvision.host.outputs import Outputs
+    from gpuvision.inspection.apertures import BoardPlacement, read_apertures
+    from gpuvision.inspection.deposits import PasteSettings
+    from gpuvision.workflows.inspecting import (
+        LEAD_FILES,
+        PASTE_FILES,
+        ScaleSigma,
+        VolumeLimits,
+        inspect_leads,
+        inspect_paste,
+    )
+
+    if not heights.exists():
+        raise FileNotFoundError(f"{heights}: no such file")
+    lead_file = Path(leads) if leads is not None and leads.lower().endswith(".csv") else None
+    inputs = [each for each in (heights, board, lead_file) if each is not None]
+    outputs = Outputs("inspect", inputs=inputs, overwrite=overwrite)
+    outputs.claim_folder(out, PASTE_FILES if leads is None else LEAD_FILES)
+    outputs.claim(as_json)
+    scale = _image_scale(cell, height_step, height_offset, hole)
+    noise = _length(sigma, "--sigma")
+    chosen: Literal["top", "bottom"] = "bottom" if side is Side.bottom else "top"
+    at = _pose(pose, "--pose")
+    found: PasteInspection | LeadInspection
+    if leads is not None:
+        reject_unused(
+            "with --leads",
+            stencil=stencil,
+            initial_pose=initial_pose,
+            search_range=search_range,
+            threshold=threshold,
+            margin=margin,
+            ring=ring,
+            reference_order=reference_order,
+            pad_height=pad_height,
+            minimum_volume=minimum_volume,
+            maximum_volume=maximum_volume,
+            scale_sigma=scale_sigma,
+        )
+        regions = _regions(leads, lead_file, board, layers, chosen)
+        if lead_file is None and at is None:
+            raise ValueError(f"--leads is {leads!r}, a part: give --pose too, or a CSV file of leads")
+        if at is None:
+            reject_unused("without --pose", side=side)
+        # A part with its leads up is the mirror image of its pads.
+        mirrored = (chosen == "top") == (lead_file is None)
+        gravity = None if centre is None else quantities(centre, "--centre", "m,m")
+        found = inspect_leads(
+            read_heights(heights, scale),
+            regions,
+            placement=None
+            if at is None
+            else BoardPlacement(x=at[0], y=at[1], theta=at[2], side="bottom" if mirrored else "top"),
+            sigma=noise,
+            correlation_area=correlation_area or 1.0,
+            centre=None if gravity is None else (gravity[0], gravity[1]),
+            maximum=_length(maximum_gap, "--maximum-gap"),
+        )
+    else:
+        reject_unused("without --leads", centre=centre, maximum_gap=maximum_gap)
+        if board is None or stencil is None:
+            missing = "--board" if board is None else "--stencil"
+            raise ValueError(f"{missing} is missing; expected a board with its stencil, or --leads")
+        if pose is not None:
+            reject_unused("with --pose, a known place", initial_pose=initial_pose, search_range=search_range)
+        settings = PasteSettings(
+            stencil=quantities(stencil, "--stencil", "m")[0],
+            threshold=_length(threshold, "--threshold"),
+            margin=quantities(margin or "50um", "--margin", "m")[0],
+            ring=quantities(ring or "0.2mm", "--ring", "m")[0],
+            reference_order=1 if reference_order is None else reference_order,
+            pad_height=quantities(pad_height or "0", "--pad-height", "m")[0],
+        )
+        limits = VolumeLimits(
+            minimum=0.5 if minimum_volume is None else minimum_volume,
+            maximum=1.5 if maximum_volume is None else maximum_volume,
+        )
+        scales = None if scale_sigma is None else ScaleSigma(**_scale_sigmas(scale_sigma))
+        reach = quantities(search_range or "2mm,3deg", "--search-range", "m,rad")
+        found = inspect_paste(
+            read_heights(heights, scale),
+            read_apertures(board, side=chosen, layers=layers_of(layers)),
+            settings,
+            side=chosen,
+            pose=at,
+            initial_pose=_pose(initial_pose, "--initial-pose"),
+            search_range=(reach[0], reach[1]),
+            sigma=noise,
+            correlation_area=correlation_area,
+            limits=limits,
+            scale_sigma=scales,
+        )
+        for each in found.warnings():
+            echo(f"warning: {each}", err=True)
+    found.write(out, overwrite=overwrite)
+    write_report(as_json, found.report(), outputs)
+    picture = out / ("volume.png" if leads is None else "coplanarity.png")
+    echo(f"{found.summary()}\nlook at {picture} and {out / 'report.json'}", err=prints_report(as_json))
+
+
+def _regions(
+    leads: str, lead_file: Path | None, board: Path | None, layers: list[str] | None, side: Literal["top", "bottom"]
+) -> tuple[Aperture, ...]:
+    """Return the regions of leads: of a CSV file, or the pads of a part of the board."""
+    from gpuvision.formats.leads_file import read_leads
+    from gpuvision.matching.artwork.artwork import read_artwork
+    from gpuvision.workflows.inspecting import pads_of_part
+
+    if lead_file is not None:
+        reject_unused("with a CSV file of leads", board=board, layers=layers)
+        return read_leads(lead_file)
+    if board is None:
+        raise ValueError(f"--leads is {leads!r}, a part: give --board too, or a CSV file of leads")
+    return pads_of_part(read_artwork(board, side=side, layers=layers_of(layers)).pads, leads)
+
+
+def _pose(text: str | None, option: str) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    x, y, theta = quantities(text, option, "m,m,rad")
+    return x, y, theta
+
+
+def _length(text: str | None, option: str) -> float | None:
+    return None if text is None else quantities(text, option, "m")[0]
+
+
+def _scale_sigmas(text: str) -> dict[str, float]:
+    try:
+        height, lateral = (float(each) for each in text.split(","))
+    except ValueError:
+        raise ValueError(f"--scale-sigma is {text!r}, expected two numbers, such as 0.002,0.001") from None
+    return {"height": height, "lateral": lateral}
+
+
+def _image_scale(cell: str | None, step: str | None, offset: str | None, hole: float | None) -> ImageScale | None:
+    """Return the scale of an image of heights; None without --cell and --height-step."""
+    from gpuvision.formats.height_files import ImageScale
+
+    if cell is None and step is None:
+        reject_unused("without --cell and --height-step", height_offset=offset, hole=hole)
+        return None
+    if cell is None or step is None:
+        raise ValueError(f"{'--cell' if cell is None else '--height-step'} is missing; an image of heights needs both")
+    cells = quantities(cell, "--cell", "m,m" if "," in cell else "m")
+    return ImageScale(
+        cell_x=cells[0],
+        cell_y=cells[-1],
+        step=quantities(step, "--height-step", "m")[0],
+        offset=_length(offset, "--height-offset") or 0.0,
+        hole=0.0 if hole is None else hole,
+    )

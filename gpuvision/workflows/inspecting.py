@@ -1,0 +1,539 @@
+"""Inspection of solder paste and of leads in a height map: measurement, verdicts, report and files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.formats.height_files import HeightMapFile
+from gpuvision.formats.json import json_tree
+from gpuvision.host.files import write_text_atomic
+from gpuvision.host.outputs import Outputs
+from gpuvision.inspection.alignment import Alignment, align_apertures
+from gpuvision.inspection.apertures import Aperture, BoardPlacement, make_aperture
+from gpuvision.inspection.coplanarity import Coplanarity, measure_coplanarity
+from gpuvision.inspection.deposits import Deposits, PasteSettings, measure_deposits
+from gpuvision.matching.artwork.board_artwork import Pad, Side
+from gpuvision.matching.artwork.shapes import Float64, Shape
+from gpuvision.plots.inspection import draw_regions
+from gpuvision.validation import finite
+
+PASTE_FILES = ("paste.csv", "report.json", "volume.png")
+"""Names of the files that `PasteInspection.write` writes."""
+LEAD_FILES = ("leads.csv", "report.json", "coplanarity.png")
+"""Names of the files that `LeadInspection.write` writes."""
+SEARCH_RANGE = (2e-3, math.radians(3.0))
+"""Default search range of a board: shift [m] and rotation [rad]."""
+# Correlation of the pattern below which the alignment is doubtful. Chosen: without paste it is below 0.2.
+_WEAK_CORRELATION = 0.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumeLimits:
+    """Limits of the volume of a deposit, as fractions of the expected volume.
+
+    Parameters
+    ----------
+    minimum, maximum : float
+        Least and greatest fraction. Default 0.5 and 1.5.
+
+    Raises
+    ------
+    ValueError
+        A limit is negative, or the minimum is not below the maximum.
+    """
+
+    minimum: float = 0.5
+    maximum: float = 1.5
+
+    def __post_init__(self) -> None:
+        finite(self.minimum, "the minimum volume", minimum=0.0)
+        finite(self.maximum, "the maximum volume", above=self.minimum)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleSigma:
+    """Relative standard deviations of scales that all deposits share: systematic errors of the sensor.
+
+    Parameters
+    ----------
+    height : float
+        Of heights: 0.002 for 0.2 %.
+    lateral : float
+        Of lengths in x and in y.
+
+    Raises
+    ------
+    ValueError
+        A number is negative or not finite.
+    """
+
+    height: float
+    lateral: float
+
+    def __post_init__(self) -> None:
+        for name in ("height", "lateral"):
+            finite(getattr(self, name), f"ScaleSigma.{name}", minimum=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PasteInspection:
+    """Solder paste of a board in a height map, with verdicts.
+
+    Attributes
+    ----------
+    heights : HeightMapFile
+        The height map.
+    apertures : tuple of Aperture
+        Apertures in the coordinates of the board.
+    settings : PasteSettings
+        Settings of the measurement.
+    placement : BoardPlacement
+        Place of the board in the height map.
+    alignment : Alignment or None
+        The fit that found the place; None if the place was given.
+    deposits : Deposits
+        Measured deposits.
+    limits : VolumeLimits
+        Limits of the verdicts.
+    scale_sigma : ScaleSigma or None
+        Systematic standard deviations; None if they are not known.
+    """
+
+    heights: HeightMapFile
+    apertures: tuple[Aperture, ...]
+    settings: PasteSettings
+    placement: BoardPlacement
+    alignment: Alignment | None
+    deposits: Deposits
+    limits: VolumeLimits
+    scale_sigma: ScaleSigma | None
+
+    @property
+    def volume_ratio(self) -> Float64:
+        """Volume of each deposit over its expected volume; NaN where it is not measured."""
+        return self.deposits.volume / self.deposits.expected_volume
+
+    def verdicts(self) -> tuple[str, ...]:
+        """Return "pass", "low" or "high" of each deposit by its volume, or the status of one without a volume."""
+        found = []
+        for status, ratio in zip(self.deposits.status, self.volume_ratio, strict=True):
+            if status not in ("measured", "missing"):
+                found.append(status)
+            elif ratio < self.limits.minimum:
+                found.append("low")
+            else:
+                found.append("high" if ratio > self.limits.maximum else "pass")
+        return tuple(found)
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what may be wrong with the inspection, one sentence each."""
+        found = []
+        if self.alignment is not None and self.alignment.is_ambiguous:
+            found.append(
+                "the paste pattern fits about as well at another place of the search range; give --initial-pose and a "
+                "smaller --search-range, or --pose"
+            )
+        if self.alignment is not None and self.alignment.correlation < _WEAK_CORRELATION:
+            found.append(
+                f"the height map correlates with the paste pattern by {self.alignment.correlation:.2f} only; check the "
+                "side of the board and the initial pose"
+            )
+        if self.deposits.noise * 4 > self.settings.level:
+            found.append(
+                f"the noise of the heights is {1e6 * self.deposits.noise:.3g} um, the threshold of the area only "
+                f"{1e6 * self.settings.level:.3g} um: areas and mean heights are biased by noise"
+            )
+        return tuple(found)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return one dictionary for each deposit, in SI units; offsets are in the coordinates of the board's files."""
+        deposits = self.deposits
+        height, lateral = (
+            (math.nan, math.nan) if self.scale_sigma is None else (self.scale_sigma.height, self.scale_sigma.lateral)
+        )
+        verdicts, ratio = self.verdicts(), self.volume_ratio
+        rows = []
+        for k, (name, status) in enumerate(zip(deposits.names, deposits.status, strict=True)):
+            volume, mean = float(deposits.volume[k]), float(deposits.height_mean[k])
+            rows.append(
+                {
+                    "name": name,
+                    "verdict": verdicts[k],
+                    "status": status,
+                    "x_m": float(self.apertures[k].centroid[0]),
+                    "y_m": float(self.apertures[k].centroid[1]),
+                    "expected_area_m2": float(deposits.expected_area[k]),
+                    "expected_volume_m3": float(deposits.expected_volume[k]),
+                    "volume_m3": volume,
+                    "volume_sigma_m3": float(deposits.volume_sigma[k]),
+                    "volume_systematic_sigma_m3": abs(volume) * math.hypot(height, 2 * lateral),
+                    "volume_ratio": float(ratio[k]),
+                    "area_m2": float(deposits.area[k]),
+                    "area_sigma_m2": float(deposits.area_sigma[k]),
+                    "area_systematic_sigma_m2": 2 * lateral * float(deposits.area[k]),
+                    "height_mean_m": mean,
+                    "height_mean_sigma_m": float(deposits.height_mean_sigma[k]),
+                    "height_mean_systematic_sigma_m": abs(mean) * height,
+                    "height_max_m": float(deposits.height_max[k]),
+                    "height_max_sigma_m": float(deposits.height_max_sigma[k]),
+                    "offset_x_m": float(deposits.offset[k, 0]),
+                    "offset_y_m": float(deposits.offset[k, 1]),
+                    "offset_x_sigma_m": float(deposits.offset_sigma[k, 0]),
+                    "offset_y_sigma_m": float(deposits.offset_sigma[k, 1]),
+                    "valid_fraction": float(deposits.valid[k]),
+                }
+            )
+        return rows
+
+    def summary(self) -> str:
+        """Return one line: deposits, verdicts, volumes, noise."""
+        verdicts = self.verdicts()
+        others = {each: verdicts.count(each) for each in dict.fromkeys(verdicts) if each != "pass"}
+        counts = ", ".join([f"{verdicts.count('pass')} pass", *(f"{count} {name}" for name, count in others.items())])
+        known = self.volume_ratio[np.isfinite(self.volume_ratio)]
+        volumes = ""
+        if known.size:
+            low, middle, high = (100 * float(each) for each in (known.min(), np.median(known), known.max()))
+            volumes = f"; volumes {low:.0f} to {high:.0f} % (median {middle:.0f} %)"
+        place = self.placement
+        pose = f"{1e3 * place.x:.3f} mm, {1e3 * place.y:.3f} mm, {math.degrees(place.theta):.3f} deg"
+        how = "given" if self.alignment is None else "fitted to the paste"
+        noise = f"noise {1e6 * self.deposits.noise:.2g} um"
+        return f"{len(verdicts)} deposits: {counts}{volumes}; board at {pose} ({how}); {noise}"
+
+    def report(self) -> dict[str, Any]:
+        """Return the content of ``report.json``; None for numbers that are not known."""
+        fitted = self.alignment
+        alignment = None
+        if fitted is not None:
+            alignment = {
+                "covariance": fitted.covariance.tolist(),
+                "centre": fitted.centre.tolist(),
+                "residual_scale": fitted.residual_scale,
+                "deposits": fitted.count,
+                "correlation": fitted.correlation,
+                "second_correlation": fitted.second_correlation,
+            }
+        tree = {
+            "gpuvision": version("gpuvision"),
+            "summary": self.summary(),
+            "warnings": list(self.warnings()),
+            "settings": asdict(self.settings),
+            "limits": asdict(self.limits),
+            "scale_sigma": None if self.scale_sigma is None else asdict(self.scale_sigma),
+            "pose": asdict(self.placement),
+            "alignment": alignment,
+            "noise": self.deposits.noise,
+            "noise_source": "height map" if self.heights.sigma is not None else "board about the reference surfaces",
+            "correlation_area_cells": self.deposits.correlation_area,
+            "map": asdict(self.heights.grid),
+            "deposits": self.rows(),
+        }
+        return dict(json_tree(tree))
+
+    def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
+        """Write ``paste.csv``, ``report.json`` and the picture ``volume.png`` into a folder, all or none.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Output folder; created if it is missing.
+        overwrite : bool
+            Whether files may be replaced that no earlier inspection wrote. Default False.
+
+        Raises
+        ------
+        OSError
+            A file exists and is no output of an inspection, or the folder cannot be written.
+        """
+        ratio = self.volume_ratio
+        with Outputs("inspect", overwrite=overwrite).folder(folder) as inside:
+            _write_tables(inside, "paste.csv", self.rows(), self.report())
+            draw_regions(
+                inside / "volume.png",
+                self.heights.z,
+                self.heights.grid,
+                [each.moved(self.placement) for each in self.apertures],
+                100 * ratio,
+                (0.0, 200.0),
+                [each == "pass" for each in self.verdicts()],
+                title=self.summary(),
+                label="volume [% of the aperture times the stencil]",
+                colours="RdYlBu",
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeadInspection:
+    """Coplanarity of leads or balls in a height map.
+
+    Attributes
+    ----------
+    heights : HeightMapFile
+        The height map, leads up.
+    regions : tuple of Aperture
+        Regions of the leads in the height map.
+    leads : Coplanarity
+        Tops, gaps and deviations.
+    maximum : float or None
+        Largest gap that passes [m]; None without a limit.
+    """
+
+    heights: HeightMapFile
+    regions: tuple[Aperture, ...]
+    leads: Coplanarity
+    maximum: float | None
+
+    def verdicts(self) -> tuple[str, ...]:
+        """Return "pass" or "high" of each lead by its gap, or "holes" of a lead without a top."""
+        limit = math.inf if self.maximum is None else self.maximum
+        return tuple("holes" if not np.isfinite(gap) else "pass" if gap <= limit else "high" for gap in self.leads.gap)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return one dictionary for each lead, in SI units."""
+        leads = self.leads
+        names = ("top", "top_sigma", "gap", "gap_sigma", "deviation", "deviation_sigma")
+        verdicts = self.verdicts()
+        return [
+            {
+                "name": name,
+                "verdict": verdicts[k],
+                "seat": name in leads.seats,
+                "x_m": float(leads.place[k, 0]),
+                "y_m": float(leads.place[k, 1]),
+                **{f"{each}_m": float(getattr(leads, each)[k]) for each in names},
+            }
+            for k, name in enumerate(leads.names)
+        ]
+
+    def summary(self) -> str:
+        """Return one line: coplanarity with its sigma, the lowest lead, the seats, the noise."""
+        leads, verdicts = self.leads, self.verdicts()
+        failed = "" if self.maximum is None else f"; {len(verdicts) - verdicts.count('pass')} leads fail"
+        spread = float(np.nanstd(leads.deviation))
+        return (
+            f"{len(leads.names)} leads: coplanarity {1e6 * leads.coplanarity:.3g} um (sigma "
+            f"{1e6 * leads.coplanarity_sigma:.2g} um) at {leads.lowest}, seated on {', '.join(leads.seats)}; rms about "
+            f"the least-squares plane {1e6 * spread:.3g} um; noise {1e6 * leads.noise:.2g} um{failed}"
+        )
+
+    def report(self) -> dict[str, Any]:
+        """Return the content of ``report.json``; None for numbers that are not known."""
+        tree = {
+            "gpuvision": version("gpuvision"),
+            "summary": self.summary(),
+            "coplanarity": self.leads.coplanarity,
+            "coplanarity_sigma": self.leads.coplanarity_sigma,
+            "lowest": self.leads.lowest,
+            "seats": list(self.leads.seats),
+            "maximum": self.maximum,
+            "noise": self.leads.noise,
+            "map": asdict(self.heights.grid),
+            "leads": self.rows(),
+        }
+        return dict(json_tree(tree))
+
+    def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
+        """Write ``leads.csv``, ``report.json`` and the picture ``coplanarity.png``; see `PasteInspection.write`."""
+        gaps = 1e6 * self.leads.gap
+        with Outputs("inspect", overwrite=overwrite).folder(folder) as inside:
+            _write_tables(inside, "leads.csv", self.rows(), self.report())
+            draw_regions(
+                inside / "coplanarity.png",
+                self.heights.z,
+                self.heights.grid,
+                self.regions,
+                gaps,
+                (0.0, max(float(np.nanmax(gaps)), 1e-3)),
+                [each == "pass" for each in self.verdicts()],
+                title=self.summary(),
+                label="gap below the seating plane [um]",
+                colours="viridis",
+            )
+
+
+def _write_tables(folder: Path, name: str, rows: Sequence[Mapping[str, Any]], report: dict[str, Any]) -> None:
+    """Write rows as CSV and a report as JSON; unknown numbers are empty cells."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        known = {
+            key: "" if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()
+        }
+        writer.writerow(known)
+    write_text_atomic(folder / name, text.getvalue())
+    write_text_atomic(folder / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
+
+
+def inspect_paste(
+    heights: HeightMapFile,
+    apertures: Sequence[Aperture],
+    settings: PasteSettings,
+    *,
+    side: Side = "top",
+    pose: tuple[float, float, float] | None = None,
+    initial_pose: tuple[float, float, float] | None = None,
+    search_range: tuple[float, float] = SEARCH_RANGE,
+    sigma: float | None = None,
+    correlation_area: float | None = None,
+    limits: VolumeLimits = VolumeLimits(),
+    scale_sigma: ScaleSigma | None = None,
+) -> PasteInspection:
+    """Measure the solder paste of a board in a height map.
+
+    Parameters
+    ----------
+    heights : HeightMapFile
+        Height map of `read_heights`.
+    apertures : sequence of Aperture
+        Apertures of `read_apertures`.
+    settings : PasteSettings
+        Stencil, margins and reference surface.
+    side : {"top", "bottom"}
+        Side of the board that the height map shows. Default "top".
+    pose : tuple of float, optional
+        Known place of the board: position of the origin of its files in the height map [m], and direction of its x axis
+        [rad]. Default: found by the paste.
+    initial_pose : tuple of float, optional
+        Place where the search begins. Default: the centre of the apertures in the centre of the height map.
+    search_range : tuple of float
+        Largest shift [m] and rotation [rad] of the search. Default 2 mm and 3 degrees.
+    sigma : float, optional
+        Random standard deviation of all heights [m]. Default: that of the height map, or else estimated; see
+        `measure_deposits`.
+    correlation_area : float, optional
+        Number of cells whose noise is common. Default: estimated; see `measure_deposits`.
+    limits : VolumeLimits
+        Limits of the verdicts.
+    scale_sigma : ScaleSigma, optional
+        Systematic standard deviations of the scales.
+
+    Returns
+    -------
+    PasteInspection
+
+    Raises
+    ------
+    ValueError
+        The board is not found in the height map, or both poses are given.
+    """
+    if pose is not None and initial_pose is not None:
+        raise ValueError("pose and initial_pose are both given; expected a known pose or the beginning of a search")
+    noise = heights.sigma if sigma is None else sigma
+    alignment = None
+    if pose is None:
+        if initial_pose is None:
+            initial = _centred(heights, apertures, side)
+        else:
+            initial = BoardPlacement(x=initial_pose[0], y=initial_pose[1], theta=initial_pose[2], side=side)
+        alignment = align_apertures(
+            heights.z, heights.grid, apertures, settings, initial=initial, search_range=search_range
+        )
+        placement = alignment.placement
+    else:
+        placement = BoardPlacement(x=pose[0], y=pose[1], theta=pose[2], side=side)
+    deposits = measure_deposits(
+        heights.z, heights.grid, apertures, placement, settings, sigma=noise, correlation_area=correlation_area
+    )
+    return PasteInspection(
+        heights=heights,
+        apertures=tuple(apertures),
+        settings=settings,
+        placement=placement,
+        alignment=alignment,
+        deposits=deposits,
+        limits=limits,
+        scale_sigma=scale_sigma,
+    )
+
+
+def _centred(heights: HeightMapFile, apertures: Sequence[Aperture], side: Side) -> BoardPlacement:
+    """Return the place in which the centre of the apertures is the centre of the height map."""
+    bounds = np.concatenate([each.bounds for each in apertures])
+    middle = (bounds.min(axis=0) + bounds.max(axis=0)) / 2
+    grid = heights.grid
+    here = np.array([grid.left + (grid.columns - 1) / 2 * grid.cell_x, grid.top - (grid.rows - 1) / 2 * grid.cell_y])
+    shift = here - BoardPlacement(x=0.0, y=0.0, theta=0.0, side=side).to_map(middle)
+    return BoardPlacement(x=float(shift[0]), y=float(shift[1]), theta=0.0, side=side)
+
+
+def pads_of_part(pads: Sequence[Pad], part: str) -> tuple[Aperture, ...]:
+    """Return the pads of a part as regions, named by their pins.
+
+    Raises
+    ------
+    ValueError
+        No pad has this part: the files are not Gerber X2, or the name is another.
+    """
+    found = [each for each in pads if each.part == part]
+    if not found:
+        known = sorted({each.part for each in pads if each.part})
+        names = ", ".join(known[:12]) or "none: the files do not name parts (Gerber X2 does)"
+        raise ValueError(f"no pad belongs to the part {part!r}; known parts: {names}")
+    return tuple(make_aperture(each.pin or str(k), [Shape(each.outline)]) for k, each in enumerate(found, 1))
+
+
+def inspect_leads(
+    heights: HeightMapFile,
+    regions: Sequence[Aperture],
+    *,
+    placement: BoardPlacement | None = None,
+    sigma: float | None = None,
+    correlation_area: float = 1.0,
+    centre: tuple[float, float] | None = None,
+    maximum: float | None = None,
+) -> LeadInspection:
+    """Measure the coplanarity of leads or balls in a height map of a component with its leads up.
+
+    Parameters
+    ----------
+    heights : HeightMapFile
+        Height map of `read_heights`.
+    regions : sequence of Aperture
+        Region of each lead, three or more.
+    placement : BoardPlacement, optional
+        Place of the regions in the height map. Default: they are in the coordinates of the height map.
+    sigma : float, optional
+        Random standard deviation of all heights [m]. Default: that of the height map, or else estimated.
+    correlation_area : float
+        Number of cells whose noise is common. Default 1.
+    centre : tuple of float, optional
+        Centre of gravity, in the coordinates of the regions [m]. Default: mean of the regions.
+    maximum : float, optional
+        Largest gap that passes [m].
+
+    Returns
+    -------
+    LeadInspection
+
+    Raises
+    ------
+    ValueError
+        Fewer than three tops are measured, or the centre of gravity is not between them.
+    """
+    gravity: npt.NDArray[np.float64] | None = None if centre is None else np.array(centre)
+    moved = tuple(regions)
+    if placement is not None:
+        moved = tuple(each.moved(placement) for each in regions)
+        gravity = None if gravity is None else placement.to_map(gravity)
+    leads = measure_coplanarity(
+        heights.z,
+        heights.grid,
+        moved,
+        sigma=heights.sigma if sigma is None else sigma,
+        correlation_area=correlation_area,
+        centre=None if gravity is None else (float(gravity[0]), float(gravity[1])),
+    )
+    return LeadInspection(heights=heights, regions=moved, leads=leads, maximum=maximum)

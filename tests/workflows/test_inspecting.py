@@ -1,0 +1,158 @@
+"""``gpuvision inspect`` from files: paste of a board, leads of a CSV file and of a part, messages."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from gpuvision.formats.range_image import write_tiff
+from gpuvision.inspection.apertures import BoardPlacement
+from paste_maps import Box, Cap, board_grid, paste_map
+from scanning import Ran, check_refused
+
+HEAD = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
+PLACES = [(1.0, 1.0), (2.2, 1.1), (3.0, 2.2), (1.2, 2.6), (2.1, 1.9)]
+LAYERS = ("--layers", "paste.gbr=top paste", "--layers", "copper.gbr=top copper")
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    return lambda *args: Ran(capsys, monkeypatch, "inspect", *args)
+
+
+def flashes(places: list[tuple[float, float]]) -> str:
+    return "".join(f"X{round(x * 1e6)}Y{round(y * 1e6)}D03*\n" for x, y in places)
+
+
+@pytest.fixture
+def gerbers(tmp_path: Path) -> Path:
+    folder = tmp_path / "gerbers"
+    folder.mkdir()
+    copper = "%ADD10C,0.5*%\nD10*\n"
+    for pin, place in enumerate(PLACES, 1):
+        copper += f"%TO.P,U7,{pin}*%\n" + flashes([place])
+    (folder / "paste.gbr").write_text(HEAD + "%ADD10C,0.4*%\nD10*\n" + flashes(PLACES) + "M02*\n")
+    (folder / "copper.gbr").write_text(HEAD + copper + "M02*\n")
+    return folder
+
+
+@pytest.fixture
+def paste(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """Height map of caps; the second has a quarter of its volume, the last is missing."""
+    grid = board_grid(200, 180, cell=20e-6)
+    place = BoardPlacement(x=0.1e-3, y=-0.3e-3, theta=0.02)
+    heights = [130e-6, 40e-6, 130e-6, 130e-6]
+    spots = [(Cap(200e-6, h), (1e-3 * x, 1e-3 * y)) for h, (x, y) in zip(heights, PLACES, strict=False)]
+    z = paste_map(grid, place, spots) + rng.normal(0, 1e-6, grid.shape)
+    write_tiff(tmp_path / "map.tiff", z, grid)
+    return tmp_path / "map.tiff"
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_paste_of_a_board(gerbers: Path, paste: Path, tmp_path: Path, run: Any) -> None:
+    out = tmp_path / "out"
+    ran = run(paste, "--board", gerbers, "--stencil=120um", *LAYERS, "--out", out, "--scale-sigma=0.01,0.002")
+    assert ran.code == 0, ran.err
+    assert "5 deposits: 3 pass, 2 low" in ran.out
+    rows = rows_of(out / "paste.csv")
+    assert [each["verdict"] for each in rows] == ["pass", "low", "pass", "pass", "low"]
+    assert [each["status"] for each in rows] == ["measured"] * 4 + ["missing"]
+    volume = [float(each["volume_m3"]) for each in rows]
+    np.testing.assert_allclose(volume[:4], [Cap(200e-6, h).volume for h in (130e-6, 40e-6, 130e-6, 130e-6)], rtol=0.01)
+    np.testing.assert_allclose(float(rows[0]["expected_area_m2"]), np.pi * 200e-6**2, rtol=1e-3)
+    np.testing.assert_allclose(float(rows[0]["volume_systematic_sigma_m3"]), volume[0] * np.hypot(0.01, 0.004))
+    assert rows[4]["offset_x_m"] == ""
+    report = json.loads((out / "report.json").read_text())
+    np.testing.assert_allclose([report["pose"][name] for name in ("x", "y", "theta")], [1e-4, -3e-4, 0.02], atol=1e-4)
+    assert report["deposits"][4]["offset_x_m"] is None
+    assert report["noise"] == pytest.approx(1e-6, rel=0.1)
+    assert (out / "volume.png").stat().st_size > 10_000
+    limits = ("--minimum-volume=0.1", "--maximum-volume=0.4", "--sigma=2um", "--margin=20um", "--ring=0.1mm")
+    pose = ("--pose=0.1mm,-0.3mm,0.02rad", "--json", "-")
+    ran = run(paste, "--board", gerbers, "--stencil=120um", *LAYERS, "--out", out, *limits, *pose)
+    told = json.loads(ran.out)
+    assert [each["verdict"] for each in told["deposits"]] == ["high", "pass", "high", "high", "low"]
+    assert told["alignment"] is None
+    assert told["noise"] == 2e-6
+
+
+def test_an_image_with_a_scale(gerbers: Path, tmp_path: Path, run: Any) -> None:
+    grid = board_grid(200, 180, cell=20e-6)
+    here = BoardPlacement(x=-10e-6, y=-10e-6, theta=0.0)  # an image begins at the centre of its first pixel
+    z = paste_map(grid, BoardPlacement(x=0.0, y=0.0, theta=0.0), [(Box((360e-6, 360e-6), 120e-6), (1e-3, 1e-3))])
+    cv2.imwrite(str(tmp_path / "map.png"), np.rint((z - 0.8e-3) / 1e-8).astype(np.uint16))
+    scale = ("--cell=20um", "--height-step=0.01um", "--height-offset=0.8mm", "--hole=-1")
+    pose = f"--pose={here.x},{here.y},0"
+    ran = run(
+        tmp_path / "map.png", *scale, "--board", gerbers, *LAYERS, "--stencil=120um", "--out", tmp_path / "o", pose
+    )
+    assert ran.code == 0, ran.err
+    first = rows_of(tmp_path / "o" / "paste.csv")[0]
+    np.testing.assert_allclose(float(first["volume_m3"]), 360e-6**2 * 120e-6, rtol=1e-3)
+
+
+@pytest.mark.parametrize("by_part", [False, True])
+def test_the_leads_of_a_component(gerbers: Path, tmp_path: Path, run: Any, by_part: bool) -> None:
+    """Balls over the pads of a part, leads up: the mirror image of the board."""
+    grid = board_grid(220, 180, cell=20e-6)
+    seen = BoardPlacement(x=4.2e-3, y=0.1e-3, theta=0.0, side="bottom")
+    lows = [0.0, 30e-6, 0.0, 0.0, 10e-6]
+    spots = [(Cap(250e-6, 200e-6 - low), (1e-3 * x, 1e-3 * y)) for low, (x, y) in zip(lows, PLACES, strict=True)]
+    write_tiff(tmp_path / "map.tiff", paste_map(grid, seen, spots), grid)
+    if by_part:
+        chosen = ["--leads=U7", "--board", gerbers, *LAYERS, "--pose=4.2mm,0.1mm,0deg"]
+    else:
+        at = [seen.to_map(np.array([1e-3 * x, 1e-3 * y])) for x, y in PLACES]
+        lines = [f"{k},{x},{y},5e-4,5e-4,0.1" for k, (x, y) in enumerate(at, 1)]
+        (tmp_path / "leads.csv").write_text("name,x,y,width,height,angle\n" + "\n".join(lines) + "\n")
+        chosen = ["--leads", tmp_path / "leads.csv"]
+    ran = run(tmp_path / "map.tiff", *chosen, "--out", tmp_path / "out", "--maximum-gap=20um", "--sigma=1um")
+    assert ran.code == 0, ran.err
+    rows = rows_of(tmp_path / "out" / "leads.csv")
+    np.testing.assert_allclose([float(each["gap_m"]) for each in rows], lows, atol=1e-6)
+    assert [each["verdict"] for each in rows] == ["pass", "high", "pass", "pass", "pass"]
+    assert [each["seat"] for each in rows] == ["True", "False", "True", "True", "False"]
+    assert "coplanarity 30 um" in ran.out
+    assert (tmp_path / "out" / "coplanarity.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--stencil=120um",), "--board is missing; expected a board with its stencil, or --leads"),
+        (("--board", "GERBERS"), "--stencil is missing"),
+        (("--leads=U7",), "--leads is 'U7', a part: give --board too"),
+        (("--leads=U7", "--board", "GERBERS", *LAYERS), "--leads is 'U7', a part: give --pose too"),
+        (("--leads=U8", "--board", "GERBERS", *LAYERS), "no pad belongs to the part 'U8'; known parts: U7"),
+        (("--leads=U7", "--stencil=1um"), "--stencil has no effect with --leads"),
+        (("--centre=0,0",), "--centre has no effect without --leads"),
+        (("--cell=1um",), "--height-step is missing"),
+        (("--hole=1",), "--hole has no effect without --cell and --height-step"),
+        (("--board", "GERBERS", "--stencil=1", "--pose=0,0,0", "--search-range=1,1"), "--search-range has no effect"),
+        (("--board", "GERBERS", "--stencil=0.1mm", "--scale-sigma=1"), "--scale-sigma is '1', expected two numbers"),
+        (
+            ("--board", "GERBERS", "--stencil=0.1mm", "--minimum-volume=2"),
+            "maximum volume is 1.5, expected a number > 2",
+        ),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(
+    gerbers: Path, paste: Path, tmp_path: Path, run: Any, options: tuple[str, ...], message: str
+) -> None:
+    given = [gerbers if each == "GERBERS" else each for each in options]
+    check_refused(run(paste, *given, "--out", tmp_path / "out"), message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_height_map_is_named(gerbers: Path, tmp_path: Path, run: Any) -> None:
+    check_refused(run(tmp_path / "no.tiff", "--out", tmp_path / "out"), r"no\.tiff: no such file")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import tomli_w
 
 from gpuvision.ranging.sensor_geometry import SensorGeometry
@@ -20,7 +21,14 @@ _HEADER = (
 
 
 def sensor_text(
-    geometry: SensorGeometry, *, name: str, size: tuple[int, int], along: Along, channel: str, cell: float
+    geometry: SensorGeometry,
+    *,
+    name: str,
+    size: tuple[int, int],
+    along: Along,
+    channel: str,
+    cell: float,
+    pixels: npt.ArrayLike,
 ) -> str:
     """Return the sensor file of a calibrated laser sensor.
 
@@ -38,6 +46,8 @@ def sensor_text(
         Channel of colour frames that holds the laser.
     cell : float
         Cell of the height map [m].
+    pixels : array_like
+        (n, 2): measured (column, row) over the calibrated part of the image, for the covariance of the triangulation.
 
     Returns
     -------
@@ -52,6 +62,9 @@ def sensor_text(
     }
     if sheet.bend is not None:
         triangulation["bend"] = list(sheet.bend)
+    covariance = geometry.triangulation(size, along, pixels).covariance
+    if covariance is not None:
+        triangulation["covariance"] = [list(row) for row in covariance]
     table: dict[str, Any] = {
         "kind": "camera",
         "name": name or "calibrated laser sensor",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,8 +10,9 @@ import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.views.pose_response import ray_derivatives
-from gpuvision.ranging.sheet_calibration import SheetFit
+from gpuvision.ranging.sheet_calibration import Along, SheetFit
 from gpuvision.ranging.transport_calibration import TransportFit
+from gpuvision.ranging.triangulation import Triangulation
 
 Float64 = npt.NDArray[np.float64]
 
@@ -142,6 +143,49 @@ class SensorGeometry:
         surface = np.stack([np.ones_like(g), g, h, g * g, g * h, h * h], axis=1)[:, : len(self.sheet.names)]
         by_sheet = ray[:, :, None] * surface[:, None] / steep
         return np.concatenate([np.linalg.norm(points, axis=-1)[:, None, None] * by_camera, by_sheet], axis=2)
+
+    def triangulation(self, size: tuple[int, int], along: Along, pixels: npt.ArrayLike) -> Triangulation:
+        """Return the triangulation to the mean plane of the sheet, with the covariance of its parameters.
+
+        Parameters
+        ----------
+        size : (int, int)
+            Columns and rows of a frame.
+        along : {"columns", "rows"}
+            Image axis along which the laser line runs.
+        pixels : array_like
+            (n, 2): measured (column, row) over the calibrated part of the image, such as readings.
+
+        Notes
+        -----
+        A shift or a rotation of all points (G, H) in the sheet is no error of a sensor: the covariance leaves it out.
+        The eight parameters express the errors of focal length, tilt and sheet. The part of the errors of the lens
+        that they cannot express is added to the offsets, with its mean square over the pixels.
+        """
+        v, u = ((0.0, each - 1.0) for each in (size if along == "columns" else size[::-1]))
+        sheet = Triangulation.from_camera(
+            self.camera,
+            origin=self.sheet.origin,
+            g_axis=self.sheet.g_axis,
+            h_axis=self.sheet.h_axis,
+            region=(u, v),
+            along=along,
+        )
+        seen = np.asarray(pixels, dtype=np.float64)
+        axes, slopes = np.stack([self.sheet.g_axis, self.sheet.h_axis]), self.derivatives(seen)
+        errors = np.einsum("ij,njp->nip", axes, slopes).reshape(2 * len(seen), -1)
+        g, h = self.in_sheet(self.points(seen)).T
+        one, none = np.ones_like(g), np.zeros_like(g)
+        rigid = np.stack([[one, none], [none, one], [-h, g]]).transpose(2, 1, 0).reshape(-1, 3)
+        errors = errors - rigid @ np.linalg.lstsq(rigid, errors, rcond=None)[0]
+        design = sheet.parameter_derivatives(seen[:, ::-1] if along == "columns" else seen).reshape(-1, 8)
+        moved = np.linalg.lstsq(design, errors, rcond=None)[0]
+        rest = (errors - design @ moved).reshape(len(seen), 2, -1)
+        covariance = self.covariance[: errors.shape[1], : errors.shape[1]]
+        total = moved @ covariance @ moved.T
+        total[[0, 3], [0, 3]] += np.einsum("nip,pq,niq->i", rest, covariance, rest) / len(seen)
+        rows = tuple(tuple(row) for row in (0.5 * (total + total.T)).tolist())
+        return replace(sheet, covariance=rows)
 
     def _surface(self, points: Float64) -> tuple[Float64, Float64]:
         """Return the distances of points (..., 3) from the sheet along its normal, and their gradients (..., 3)."""

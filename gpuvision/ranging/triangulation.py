@@ -302,13 +302,9 @@ class Triangulation(VisionOperation[SheetPoints]):
         if self.sigma is None and self.covariance is None:
             raise ValueError("Triangulation knows neither sigma nor covariance; give it one of them")
         points = np.asarray(points, dtype=np.float64)
-        origin, unit = self._centre_and_half_extent()
-        x = ((points if self.distortion is None else self.distortion.undistort(points)) - origin) / unit
+        p, values, w = self._at(points)
+        unit = self._centre_and_half_extent()[1]
         _, gx, gy, _, hx, hy, dx, dy = self.conditioned()
-        w = 1.0 + x @ np.array([dx, dy])
-        w = np.where(w > self.horizon, w, np.nan)
-        p = x / w[..., None]
-        values = p @ np.array([[gx, hx], [gy, hy]])
         slopes = np.array([[gx, gy], [hx, hy]]) - values[..., None] * np.array([dx, dy])
         distortion_slopes = np.eye(2) if self.distortion is None else self.distortion.jacobian(points)
         slopes = (slopes / w[..., None, None]) @ distortion_slopes / unit
@@ -318,6 +314,23 @@ class Triangulation(VisionOperation[SheetPoints]):
             design = homography.displacement_design(p, values)
             total += design @ np.array(self.covariance) @ np.swapaxes(design, -1, -2)
         return total
+
+    def parameter_derivatives(self, points: npt.ArrayLike) -> Float64:
+        """Return the derivatives (..., 2, 8) of (G, H) at measured points (u, v) (..., 2) by the parameters.
+
+        The parameters are those of `conditioned`, whose covariance is ``covariance``. NaN beyond the horizon.
+        """
+        return homography.displacement_design(*self._at(np.asarray(points, dtype=np.float64))[:2])
+
+    def _at(self, points: Float64) -> tuple[Float64, Float64, Float64]:
+        """Return ``(x, y) / w``, the displacements (G - g0, H - h0) and the denominator w at measured points (u, v)."""
+        origin, unit = self._centre_and_half_extent()
+        x = ((points if self.distortion is None else self.distortion.undistort(points)) - origin) / unit
+        _, gx, gy, _, hx, hy, dx, dy = self.conditioned()
+        w = 1.0 + x @ np.array([dx, dy])
+        w = np.where(w > self.horizon, w, np.nan)
+        p = x / w[..., None]
+        return p, p @ np.array([[gx, hx], [gy, hy]]), w
 
     @property
     def sensor_lens(self) -> Lens | None:

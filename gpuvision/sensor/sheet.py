@@ -54,8 +54,10 @@ def read_triangulation(
         raise table.error(f"[{table.name}] {problem}, expected one of {', '.join(ways)}")
     made = ways[given[0]](table, common)
     bend = _bend(table) if given[0] in _POSES else None
+    covariance = table.rows("covariance", "m^2, m and 1", 8, None)
     table.finish()
-    return made, bend
+    with table.checking():
+        return (made if covariance is None else replace(made, covariance=covariance)), bend
 
 
 def _from_homography(table: Section, common: dict[str, Any]) -> Triangulation:

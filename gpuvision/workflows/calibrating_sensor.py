@@ -42,6 +42,8 @@ Progress = Callable[[int, int | None], object]
 
 # Share of the readings of a view that the sheet rejects, above which a warning names the view (chosen).
 _MANY_OUTLIERS = 0.5
+# Every n-th reading serves for the covariance of the triangulation, which is smooth over the image.
+_EVERY = 16
 # Reduced chi-square of views above which a warning says that they disagree (chosen: three times the predicted scatter).
 _DISAGREEMENT = 9.0
 
@@ -428,6 +430,7 @@ def write_sensor_calibration(
         along=calibration.along,
         channel=calibration.channel,
         cell=calibration.cell,
+        pixels=np.concatenate([each.points for each in calibration.lines if each is not None])[::_EVERY],
     )
     report = json.dumps(json_tree(calibration.report()), indent=1) + "\n"
     outputs = Outputs("calibrate", inputs=[*images, *inputs], overwrite=overwrite)

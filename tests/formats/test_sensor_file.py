@@ -24,7 +24,7 @@ def geometry_of(truth: LaserSensor) -> SensorGeometry:
         h_axis=truth.h,
         bend=None,
         names=("offset", "slope_g", "slope_h"),
-        noise_covariance=np.zeros((3, 3)),
+        noise_covariance=np.diag([4e-10, 1e-8, 1e-6]),
         by_camera=np.zeros((3, 0)),
         sigma_px=0.1,
         view_ratio=1.0,
@@ -46,15 +46,23 @@ def test_scan_reads_the_calibrated_sensor(tmp_path: Path) -> None:
     truth = sensor(20.0)
     geometry = geometry_of(truth)
     path = tmp_path / "sensor.toml"
-    path.write_text(sensor_text(geometry, name="test", size=SIZE, along="columns", channel="grey", cell=4e-4))
+    flat = np.stack(np.meshgrid(np.linspace(-0.04, 0.04, 5), np.linspace(-0.02, 0.02, 5)), axis=-1).reshape(-1, 2)
+    pixels = truth.project(truth.surface(flat))
+    path.write_text(
+        sensor_text(geometry, name="test", size=SIZE, along="columns", channel="grey", cell=4e-4, pixels=pixels)
+    )
     read = Sensor.load(path)
     assert (read.name, read.frame, read.output.cell) == ("test", SIZE[::-1], 4e-4)
     assert isinstance(read.readout, LineReadout)
     assert isinstance(read.transport, StraightTransport)
-    flat = np.stack(np.meshgrid(np.linspace(-0.04, 0.04, 5), np.linspace(-0.02, 0.02, 5)), axis=-1).reshape(-1, 2)
-    pixels = truth.project(truth.surface(flat))
-    assert read.readout.triangulation is not None
-    np.testing.assert_allclose(read.readout.triangulation.to_sensor(flat), pixels[:, ::-1], atol=1e-6)
+    sheet = read.readout.triangulation
+    assert sheet is not None
+    np.testing.assert_allclose(sheet.to_sensor(flat), pixels[:, ::-1], atol=1e-6)
+    assert sheet.covariance is not None
+    assert sheet.covariance == geometry.triangulation(SIZE, "columns", pixels).covariance
+    # The sheet is known to 20 um and 1 mrad about g: G and H are uncertain by a few um at a few cm.
+    sigmas = np.sqrt(np.diagonal(sheet.covariance_at(pixels[:, ::-1]), axis1=-2, axis2=-1))
+    assert 1e-6 < sigmas.max() < 200e-6
     axes = np.stack([read.transport.g_axis, read.transport.h_axis, read.transport.direction])
     # The next profile lies towards g x h: with y along it and z along h, x is opposite to g.
     np.testing.assert_allclose(axes, [[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], atol=1e-12)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from gpuvision.ranging.sensor_geometry import SensorGeometry
-from laser_sensor import PROFILES_BETWEEN, STEP, LaserSensor, calibrated, sensor
+from laser_sensor import PROFILES_BETWEEN, SIZE, STEP, LaserSensor, calibrated, sensor
 
 Float64 = npt.NDArray[np.float64]
 BENT = (0.06, -0.02, 0.03)
@@ -122,3 +122,39 @@ def test_step_is_within_its_sigma(truth: LaserSensor, found: SensorGeometry) -> 
     sigma = np.sqrt(found.direction @ found.transport.covariance(found.camera_covariance) @ found.direction)
     assert sigma * PROFILES_BETWEEN * 4 < 20e-6
     assert abs(found.step - STEP) < 4.0 * sigma
+
+
+def aligned(found: Float64, exact: Float64) -> Float64:
+    """Return the errors (n, 2) of points (G, H) after the best rotation and shift."""
+    middle, centre = found.mean(axis=0), exact.mean(axis=0)
+    u, _, vt = np.linalg.svd((found - middle).T @ (exact - centre))
+    return (found - middle) @ (u @ vt) - (exact - centre)
+
+
+def errors_in_sheet(truth: LaserSensor, found: SensorGeometry) -> tuple[Float64, Float64]:
+    """Return errors (n, 2) of (G, H) for exact readings up to a rigid motion, and the predicted sigmas (n, 2)."""
+    pixels = truth.project(truth.surface(FLAT))
+    sheet = found.triangulation(SIZE, "columns", pixels)
+    sigmas = np.sqrt(np.diagonal(sheet.covariance_at(pixels[:, ::-1]), axis1=-2, axis2=-1))
+    return aligned(found.in_sheet(found.points(pixels)), FLAT), sigmas
+
+
+def test_triangulation_predicts_errors_up_to_a_rigid_motion(truth: LaserSensor, found: SensorGeometry) -> None:
+    """The covariance leaves out where the camera's frame lies, and no error that changes the shape of a part."""
+    errors, sigmas = errors_in_sheet(truth, found)
+    assert 0.1 < np.sqrt(np.mean((errors / sigmas) ** 2)) < 3.0
+    # In the frame of the camera the points are several times as uncertain.
+    slopes = found.derivatives(truth.project(truth.surface(FLAT)))
+    inside = found.covariance[: slopes.shape[2], : slopes.shape[2]]
+    absolute = np.sqrt(np.einsum("i,nip,pq,njq,j->n", truth.h, slopes, inside, slopes, truth.h))
+    assert np.median(absolute) > 1.5 * np.median(sigmas[:, 1])
+
+
+@pytest.mark.slow
+def test_systematic_sigmas_hold_over_seeds(truth: LaserSensor) -> None:
+    ratios = []
+    for seed in range(20):
+        errors, sigmas = errors_in_sheet(truth, calibrated(truth, np.random.default_rng((30, seed))))
+        ratios.append(errors / sigmas)
+    assert np.mean(np.abs(ratios) < 3.0) >= 0.95
+    assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4

@@ -17,8 +17,11 @@ import numpy.typing as npt
 import pytest
 
 from gpuvision.cli.main import application
+from gpuvision.host import Device
+from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.calibrating_sensor import TransportViews, calibrate_sensor
 from gpuvision.workflows.laser_images import pair_images
+from gpuvision.workflows.scanning import scan
 from laser_sensor import PITCH, PROFILES_BETWEEN, LaserSensor, sensor, up, write_images
 
 Float64 = npt.NDArray[np.float64]
@@ -228,3 +231,22 @@ def test_given_step_takes_the_transport_along_the_normal(images: Path) -> None:
     assert done.cell == 1e-3
     assert any("no transport views" in each for each in done.warnings)
     assert done.report()["transport"] is None
+
+
+@pytest.mark.slow
+def test_scan_measures_a_step_block(written: Path, device: Device) -> None:
+    """Frames of a block with steps of 6 mm, 120 columns wide, on the moving stage; the scan reads the written file."""
+    rng = np.random.default_rng(3)
+    row = np.arange(360.0)[:, None]
+    frames = np.full((24, 360, 480), 8.0) + rng.normal(0.0, 1.5, (24, 360, 480))
+    for profile in range(24):
+        for number, height in enumerate((-0.006, 0.0, 0.006)):
+            rows = TRUTH.line(up(TRUTH), TRUTH.origin + height * up(TRUTH) + profile * TRUTH.step)
+            step = slice(60 + 120 * number, 180 + 120 * number)
+            frames[profile, :, step] += 150.0 * np.exp(-0.5 * ((row - rows[step]) / 1.4) ** 2)
+    sensor_read = Sensor.load(written)
+    done = scan(np.clip(np.rint(frames), 0.0, 255.0).astype(np.uint8), sensor_read, device=device)
+    heights = [float(np.nanmean(done.points.z[:, start : start + 90])) for start in (75, 195, 315)]
+    pixel = 0.73e-3
+    assert np.abs(np.diff(heights) - 0.006).max() < 0.02 * pixel
+    assert np.abs(np.subtract(heights, (-0.006, 0.0, 0.006))).max() < 0.02 * pixel

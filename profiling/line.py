@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, host_view, to_numpy
 from gpuvision.profiling.harness import Case
@@ -194,7 +195,10 @@ def line_frames(count: int) -> Frames:
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield both centroids on 1, 16 and 64 frames, the fits, readout along rows, and readout with triangulation."""
+    """Yield both centroids on 1, 16 and 64 frames, the fits, readout along rows, and readout with triangulation.
+
+    The triangulation corrects a lens ("fused"), or a calibrated camera with a tilted sensor ("camera").
+    """
     centres: tuple[Method, ...] = ("centroid", "windowed")
     fits: tuple[Method, ...] = ("gauss3", "fir", "ml")
     for method in centres:
@@ -205,7 +209,8 @@ def cases(device: Device) -> Iterator[Case]:
     yield _case(device, LineReadout(method="windowed", along="rows", **_SETTINGS), 16, "windowed-rows/16")
     for method in centres:
         for count in (1, 16):
-            yield _fused_case(device, method, count)
+            yield _fused_case(device, method, count, "fused", {"lens": _LENS})
+        yield _fused_case(device, method, 16, "camera", {"camera": _CAMERA})
 
 
 # Case names in the results. "whole" (the whole profile) is older than the method name "centroid"; it stays, because
@@ -243,7 +248,15 @@ def _peers(readout: LineReadout, frames: Frames, across: Frames) -> dict[str, Ca
     return peers
 
 
-def _fused_case(device: Device, method: Method, count: int) -> Case:
+_LENS = Lens(k1=4e-8, k2=1e-14, centre=(COLUMNS / 2.0, ROWS / 2.0))
+# Focal length of 1000 px, sensor tilted by 20 degrees.
+_CAMERA = Camera(
+    matrix=((1000.0, 0.0, COLUMNS / 2.0), (0.0, 1000.0, ROWS / 2.0), (0.0, 0.0, 1.0)),
+    distortion=(-0.1, 0.05, *(0.0,) * 10, math.radians(20.0), 0.0),
+)
+
+
+def _fused_case(device: Device, method: Method, count: int, name: str, distortion: Mapping[str, Any]) -> Case:
     """Return a case with undistortion and triangulation in the same pass; the peer is our readout without them.
 
     The case gives no traffic: the copy that measures the limit of the device evicts the caches for the function that
@@ -252,7 +265,7 @@ def _fused_case(device: Device, method: Method, count: int) -> Case:
     sheet = Triangulation(
         homography=((1.1e-5, 2.0e-4, -0.1), (-2.2e-4, 1.0e-6, 0.06), (2.0e-4, 1.0e-5, 1.0)),
         region=((0.0, ROWS - 1.0), (0.0, COLUMNS - 1.0)),
-        lens=Lens(k1=4e-8, k2=1e-14, centre=(COLUMNS / 2.0, ROWS / 2.0)),
+        **distortion,
     )
     settings = {**_SETTINGS, "outputs": (*OUTPUTS, "g", "h")}
     alone, frames = _bound(device, LineReadout(method=method, **_SETTINGS), line_frames(count))
@@ -264,7 +277,7 @@ def _fused_case(device: Device, method: Method, count: int) -> Case:
     )
     error = float(np.nanmax(np.abs(to_numpy(fused.outputs.h) - to_numpy(expected.h))))
     peers = {"gpuvision": lambda: alone.run(shared)}
-    return Case("line", f"{_ROWS[method]}-fused/{count}", lambda: fused.run(shared), peers, error)
+    return Case("line", f"{_ROWS[method]}-{name}/{count}", lambda: fused.run(shared), peers, error)
 
 
 def _bound(device: Device, readout: LineReadout, frames: Frames) -> tuple[Any, Frames]:

@@ -167,7 +167,14 @@ FOLDING = {
 }
 
 
-@pytest.mark.parametrize("coefficients", FOLDING.values(), ids=FOLDING)
+@pytest.mark.parametrize(
+    "coefficients",
+    [
+        pytest.param(each, marks=pytest.mark.slow if name in ("k1 k2 k3", "tangential", "rational") else [])
+        for name, each in FOLDING.items()
+    ],
+    ids=FOLDING,
+)
 def test_fold_along_rays(coefficients: tuple[float, ...]) -> None:
     unit = camera(*coefficients, matrix=np.eye(3))
     finite = 0

@@ -95,7 +95,7 @@ def test_stripes_are_found_on_their_lines(camera: MountedCamera, rng: np.random.
     assert np.median(scan.sigmas[far > 5.0]) > 3.0 * np.median(scan.sigmas[far < 3.0])
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, BENT])
+@pytest.mark.parametrize("camera", [pytest.param(PINHOLE, marks=pytest.mark.slow), BENT])
 def test_a_robot_is_located_through_its_camera(camera: MountedCamera, rng: np.random.Generator, device: Device) -> None:
     field = read_field("robocup_msl")
     image = seen_ahead(carpet(), camera, POSE, shape=SHAPE, rng=rng)

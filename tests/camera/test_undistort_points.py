@@ -127,7 +127,7 @@ def test_the_other_two_ways(device: Device, name: str, inverse: bool, rng: np.ra
         assert assert_as_expected(operation, operation(points, device=device), points).mean() > 0.9
 
 
-@pytest.mark.parametrize("name", ["tilt", "all"])
+@pytest.mark.parametrize("name", [pytest.param("tilt", marks=pytest.mark.slow), "all"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("inverse", [False, True], ids=["undistort", "distort"])
 def test_another_matrix(device: Device, name: str, dtype: Any, inverse: bool, rng: np.random.Generator) -> None:
@@ -147,7 +147,7 @@ def test_double_arithmetic_on_single_points(device: Device, variant: Any, rng: n
         UndistortPoints(model=CAMERAS["all"], precision="single")(points.astype(float), device=device)
 
 
-@pytest.mark.parametrize("name", ["k1", "tangential", "tilt", "all"])
+@pytest.mark.parametrize("name", ["k1", "tangential", pytest.param("tilt", marks=pytest.mark.slow), "all"])
 def test_round_trip_in_double(device: Device, name: str, rng: np.random.Generator) -> None:
     points = image_points(rng)
     ideal = UndistortPoints(model=CAMERAS[name])(points, device=device)
@@ -181,7 +181,12 @@ def test_a_sensor_of_8000_pixels_in_single(
 @TWO_WAYS
 @pytest.mark.parametrize(
     "coefficients",
-    [(-0.4,), (-0.5, 0.1), (-0.3, 0.02, 0.02, -0.03), (0.1, 0.0, 0.01, 0.02, 0.0, 0.5, 0.1, 0.05)],
+    [
+        pytest.param((-0.4,), marks=pytest.mark.slow),
+        pytest.param((-0.5, 0.1), marks=pytest.mark.slow),
+        (-0.3, 0.02, 0.02, -0.03),
+        (0.1, 0.0, 0.01, 0.02, 0.0, 0.5, 0.1, 0.05),
+    ],
     ids=["k1", "k1 k2", "tangential", "rational decentred"],
 )
 def test_at_the_fold(device: Device, coefficients: tuple[float, ...], variant: Any, dtype: Any) -> None:

@@ -49,7 +49,11 @@ def test_likelihood_reaches_the_bound(device, rng, sigma, peak):
     assert deviation(readout, frame, places, device) < 1.05 * bound
 
 
-@pytest.mark.parametrize(("sigma", "peak"), FIGURES)
+@pytest.mark.parametrize(
+    # Each sigma has a window, and with it a kernel, of its own.
+    ("sigma", "peak"),
+    [pytest.param(*each, marks=pytest.mark.slow if each[0] in (0.5, 4.0) else []) for each in FIGURES],
+)
 def test_classical_methods(device, rng, sigma, peak):
     places, frame = trials(rng, sigma, peak)
     methods = (
@@ -66,7 +70,8 @@ def test_classical_methods(device, rng, sigma, peak):
 
 
 @pytest.mark.parametrize(
-    ("sigma", "windowed", "gauss3", "four_taps"), [(0.5, 0.0023, 0.0053, 0.0117), (1.0, 0.0046, 0.0001, 0.018)]
+    ("sigma", "windowed", "gauss3", "four_taps"),
+    [pytest.param(0.5, 0.0023, 0.0053, 0.0117, marks=pytest.mark.slow), (1.0, 0.0046, 0.0001, 0.018)],
 )
 def test_bias_without_noise(device, sigma, windowed, gauss3, four_taps):
     places = LENGTH // 2 + np.linspace(-0.5, 0.5, 201)

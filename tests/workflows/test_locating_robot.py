@@ -104,9 +104,9 @@ def is_correct(found: np.ndarray, pose: tuple[float, float, float]) -> bool:
     "kind",
     [pytest.param(each, marks=[] if each in ("lines", "mottled") else pytest.mark.slow) for each in sorted(NO_FIELDS)],
 )
-def test_what_is_no_field_is_refused(kind: str, rng: np.random.Generator) -> None:
+def test_what_is_no_field_is_refused(kind: str, rng: np.random.Generator, draws: Callable[[int, int], int]) -> None:
     field = read_field("robocup_msl")
-    for _ in range(6):
+    for _ in range(draws(2, 6)):
         found = locate_robot(scan_floor(NO_FIELDS[kind](rng), scale=SCALE, line_width=WIDE), field)
         assert found.reason
         assert found.candidates == ()

@@ -33,13 +33,13 @@ def demo(
     from gpuvision.host.files import atomic_write, write_text_atomic
     from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.demo import SENSORS, make_part, make_scan_task
-    from gpuvision.workflows.scan_result import SCAN_FILES
+    from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES
     from gpuvision.workflows.scanning import scan
     from gpuvision.workflows.simulating import simulate, simulate_recording
     from gpuvision.workflows.simulation_result import simulation_files
 
     outputs = Outputs("demo", overwrite=overwrite)
-    each_sensor = {*SCAN_FILES, *simulation_files(has_mask=False), "recording.npy"}
+    each_sensor = {*SCAN_FILES, *SIGMA_FILES, *simulation_files(has_mask=False), "recording.npy"}
     names = ["part.ply", "report.json", *(f"{name}/{file}" for name in SENSORS for file in sorted(each_sensor))]
     masked_folder = f"{SENSORS[-1]}_masked"
     outputs.claim_folder(out, [*names, *(f"{masked_folder}/{file}" for file in simulation_files(has_mask=True))])

@@ -146,7 +146,8 @@ def scan(
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
-    from gpuvision.workflows.scan_result import SCAN_FILES, surface_files
+    from gpuvision.workflows.scan_errors import budget_line
+    from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES, surface_files
     from gpuvision.workflows.scanning import scan as run
 
     described = Sensor.load(sensor)
@@ -170,7 +171,7 @@ def scan(
         return
     outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
     chosen_formats = [each.value for each in formats or ()]
-    outputs.claim_folder(out, (*SCAN_FILES, *surface_files(chosen_formats).values()))
+    outputs.claim_folder(out, (*SCAN_FILES, *SIGMA_FILES, *surface_files(chosen_formats).values()))
     outputs.claim(as_json)
     if trace is not None:
         if trace.absolute() in (out.absolute(), *out.absolute().parents):
@@ -193,7 +194,9 @@ def scan(
     write_report(as_json, done.report(), outputs)
     for advice in done.advice():
         echo(f"warning: {advice}", err=True)
-    echo(f"{done.summary()}\nlook at {out / 'picture.png'} and {out / 'report.json'}", err=prints_report(as_json))
+    lines = (done.summary(), budget_line(done.error_budget()))
+    look = f"look at {out / 'picture.png'} and {out / 'report.json'}"
+    echo("\n".join([*filter(None, lines), look]), err=prints_report(as_json))
 
 
 def _write_preview(

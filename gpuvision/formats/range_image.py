@@ -18,6 +18,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
 import cv2
@@ -41,7 +42,7 @@ _PNG_HEAD = 8 + 25  # signature and IHDR
 _PLY_TYPES = {"float32": "float", "float64": "double", "uint8": "uchar", "uint16": "ushort", "uint32": "uint"}
 _PLY_DTYPES = {name: np.dtype(dtype).newbyteorder("<") for dtype, name in _PLY_TYPES.items()}
 _UNITS_KEY = "units"
-_LONGEST_LINE, _MOST_LINES = 1000, 100  # characters and lines of the header of a PLY file; write_ply writes 15 lines
+_LONGEST_LINE, _MOST_LINES = 1000, 100  # characters and lines of the header of a PLY file; write_ply writes 21 lines
 
 Array = npt.NDArray[Any]
 Values: TypeAlias = npt.ArrayLike | DeviceArray
@@ -106,7 +107,14 @@ def _grid_table(grid: Grid | None) -> dict[str, float]:
 # ---- TIFF ------------------------------------------------------------------------------------------------------
 
 
-def write_tiff(path: str | os.PathLike[str], z: Values, grid: Grid | None = None, *, overwrite: bool = False) -> None:
+def write_tiff(
+    path: str | os.PathLike[str],
+    z: Values,
+    grid: Grid | None = None,
+    *,
+    quantity: str = "height",
+    overwrite: bool = False,
+) -> None:
     """Write heights as float32 TIFF: metres, NaN in holes.
 
     With a grid the resolution tags hold the cells per centimetre. The description is JSON: unit, value of a hole, grid.
@@ -119,6 +127,8 @@ def write_tiff(path: str | os.PathLike[str], z: Values, grid: Grid | None = None
         Heights [m], (rows, columns); NaN in holes.
     grid : Grid, optional
         Grid of the heights.
+    quantity : str
+        Name of the quantity in the description, default ``"height"``; for another length over the cells.
     overwrite : bool
         Whether an existing file may be replaced. Default False.
 
@@ -136,7 +146,7 @@ def write_tiff(path: str | os.PathLike[str], z: Values, grid: Grid | None = None
             file,
             z,
             photometric="minisblack",
-            description=json.dumps({"quantity": "height", "unit": "m", "hole": "NaN", **_grid_table(grid)}),
+            description=json.dumps({"quantity": quantity, "unit": "m", "hole": "NaN", **_grid_table(grid)}),
             metadata=None,
             software="gpuvision",
             resolutionunit="CENTIMETER" if cells else None,
@@ -266,6 +276,7 @@ def write_ply(
     intensity: Values | None = None,
     status: Values | None = None,
     *,
+    scalars: Mapping[str, Values] = MappingProxyType({}),
     organised: bool = True,
     overwrite: bool = False,
 ) -> None:
@@ -279,6 +290,8 @@ def write_ply(
         Coordinates [m], (profiles, samples), float32 or float64; the file keeps the type.
     intensity, status : array_like or device array, optional
         Intensity and `Status` flags, of the same shape.
+    scalars : mapping of str to array_like or device array, optional
+        More scalar fields of the points by name, of the same shape.
     organised : bool
         True (default): all samples in scan order, with NaN in holes, and ``obj_info num_cols`` (samples) and
         ``num_rows`` (profiles). False: the valid points only, for viewers that do not support NaN.
@@ -292,7 +305,7 @@ def write_ply(
     TypeError
         PLY does not support the type of an array.
     """
-    arrays = {"x": x, "y": y, "z": z, "intensity": intensity, "status": status}
+    arrays = {"x": x, "y": y, "z": z, "intensity": intensity, "status": status, **scalars}
     fields = {name: _numpy(each) for name, each in arrays.items() if each is not None}
     shape = fields["x"].shape
     for name, each in fields.items():

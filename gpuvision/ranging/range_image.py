@@ -90,6 +90,13 @@ def _unit(value: Any, what: str) -> Vector:
     return x, y, z
 
 
+def _check_jitter(transport: StraightTransport | RotatingSheet) -> None:
+    what = f"{type(transport).__name__}.jitter"
+    object.__setattr__(transport, "jitter", finite(transport.jitter, what))
+    if transport.jitter < 0.0:
+        raise ValueError(f"{what} is {transport.jitter}, expected 0 or more")
+
+
 class StraightTable(NamedTuple):
     """Parameters of ``kernels/range_image/range_image.cl`` after the limits, for a straight transport."""
 
@@ -145,6 +152,8 @@ class StraightTransport:
         Direction of the transport, from a profile to the next one; it is normalised.
     origin : (3,) array_like
         Point G = H = 0 of the sheet at L = 0 [m].
+    jitter : float
+        Standard deviation of the transport of a profile [m], >= 0, default 0; part of the predicted random errors.
     bend : BentSheet, optional
         Deviation of the light from the mean plane of the sheet, to which G and H refer; ``g_axis`` and ``h_axis`` must
         then be orthonormal. Default: a flat sheet.
@@ -166,9 +175,11 @@ class StraightTransport:
     h_axis: Vector = (0.0, 0.0, 1.0)
     direction: Vector = (0.0, 1.0, 0.0)
     origin: Vector = (0.0, 0.0, 0.0)
+    jitter: float = 0.0
     bend: BentSheet | None = None
 
     def __post_init__(self) -> None:
+        _check_jitter(self)
         if self.step is not None:
             object.__setattr__(self, "step", finite(self.step, "StraightTransport.step"))
         if self.step == 0.0:
@@ -223,7 +234,7 @@ class StraightTransport:
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, lists and tables, as in a TOML file."""
         table: dict[str, Any] = {} if self.step is None else {"step": self.step}
-        table |= {"start": self.start}
+        table |= {"start": self.start} | ({"jitter": self.jitter} if self.jitter else {})
         table |= {name: list(getattr(self, name)) for name in ("g_axis", "h_axis", "direction", "origin")}
         return table if self.bend is None else {**table, "bend": self.bend.to_dict()}
 
@@ -268,6 +279,8 @@ class RotatingSheet:
     first_angle, angle_step : float
         Angle of profile 0 and its change per profile [rad], used by `transport`. ``angle_step`` is ``None`` if an
         encoder measures the angle.
+    jitter : float
+        Standard deviation of the angle of a profile [rad], >= 0, default 0; part of the predicted random errors.
     along : {"rows", "columns"}
         Image axis along which the samples of a profile run, default ``"rows"``: one sample per row, the position is a
         column (a vertical line). ``"columns"``: one sample per column, the position is a row.
@@ -297,6 +310,7 @@ class RotatingSheet:
     sheet_offset: float = 0.0
     first_angle: float = 0.0
     angle_step: float | None = None
+    jitter: float = 0.0
     along: Literal["rows", "columns"] = "rows"
     lens: Lens | None = None
     scene_axes: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -304,6 +318,7 @@ class RotatingSheet:
     horizon: float = 1e-4
 
     def __post_init__(self) -> None:
+        _check_jitter(self)
         self._check_camera()
         for name in ("sheet_offset", "first_angle", "horizon"):
             object.__setattr__(self, name, finite(getattr(self, name), f"RotatingSheet.{name}"))
@@ -424,7 +439,7 @@ class RotatingSheet:
             value = getattr(self, name)
             if isinstance(value, Lens | Camera):
                 table[name] = value.to_dict()
-            elif value is not None:
+            elif value is not None and (name != "jitter" or value):
                 table[name] = np.array(value).tolist() if isinstance(value, tuple) else value
         return table
 

@@ -64,6 +64,7 @@ from gpuvision.sensor.transports import Encoder, Transport, read_transport
 
 Background = Literal["none", "median", "previous", "dark_after", "dark_before"]
 BACKGROUNDS: tuple[Background, ...] = get_args(Background)
+_NOISE_KEYS = ("read_noise", "gain", "speckle")
 Folded = Literal["drop", "top"]
 Ambiguous = Literal["drop", "keep"]
 
@@ -147,6 +148,9 @@ class Sensor:
     polygon
         Polygon mirror through which a point sensor looks. A frame is then a sweep of one facet, and its strips are
         the samples of the sweep.
+    noise_known
+        Whether the file gives the noise of the readout, so that a scan predicts its errors: ``read_noise``, ``gain`` or
+        ``speckle`` of a camera, ``[psd.noise]`` of a PSD.
     """
 
     name: str
@@ -159,6 +163,7 @@ class Sensor:
     light: Light | None = None
     encoder: Encoder | None = None
     polygon: PolygonScan | None = None
+    noise_known: bool = False
 
     @classmethod
     def load(cls, path: str | Path) -> Sensor:
@@ -231,6 +236,7 @@ class Sensor:
             polygon = read_polygon(top.optional_section("polygon"), frame[0], sheet)
         output = _output(top.section("output"))
         light = _light(top, transport)
+        noise_known = "noise" in readout if kind == "psd" else any(key in readout for key in _NOISE_KEYS)
         top.finish()
         return cls(
             name=name,
@@ -243,6 +249,7 @@ class Sensor:
             light=light,
             encoder=encoder,
             polygon=polygon,
+            noise_known=noise_known,
         )
 
     @classmethod
@@ -356,6 +363,7 @@ def _line(table: Section, along: Along, sheet: Triangulation | None, axes: Sampl
         fir_length=cast(Literal[4, 8], table.integer("fir_length", default.fir_length, at_least=4, at_most=8)),
         read_noise=table.number("read_noise", "grey levels", default.read_noise, at_least=0.0),
         gain=table.number("gain", "grey levels per electron", default.gain, at_least=0.0),
+        speckle=table.number("speckle", "pixel", default.speckle, at_least=0.0),
         triangulation=sheet,
         axes=axes,
     )

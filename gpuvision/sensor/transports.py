@@ -105,6 +105,7 @@ def _straight(table: Section) -> tuple[StraightTransport, Encoder | None]:
     transport = StraightTransport(
         step=None if encoder is not None else table.number("step", "m per profile"),
         start=start,
+        jitter=table.number("jitter", "m", 0.0, at_least=0.0),
         g_axis=read_vector(table, "g_axis", "", default.g_axis),
         h_axis=read_vector(table, "h_axis", "", default.h_axis),
         direction=read_vector(table, "direction", "", default.direction),
@@ -132,6 +133,7 @@ def _rotating(table: Section, optics: Optics, along: Along) -> tuple[RotatingShe
         sheet_normal=read_vector(table, "sheet_normal", ""),
         sheet_offset=table.number("sheet_offset", "m", 0.0),
         first_angle=first_angle,
+        jitter=table.number("jitter", "rad", 0.0, at_least=0.0),
         angle_step=None if encoder is not None else table.number("angle_step", "rad per profile", **limits),
         scene_axes=table.rows("scene_axes", "", 3, identity),
         scene_origin=read_vector(table, "scene_origin", "m", (0.0, 0.0, 0.0)),

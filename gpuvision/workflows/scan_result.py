@@ -26,6 +26,7 @@ from gpuvision.ranging.range_image import RangePoints, RotatingSheet
 from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
+from gpuvision.workflows.scan_errors import ScanErrors, error_budget
 
 Array = npt.NDArray[Any]
 PlyPoints = Literal["organised", "valid"]
@@ -40,6 +41,9 @@ SCAN_FILES = (
     "report.json",
 )
 """Names of the files that `Scan.write` writes."""
+
+SIGMA_FILES = ("range_image_sigma.tiff", "range_image_systematic.tiff")
+"""Names of the files that `Scan.write` also writes if the random and the systematic errors are known."""
 
 
 def surface_files(formats: Iterable[str]) -> dict[SurfaceFormat, str]:
@@ -112,6 +116,9 @@ class Scan:
         Further entries of the report: recording, sensor, rates [frames/s], delay of the replay [s].
     limits : ScanLimits
         Limits of the scan.
+    errors : ScanErrors, optional
+        Predicted errors of the points; None if the sensor file gives no noise. The random error of the height map is
+        ``heights.sigma``.
     """
 
     sensor: Sensor
@@ -125,6 +132,7 @@ class Scan:
     seconds: dict[str, float]
     metadata: dict[str, Any]
     limits: ScanLimits = ScanLimits()
+    errors: ScanErrors | None = None
 
     @property
     def valid_fraction(self) -> float:
@@ -163,6 +171,12 @@ class Scan:
         size = f"{self.grid.columns} x {self.grid.rows} cells"
         return f"{stream.frames} frames{dropped} at {speed}, {valid}, {size}{overdue}{stalled}{unordered}"
 
+    def error_budget(self) -> dict[str, Any]:
+        """Return the predicted and measured errors of the points and heights: see `scan_errors.error_budget`."""
+        sigma = self.heights.sigma
+        map_sigma = None if sigma is None else to_numpy(sigma)
+        return error_budget(self.errors, to_numpy(self.points.z), map_sigma, camera=self.sensor.kind == "camera")
+
     @property
     def throughput(self) -> float:
         """Frames per second."""
@@ -191,6 +205,7 @@ class Scan:
             "seconds": {"stream": stream.pop("seconds")} | self.seconds,
             "stream": stream,
             "map": dataclasses.asdict(self.grid) | {"valid_fraction": valid_cells},
+            "error_budget": self.error_budget(),
         }
 
     def write(
@@ -205,6 +220,9 @@ class Scan:
 
         ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` show the height map. ``range_image.ply``
         and ``scan.png`` show the organised points. ``range_image.npz`` holds both. ``report.json`` holds the report.
+        With a noise model ``range_image_sigma.tiff`` holds the random standard deviation of the height map; with the
+        covariance of a calibration ``range_image_systematic.tiff`` holds the systematic one. The PLY and NPZ files have
+        those of the points, ``sigma_x`` and ``systematic_x`` and so on.
 
         Parameters
         ----------
@@ -230,7 +248,23 @@ class Scan:
             write_tiff(inside / "range_image.tiff", z, self.grid)
             write_png16(inside / "range_image.png", z, self.grid)
             organised = ply_points == "organised"
-            write_ply(inside / "range_image.ply", *points[:3], self.intensity, points.status, organised=organised)
+            write_ply(
+                inside / "range_image.ply",
+                *points[:3],
+                self.intensity,
+                points.status,
+                scalars=self._point_sigmas(),
+                organised=organised,
+            )
+            if self.heights.sigma is not None:
+                write_tiff(inside / SIGMA_FILES[0], self.heights.sigma, self.grid, quantity="random sigma of height")
+            if self.errors is not None and self.errors.map_systematic is not None:
+                write_tiff(
+                    inside / SIGMA_FILES[1],
+                    self.errors.map_systematic,
+                    self.grid,
+                    quantity="systematic sigma of height",
+                )
             for each, name in surface_files(formats).items():
                 SURFACE_WRITERS[each][1](inside / name, z, self.grid)
             write_npz(inside / "range_image.npz", *self._arrays())
@@ -247,6 +281,14 @@ class Scan:
     def _title(self) -> str:
         return self.sensor.name or "Height map"
 
+    def _point_sigmas(self) -> dict[str, Array]:
+        """Return the standard deviations of the points [m] by name: random ``sigma_x``, ``systematic_x`` and so on."""
+        if self.errors is None:
+            return {}
+        groups = {"sigma": self.errors.random, "systematic": self.errors.systematic}
+        known = {name: each for name, each in groups.items() if each is not None}
+        return {f"{name}_{axis}": getattr(each, axis) for name, each in known.items() for axis in "xyz"}
+
     def _arrays(self) -> tuple[dict[str, Array], dict[str, str]]:
         """Return the arrays of ``range_image.npz`` and their units, by name."""
         light = "A" if self.sensor.kind == "psd" else "grey level"
@@ -260,7 +302,13 @@ class Scan:
             "map_z": (self.heights.z, "m"),
             "map_status": (self.heights.status, "flags"),
             "map_intensity": (self.heights.intensity, light),
+            **{name: (array, "m") for name, array in self._point_sigmas().items()},
         }
+        maps = {
+            "map_sigma": self.heights.sigma,
+            "map_systematic": None if self.errors is None else self.errors.map_systematic,
+        }
+        held |= {name: (array, "m") for name, array in maps.items() if array is not None}
         return {name: array for name, (array, _) in held.items()}, {name: unit for name, (_, unit) in held.items()}
 
 

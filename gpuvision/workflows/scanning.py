@@ -31,6 +31,7 @@ from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.workflows.focus_frames import read_focus_peak
 from gpuvision.workflows.opened_recording import open_for_scan
+from gpuvision.workflows.scan_errors import ScanErrors, predict_errors, sigma_outputs
 from gpuvision.workflows.scan_result import Scan, ScanLimits, scan_advice
 
 Array = npt.NDArray[Any]
@@ -104,10 +105,15 @@ def scan(
     paced, stream = _pipeline(source, readout, device, rate, policy, timeline)
     fields, frame_numbers = _read_frames(stream, readout.outputs or (), source.length, progress)
     start = time.perf_counter()
-    points = _points(sensor, fields, frame_numbers, stream.device)
+    points, errors = _points(sensor, fields, frame_numbers, stream.device)
     intensity = fields["peak" if sensor.kind == "camera" else "total"]
     middle = time.perf_counter()
-    heights, grid = resample_heights(sensor, points, intensity, stream.device, max_cells=limits.max_cells)
+    sigma = None if errors is None else errors.random.z
+    heights, grid = resample_heights(sensor, points, intensity, stream.device, max_cells=limits.max_cells, sigma=sigma)
+    if errors is not None and errors.systematic is not None:
+        # Linear interpolation of the systematic error, as of the intensity: the errors of neighbours are the same.
+        of_map, _ = resample_heights(sensor, points, errors.systematic.z, stream.device, max_cells=limits.max_cells)
+        errors = dataclasses.replace(errors, map_systematic=to_numpy(of_map.intensity))
     if timeline is not None:
         timeline.write_file()
     seconds = {"assemble": middle - start, "resample": time.perf_counter() - middle}
@@ -123,6 +129,7 @@ def scan(
         seconds=seconds,
         metadata=_metadata(name, sensor, rate, paced),
         limits=limits,
+        errors=errors,
     )
 
 
@@ -208,11 +215,13 @@ def _encoder(sensor: Sensor) -> dict[str, Any] | None:
 
 
 def _with_range_outputs(sensor: Sensor, precision: Precision) -> LineReadout | PsdReadout:
-    """Return the sensor's readout with only the outputs that a range image needs."""
+    """Return the sensor's readout with only the outputs that a range image and its errors need."""
     assert not isinstance(sensor.readout, FocusStack)  # it has no stream of profiles
     positions = ("position",) if isinstance(sensor.transport, RotatingSheet) else ("g", "h")
     light = "peak" if sensor.kind == "camera" else "total"
-    return dataclasses.replace(sensor.readout, outputs=(*positions, light, "status"), precision=precision)
+    return dataclasses.replace(
+        sensor.readout, outputs=(*positions, light, "status", *sigma_outputs(sensor)), precision=precision
+    )
 
 
 def _pipeline(
@@ -251,8 +260,13 @@ def _read_frames(
     )
 
 
-def _points(sensor: Sensor, fields: dict[str, Array], frame_numbers: Array, device: Device) -> RangePoints:
-    """Return the organised range image of the readout's outputs, with the transport of each frame number."""
+def _points(
+    sensor: Sensor, fields: dict[str, Array], frame_numbers: Array, device: Device
+) -> tuple[RangePoints, ScanErrors | None]:
+    """Return the organised range image of the readout's outputs, with the transport of each frame number.
+
+    With a noise model also return the predicted errors.
+    """
     positions = [fields[name] for name in ("position", "g", "h") if name in fields]
     transports, status = sensor.transports(int(frame_numbers[-1]) + 1), fields["status"]
     if sensor.encoder is not None:
@@ -260,7 +274,9 @@ def _points(sensor: Sensor, fields: dict[str, Array], frame_numbers: Array, devi
     if sensor.polygon is not None:
         transports = sensor.polygon.sample_transports(transports, status.shape[1])
     transports = transports[frame_numbers]
-    return assemble_points(sensor, positions, transports, status, device)
+    points = assemble_points(sensor, positions, transports, status, device)
+    errors = predict_errors(sensor, fields, points, transports, device) if "sigma" in fields else None
+    return points, errors
 
 
 def assemble_points(
@@ -309,7 +325,13 @@ def _drop_ambiguous(sensor: Sensor, points: RangePoints) -> None:
 
 
 def resample_heights(
-    sensor: Sensor, points: RangePoints, light: Array, device: Device, *, max_cells: int = ScanLimits.max_cells
+    sensor: Sensor,
+    points: RangePoints,
+    light: Array,
+    device: Device,
+    *,
+    max_cells: int = ScanLimits.max_cells,
+    sigma: Array | None = None,
 ) -> tuple[HeightMap, Grid]:
     """Resample an organised range image to a height map over the grid of the sensor file (``[output]``).
 
@@ -325,6 +347,8 @@ def resample_heights(
         Device of the computation.
     max_cells : int
         Largest number of cells of the grid, default 2^26.
+    sigma : numpy.ndarray, optional
+        Random standard deviation of z [m], (profiles, samples); requests that of the heights.
 
     Returns
     -------
@@ -359,8 +383,9 @@ def resample_heights(
         folded=output.folded,
         along=along,
         across=across,
+        sigma=sigma is not None,
     )
-    return regrid(x, y, z, light, status, device=device), grid
+    return regrid(x, y, z, light, status, sigma, device=device), grid
 
 
 def _directions(x: Array, y: Array) -> tuple[Direction, Direction]:

@@ -292,8 +292,9 @@ def test_the_command_scans(tmp_path: Path, run: Any) -> None:
         "--precision", "double", "--rate", "1000", "--policy", "block", "--trace", trace,
     )  # fmt: skip
     assert (ran.code, ran.err) == (0, "")
-    assert {each.name for each in out.iterdir()} == FILES
+    assert {each.name for each in out.iterdir()} == FILES | {"range_image_sigma.tiff"}  # the sensor gives its noise
     assert "12 frames at" in ran.out
+    assert re.search(r"sigma of z [0-9.e+-]+ um random \(readout .* um, transport 0 um\); systematic unknown", ran.out)
     assert str(out / "picture.png") in ran.out
     report = json.loads((out / "report.json").read_text())
     assert (report["precision"], report["rate"], report["stream"]["policy"]) == ("double", 1000.0, "block")

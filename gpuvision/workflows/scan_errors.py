@@ -1,0 +1,260 @@
+"""Predicted and measured errors of a scan: standard deviations of its points, and the error budget of the report.
+
+Random errors differ from sample to sample or from profile to profile: the noise of the readout, the jitter of the
+transport. Systematic errors are the same in all profiles: the calibration. The two are never added.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device, to_numpy
+from gpuvision.ranging.range_image import RangeImage, RangePoints, StraightTransport
+from gpuvision.sensor.sensor import Sensor
+
+Array = npt.NDArray[Any]
+
+_PROFILES = 256  # largest number of profiles that determine the measured scatter. Chosen: its cost stays below 0.1 s
+_FEWEST = 100  # smallest number of samples that determine a median absolute deviation, to about 12 %
+_NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+_PLANE_SHARE = 8.0 / 9.0  # variance of a sample's residual from the plane through its 3 x 3 samples, over its variance
+
+
+class PointSigma(NamedTuple):
+    """Standard deviations of points.
+
+    Attributes
+    ----------
+    x, y, z
+        Of each coordinate [m], (profiles, samples); NaN where they are unknown.
+    """
+
+    x: Array
+    y: Array
+    z: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanErrors:
+    """Predicted errors of the points of a scan.
+
+    Attributes
+    ----------
+    position : numpy.ndarray
+        Standard deviation of the readout's positions, (profiles, samples): pixels of a camera, metres of a PSD.
+    readout : PointSigma
+        Random error by the noise of the readout.
+    transport : PointSigma
+        Random error by the jitter of the transport, the same for all samples of a profile.
+    random : PointSigma
+        Both together.
+    systematic : PointSigma, optional
+        Systematic error by the covariance of the calibration; None if the sensor file gives no covariance.
+    map_systematic : numpy.ndarray, optional
+        Systematic error of the height map [m], over the cells.
+    """
+
+    position: Array
+    readout: PointSigma
+    transport: PointSigma
+    random: PointSigma
+    systematic: PointSigma | None
+    map_systematic: Array | None = None
+
+
+def sigma_outputs(sensor: Sensor) -> tuple[str, ...]:
+    """Return the outputs of a readout from which `predict_errors` works; none if the sensor file gives no noise."""
+    if not sensor.noise_known or sensor.polygon is not None:
+        return ()
+    if not isinstance(sensor.transport, StraightTransport):
+        return ("sigma",)
+    sheet = getattr(sensor.readout, "triangulation", None)
+    systematic = ("systematic_g", "systematic_h") if sheet is not None and sheet.covariance is not None else ()
+    return ("sigma", "sigma_g", "sigma_h", *systematic)
+
+
+def predict_errors(
+    sensor: Sensor, fields: Mapping[str, Array], points: RangePoints, transports: Array, device: Device
+) -> ScanErrors:
+    """Predict the errors of the points of a scan.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Gives the geometry and the jitter of the transport.
+    fields : mapping of str to numpy.ndarray
+        Outputs of the readout by name, (profiles, samples), with those of `sigma_outputs`.
+    points : RangePoints
+        Points of the scan.
+    transports : numpy.ndarray
+        Transport of each profile, (profiles,).
+    device : Device
+        Device of the computation.
+
+    Returns
+    -------
+    ScanErrors
+
+    Notes
+    -----
+    First order. g and h err together. For straight transport the error of a coordinate is taken as the sum of both
+    parts: exact where the coordinate depends on one of g and h, else an upper bound. The bend of a sheet, a small part
+    of the slope, is left out.
+    """
+    if isinstance(sensor.transport, StraightTransport):
+        axes = sensor.transport
+        readout = _along_axes(axes, fields["sigma_g"], fields["sigma_h"])
+        shifts = [abs(each) * _jitter(sensor) for each in axes.direction]
+        transport = PointSigma(*(np.full_like(each, shift) for each, shift in zip(readout, shifts, strict=True)))
+        systematic = None
+        if "systematic_g" in fields:
+            systematic = _along_axes(axes, fields["systematic_g"], fields["systematic_h"])
+    else:
+        position, sigma = fields["position"], fields["sigma"]
+        readout = _displacement(sensor, points, position + sigma, transports, device)
+        transport = _displacement(sensor, points, position, transports + _jitter(sensor), device)
+        systematic = None
+    random = PointSigma(*(np.hypot(*each) for each in zip(readout, transport, strict=True)))
+    return ScanErrors(
+        position=fields["sigma"], readout=readout, transport=transport, random=random, systematic=systematic
+    )
+
+
+def _jitter(sensor: Sensor) -> float:
+    """Return the standard deviation of the transport of a profile, with the quantisation of an encoder."""
+    quantisation = 0.0 if sensor.encoder is None else abs(sensor.encoder.scale) / math.sqrt(12.0)
+    return math.hypot(sensor.transport.jitter, quantisation)
+
+
+def _along_axes(axes: StraightTransport, sigma_g: Array, sigma_h: Array) -> PointSigma:
+    parts = [abs(g) * sigma_g + abs(h) * sigma_h for g, h in zip(axes.g_axis, axes.h_axis, strict=True)]
+    return PointSigma(*parts)
+
+
+def _displacement(
+    sensor: Sensor, points: RangePoints, position: Array, transports: Array, device: Device
+) -> PointSigma:
+    """Return by how much the points move for other positions or transports."""
+    assemble = RangeImage(geometry=sensor.transport)
+    status = np.zeros(position.shape, np.uint8)
+    moved = assemble(position, transports.astype(position.dtype), status, device=device)
+    return PointSigma(*(np.abs(to_numpy(new) - to_numpy(old)) for new, old in zip(moved[:3], points[:3], strict=True)))
+
+
+def scatter_about_plane(z: Array) -> float:
+    """Return the robust standard deviation of heights about the plane through the 3 x 3 samples around each.
+
+    Parameters
+    ----------
+    z : numpy.ndarray
+        Heights of an organised range image [m], (profiles, samples); NaN in holes.
+
+    Returns
+    -------
+    float
+        Standard deviation [m]; NaN if fewer than 100 samples have eight neighbours.
+
+    Notes
+    -----
+    For noise that is independent from sample to sample. Correlated noise (speckle larger than a sample) scatters less
+    about the plane. The median absolute deviation ignores edges; a curved surface adds its curvature.
+    """
+    profiles, samples = z.shape
+    if profiles < 3 or samples < 3:
+        return math.nan
+    middles = np.unique(np.linspace(1, profiles - 2, min(profiles - 2, _PROFILES)).astype(int))
+    rows = [z[middles + step].astype(np.float64) for step in (-1, 0, 1)]
+    columns = rows[0] + rows[1] + rows[2]
+    mean = (columns[:, :-2] + columns[:, 1:-1] + columns[:, 2:]) / 9.0
+    residuals = (rows[1][:, 1:-1] - mean).ravel()
+    residuals = residuals[np.isfinite(residuals)]
+    if residuals.size < _FEWEST:
+        return math.nan
+    deviation = np.median(np.abs(residuals - np.median(residuals)))
+    return float(_NORMAL * deviation / math.sqrt(_PLANE_SHARE))
+
+
+def error_budget(errors: ScanErrors | None, z: Array, map_sigma: Array | None, *, camera: bool) -> dict[str, Any]:
+    """Return the error budget of a scan for its report: medians [m], None where they are unknown.
+
+    Parameters
+    ----------
+    errors : ScanErrors or None
+        Predicted errors; None without a noise model.
+    z : numpy.ndarray
+        Heights of the organised range image [m].
+    map_sigma : numpy.ndarray or None
+        Random standard deviation of the height map [m].
+    camera : bool
+        Whether positions are pixels.
+
+    Returns
+    -------
+    dict
+        ``random``: ``readout``, ``transport`` and ``total``, each with x, y and z; ``systematic``: ``calibration``;
+        ``map``: ``random`` and ``systematic`` of the heights; ``position``: of the readout [px or m]; ``measured``:
+        ``scatter`` of z about a local plane, its ``ratio`` to the predicted readout noise, and ``speckle``, the value
+        of ``[line] speckle`` [px] that explains a ratio above 1.
+    """
+    scatter = _finite(scatter_about_plane(z))
+    measured: dict[str, Any] = {"scatter": scatter, "ratio": None, "speckle": None}
+    if errors is None:
+        return {"random": None, "systematic": None, "map": None, "position": None, "measured": measured}
+    predicted, position = _median(errors.readout.z), _median(errors.position)
+    if scatter is not None and predicted and position is not None:
+        measured["ratio"] = scatter / predicted
+        if camera and scatter > predicted:
+            measured["speckle"] = position * math.sqrt((scatter / predicted) ** 2 - 1.0)
+    return {
+        "random": {
+            "readout": _medians(errors.readout),
+            "transport": _medians(errors.transport),
+            "total": _medians(errors.random),
+        },
+        "systematic": None if errors.systematic is None else {"calibration": _medians(errors.systematic)},
+        "map": {"random": _median(map_sigma), "systematic": _median(errors.map_systematic)},
+        "position": position,
+        "measured": measured,
+    }
+
+
+def budget_line(budget: Mapping[str, Any]) -> str:
+    """Return one line about the heights of an error budget; empty if nothing is known about them."""
+    scatter, ratio = budget["measured"]["scatter"], budget["measured"]["ratio"]
+    parts: Sequence[str] = ()
+    if budget["random"] is not None and budget["random"]["total"]["z"] is not None:
+        random = {name: each["z"] for name, each in budget["random"].items()}
+        parts = (
+            f"sigma of z {_micrometres(random['total'])} random (readout {_micrometres(random['readout'])}, transport "
+            f"{_micrometres(random['transport'])})",
+            "systematic unknown: no covariance"
+            if budget["systematic"] is None
+            else f"{_micrometres(budget['systematic']['calibration']['z'])} systematic",
+        )
+    if scatter is not None:
+        compared = "" if ratio is None else f" ({ratio:.2f} times the readout's)"
+        parts = (*parts, f"z scatters by {_micrometres(scatter)} about a local plane{compared}")
+    return "; ".join(parts)
+
+
+def _micrometres(length: float | None) -> str:
+    return "unknown" if length is None else f"{1e6 * length:.3g} um"
+
+
+def _medians(sigma: PointSigma) -> dict[str, float | None]:
+    return {name: _median(each) for name, each in zip("xyz", sigma, strict=True)}
+
+
+def _median(values: Array | None) -> float | None:
+    known = np.empty(0) if values is None else values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else None
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

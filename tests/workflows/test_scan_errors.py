@@ -1,0 +1,184 @@
+"""Errors of a scan: the predicted standard deviations are the scatter of simulated recordings, in every output file."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from gpuvision.formats.range_image import read_ply
+from gpuvision.host import Device, to_numpy
+from gpuvision.ranging.range_image import RangeImage
+from gpuvision.reference.line import pixel_gaussian
+from gpuvision.schema import DescriptionError, read_toml
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.workflows.scan_errors import budget_line, error_budget, predict_errors, scatter_about_plane
+from gpuvision.workflows.scanning import scan
+
+READ_NOISE, GAIN, JITTER = 1.5, 0.1, 20e-6
+PRESETS = Path(__file__).parents[2] / "gpuvision" / "presets" / "sensors"
+
+
+def noisy_camera(**changes: Any) -> Sensor:
+    """Return the shipped camera with a noise model, a jitter of the transport and a covariance of the calibration."""
+    sensor = Sensor.load("camera_line")
+    readout: Any = sensor.readout
+    sheet = dataclasses.replace(readout.triangulation, covariance=np.diag([1e-12] * 6 + [1e-10] * 2))
+    readout = dataclasses.replace(
+        readout, window=6, read_noise=READ_NOISE, gain=GAIN, triangulation=sheet, outputs=None, **changes
+    )
+    transport: Any = dataclasses.replace(sensor.transport, jitter=JITTER)
+    return dataclasses.replace(sensor, readout=readout, transport=transport, noise_known=True)
+
+
+def frames_of_plane(rng: np.random.Generator, frames: int) -> Any:
+    """Return frames (n, 64, 480) of a line near row 30 that is slightly tilted, with shot noise and read noise."""
+    places = 30.2 + 0.01 * np.arange(480)[None, :] + np.zeros((frames, 1))
+    light = pixel_gaussian(np.arange(64)[None, :, None], places[:, None, :], 1.5, 150.0, 4.0)
+    noisy = rng.poisson(light / GAIN) * GAIN + rng.normal(0.0, READ_NOISE, light.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def test_predicted_errors_are_the_scatter(
+    device: Device, rng: np.random.Generator, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sensor = noisy_camera()
+    made = scan(frames_of_plane(rng, 60), sensor, device=device)
+    assert made.errors is not None
+    z, x = to_numpy(made.points.z).astype(np.float64), to_numpy(made.points.x).astype(np.float64)
+    # Each column sees the same place in all frames: 60 frames x 480 columns determine the scatter to 0.4 %.
+    for values, predicted in ((z, made.errors.random.z), (x, made.errors.random.x)):
+        assert np.sqrt(np.mean(np.var(values, axis=0, ddof=1))) == pytest.approx(
+            np.sqrt(np.mean(predicted**2)), rel=0.05
+        )
+    np.testing.assert_allclose(made.errors.random.y, JITTER, rtol=1e-6)
+    # Cells along a line of the plane: the map interpolates four samples at most.
+    heights, sigma = to_numpy(made.heights.z).astype(np.float64), to_numpy(made.heights.sigma)
+    inside = heights[5:-5, 20:-20]
+    assert np.sqrt(np.mean(np.var(inside, axis=0, ddof=1))) == pytest.approx(
+        np.sqrt(np.mean(sigma[5:-5, 20:-20] ** 2)), rel=0.1
+    )
+    assert np.nanmax(sigma) <= np.nanmax(made.errors.random.z) * (1 + 1e-6)
+
+    budget = made.report()["error_budget"]
+    assert budget["measured"]["ratio"] == pytest.approx(1.0, abs=0.06)
+    assert budget["random"]["transport"] == {"x": 0.0, "y": pytest.approx(JITTER), "z": 0.0}
+    assert budget["random"]["total"]["z"] == pytest.approx(np.median(made.errors.random.z[np.isfinite(z)]), rel=1e-6)
+    made.write(tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["error_budget"] == budget
+    points = read_ply(tmp_path / "out" / "range_image.ply")
+    with np.load(tmp_path / "out" / "range_image.npz") as held:
+        for axis in "xyz":
+            for name, group in (("sigma", made.errors.random), ("systematic", made.errors.systematic)):
+                np.testing.assert_array_equal(points[f"{name}_{axis}"], getattr(group, axis))
+                np.testing.assert_array_equal(held[f"{name}_{axis}"], getattr(group, axis))
+        np.testing.assert_array_equal(held["map_sigma"], sigma)
+        np.testing.assert_array_equal(held["map_systematic"], made.errors.map_systematic)
+    for file, values in (("sigma", sigma), ("systematic", made.errors.map_systematic)):
+        with tifffile.TiffFile(tmp_path / "out" / f"range_image_{file}.tiff") as tiff:
+            np.testing.assert_array_equal(tiff.pages[0].asarray(), values)
+            assert file[:6] in tiff.pages[0].description  # type: ignore[union-attr]
+
+
+def test_systematic_errors_are_those_of_the_calibration(device: Device, rng: np.random.Generator) -> None:
+    """The oracle is the covariance of the triangulation in NumPy, at the sensor positions of the points."""
+    sensor = noisy_camera()
+    made = scan(frames_of_plane(rng, 3), sensor, device=device)
+    assert made.errors is not None
+    assert made.errors.systematic is not None
+    readout: Any = sensor.readout
+    sheet = readout.triangulation
+    profile, samples = 1, [10, 200, 470]
+    g, h = (to_numpy(each)[profile, samples].astype(np.float64) for each in (made.points.x, made.points.z))
+    points = sheet.to_sensor(np.stack([g, h], axis=-1))
+    expected = sheet.covariance_at(points)  # without `sigma` it holds the parameters' part only
+    systematic = made.errors.systematic
+    np.testing.assert_allclose(systematic.x[profile, samples], np.sqrt(expected[:, 0, 0]), rtol=1e-3)
+    np.testing.assert_allclose(systematic.z[profile, samples], np.sqrt(expected[:, 1, 1]), rtol=1e-3)
+    of_map = made.errors.map_systematic
+    assert of_map is not None
+    known = np.isfinite(of_map)
+    assert known.mean() > 0.5
+    assert np.nanmin(systematic.z) * 0.999 <= of_map[known].min()
+    assert of_map[known].max() <= np.nanmax(systematic.z) * 1.001
+
+
+def test_errors_of_a_rotating_sheet(device: Device, rng: np.random.Generator) -> None:
+    sensor = Sensor.load("corner_scene")
+    transport: Any = dataclasses.replace(sensor.transport, jitter=2e-4)
+    sensor = dataclasses.replace(sensor, transport=transport, noise_known=True)
+    trials = 3000
+    angles = np.full(trials, float(transport.transport(80)[64]))
+    position = np.tile(np.linspace(500.0, 800.0, 16), (trials, 1))
+    sigma, status = np.full(position.shape, 0.2), np.zeros(position.shape, np.uint8)
+    assemble = RangeImage(geometry=transport)
+    noisy = assemble(
+        position + rng.normal(0.0, 0.2, position.shape), angles + rng.normal(0.0, 2e-4, trials), status, device=device
+    )
+    true = assemble(position, angles, status, device=device)
+    errors = predict_errors(sensor, {"position": position, "sigma": sigma}, true, angles, device)
+    for drawn, predicted in zip(noisy[:3], errors.random, strict=True):
+        # 3000 trials determine a standard deviation to 1.3 %.
+        np.testing.assert_allclose(np.std(drawn, axis=0), predicted[0], rtol=0.07, atol=1e-7)
+
+
+def test_scatter_about_a_plane(rng: np.random.Generator) -> None:
+    profile, sample = np.mgrid[:80, :90]
+    z = 0.01 * profile - 0.02 * sample + rng.normal(0.0, 3e-3, (80, 90))
+    z[40:] += 5.0  # a step: its edge is one profile wide
+    z[10:14, 10:30] = np.nan
+    # 5500 residuals, each from nine samples: the median deviation is determined to about 3 %.
+    assert scatter_about_plane(z) == pytest.approx(3e-3, rel=0.08)
+    assert np.isnan(scatter_about_plane(z[:2]))
+    assert np.isnan(scatter_about_plane(np.full((50, 50), np.nan)))
+
+
+def test_without_a_noise_model_only_the_scatter_is_known(
+    device: Device, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    made = scan(frames_of_plane(rng, 12), Sensor.load("camera_line"), device=device)
+    assert made.errors is None
+    assert made.heights.sigma is None
+    budget = made.error_budget()
+    assert budget["random"] is None
+    assert budget["measured"]["scatter"] > 0
+    assert budget_line(budget).startswith("z scatters by")
+    made.write(tmp_path / "out")
+    assert not (tmp_path / "out" / "range_image_sigma.tiff").exists()
+    empty = error_budget(None, np.full((5, 5), np.nan), None, camera=True)
+    assert budget_line(empty) == ""
+
+
+def test_speckle_that_explains_the_scatter(device: Device, rng: np.random.Generator) -> None:
+    """Noise that is half of the real one: the speckle of the budget, put into the sensor file, makes the ratio 1."""
+    frames = frames_of_plane(rng, 40)
+    sensor = noisy_camera(speckle=0.0)
+    readout: Any = sensor.readout
+    weak = dataclasses.replace(
+        sensor, readout=dataclasses.replace(readout, read_noise=READ_NOISE / 2, gain=GAIN / 4, outputs=None)
+    )
+    measured = scan(frames, weak, device=device).error_budget()["measured"]
+    assert measured["ratio"] == pytest.approx(2.0, rel=0.1)
+    mended = dataclasses.replace(weak, readout=dataclasses.replace(weak.readout, speckle=measured["speckle"]))
+    again = scan(frames, mended, device=device).error_budget()["measured"]
+    assert again["ratio"] == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize("kind", ["camera_line", "psd_line"])
+def test_sensor_file_gives_noise_and_jitter(tmp_path: Path, kind: str) -> None:
+    text = (PRESETS / f"{kind}.toml").read_text()
+    assert Sensor.load(kind).noise_known == (kind == "psd_line")
+    path = tmp_path / "sensor.toml"
+    with_jitter = text.replace('kind = "straight"', 'kind = "straight"\njitter = 3e-6')
+    path.write_text(with_jitter.replace("[line]", "[line]\nspeckle = 0.02\ngain = 0.1"))
+    sensor = Sensor.from_section(read_toml(path))
+    assert sensor.noise_known
+    assert sensor.transport.jitter == 3e-6
+    path.write_text(text.replace('kind = "straight"', 'kind = "straight"\njitter = -3e-6'))
+    with pytest.raises(DescriptionError, match="jitter"):
+        Sensor.from_section(read_toml(path))

@@ -46,11 +46,14 @@ class Selection(NamedTuple):
 def select_full(items: Sequence[pytest.Item], best: Collection[Device]) -> Selection:
     """Return the full tier of some tests; `best` has the best device.
 
-    The best device runs all tests, every other device a covering design of each product of three or more parameters,
-    and no slow tests: these measure accuracy, which the comparison of the devices with the references covers.
+    The best device runs all tests. Every other device runs no slow tests: these measure accuracy, which the comparison
+    of the devices with the references covers. Of the tests of kernels it runs designs that hold each pair of values, of
+    tests that use the kernels of other files smaller designs.
     """
     others = [item for item in items if device_of(item) not in (None, *best)]
-    kept = set(_designed([item for item in others if item.get_closest_marker("slow") is None], pairs=True))
+    short = [item for item in others if item.get_closest_marker("slow") is None]
+    kept = set(_designed([item for item in short if _is_of_kernel(item)], pairs=True))
+    kept.update(_designed([item for item in short if not _is_of_kernel(item)]))
     left = [item for item in others if item not in kept]
     omitted = set(left)
     return Selection([item for item in items if item not in omitted], left, set())
@@ -160,8 +163,11 @@ def _smoke_case(item: pytest.Item) -> tuple[Any, ...] | None:
     """
     if _is_of_host(item):
         return (item.path, function_of(item), str(device_of(item)))
-    is_of_kernel = item.path.stem in _OF_KERNELS and item.path.parent.name not in _COMPOSED
-    return (item.path, "", str(device_of(item))) if is_of_kernel else None
+    return (item.path, "", str(device_of(item))) if _is_of_kernel(item) else None
+
+
+def _is_of_kernel(item: pytest.Item) -> bool:
+    return item.path.stem in _OF_KERNELS and item.path.parent.name not in _COMPOSED
 
 
 def _is_of_host(item: pytest.Item) -> bool:

@@ -13,9 +13,12 @@ import trimesh
 import board_images
 import gpuvision as gv
 import laser_sensor
+import paste_maps
 import target_images
 from boards import LAYERS, board_folder
 from floors import floor_image
+from gpuvision.formats.range_image import write_tiff
+from gpuvision.inspection.apertures import BoardPlacement
 from scanning import line_frames
 
 
@@ -73,6 +76,21 @@ def _floor(folder: Path) -> dict[str, Any]:
     return {}
 
 
+def _paste(folder: Path) -> dict[str, Any]:
+    gerbers = folder / "gerbers"
+    gerbers.mkdir()
+    places = [(1.0, 1.0), (2.0, 1.1), (1.4, 1.8), (2.3, 2.1)]
+    flashes = "".join(f"X{round(x * 1e6)}Y{round(y * 1e6)}D03*\n" for x, y in places)
+    head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n%ADD10C,0.4*%\nD10*\n"
+    (gerbers / "paste.gbr").write_text(f"{head}{flashes}M02*\n")
+    grid = paste_maps.board_grid(160, 150, cell=20e-6)
+    here = BoardPlacement(x=-30e-6, y=20e-6, theta=0.01)
+    caps = [(paste_maps.Cap(200e-6, 130e-6), (1e-3 * x, 1e-3 * y)) for x, y in places]
+    z = paste_maps.paste_map(grid, here, caps) + np.random.default_rng(1).normal(0.0, 1e-6, grid.shape)
+    write_tiff(folder / "heights.tiff", z, grid)
+    return {}
+
+
 INPUTS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "docs/guides/scan_recording.md": _recording,
     "docs/guides/calibrate_lens.md": _one_image,
@@ -81,4 +99,5 @@ INPUTS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "docs/guides/simulate_part.md": _part,
     "docs/guides/locate_board.md": _board,
     "docs/guides/locate_robot.md": _floor,
+    "docs/guides/inspect_paste.md": _paste,
 }

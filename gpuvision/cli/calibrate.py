@@ -23,6 +23,8 @@ from gpuvision.cli.arguments import (
     write_report,
 )
 from gpuvision.cli.calibrate_sensor import (
+    BlockFolder,
+    BlockHeights,
     Channel,
     LaserFolder,
     LineAxis,
@@ -124,6 +126,8 @@ def calibrate(
     transport_views: TransportFolder = None,
     profiles_between: ProfilesBetween = None,
     on_stage: OnStage = False,
+    block: BlockFolder = None,
+    block_heights: BlockHeights = None,
     step: Step = None,
     along: LineAxis = None,
     channel: Channel = None,
@@ -135,7 +139,9 @@ def calibrate(
     Every parameter comes with its standard deviation. The report lists other models that fit equally well and warns of
     parameters that the images do not determine.
     """
-    options = SensorOptions(laser, transport_views, profiles_between, on_stage, step, along, channel)
+    options = SensorOptions(
+        laser, transport_views, profiles_between, on_stage, block, block_heights, step, along, channel
+    )
     if not sensor:
         reject_unused("without --sensor", **options._asdict())
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from gpuvision.cli.arguments import echo, named_path, prints_report, write_report
+from gpuvision.cli.arguments import echo, named_path, prints_report, quantities, write_report
 from gpuvision.cli.scan import progress_bar
 
 if TYPE_CHECKING:
     from gpuvision.camera.calibration import Calibration
     from gpuvision.host.recordings import Channel as RecordingChannel
-    from gpuvision.workflows.calibrating_sensor import SensorCalibration
+    from gpuvision.workflows.calibrating_sensor import BlockViews, SensorCalibration, TransportViews
 
 
 class Axis(StrEnum):
@@ -57,6 +57,23 @@ OnStage = Annotated[
     bool,
     typer.Option("--on-stage", help="The target of the transport views lies on the stage: its plane is z = 0."),
 ]
+BlockFolder = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        parser=named_path,
+        help="With --sensor and transport views: folder with pairs of images (block1.png, block1_laser.png) of a "
+        "stepped block on the stage, instead of laser images of the target or beside them.",
+    ),
+]
+BlockHeights = Annotated[
+    str | None,
+    typer.Option(
+        metavar="H,H,...",
+        help="Heights of the block's steps over the plane of the target on the stage, along the laser line in the "
+        "direction of growing columns (or rows), such as 0,5mm,10mm.",
+    ),
+]
 Step = Annotated[
     float | None,
     typer.Option(
@@ -85,6 +102,8 @@ class SensorOptions(NamedTuple):
     transport_views: Path | None
     profiles_between: float | None
     on_stage: bool
+    block: Path | None
+    block_heights: str | None
     step: float | None
     along: Axis | None
     channel: str | None
@@ -123,7 +142,7 @@ def calibrate_sensor(
 
     channel = _checked_channel(options.channel)
     _check(options, camera)
-    inputs = [*images, *(each for each in (options.laser, options.transport_views) if each is not None)]
+    inputs = [*images, *(each for each in (options.laser, options.transport_views, options.block) if each is not None)]
     outputs = Outputs("calibrate", inputs=inputs, overwrite=overwrite)
     outputs.claim(*sensor_calibration_files(out), as_json)
     with progress_bar(f"detecting {camera['pattern']}") as progress:
@@ -131,6 +150,7 @@ def calibrate_sensor(
             images,
             laser=options.laser,
             transport=_transport_views(options),
+            block=_block_views(options),
             step=options.step,
             along=None if options.along is None else options.along.value,
             channel=channel,
@@ -158,6 +178,10 @@ def _check(options: SensorOptions, camera: dict[str, Any]) -> None:
         )
     if (options.transport_views is None) != (options.profiles_between is None):
         raise ValueError("--transport-views and --profiles-between need each other; give both")
+    if (options.block is None) != (options.block_heights is None):
+        raise ValueError("--block and --block-heights need each other; give both")
+    if options.block is not None and options.transport_views is None:
+        raise ValueError("--block needs --transport-views, which show the plane of the stage")
     if options.on_stage and options.transport_views is None:
         raise ValueError("--on-stage has no effect without --transport-views; leave it out")
 
@@ -171,7 +195,7 @@ def _checked_channel(name: str | None) -> RecordingChannel:
     raise ValueError(f"--channel is {name!r}, expected one of {', '.join(CHANNELS)}")
 
 
-def _transport_views(options: SensorOptions) -> Any:
+def _transport_views(options: SensorOptions) -> TransportViews | None:
     from gpuvision.workflows.calibrating_sensor import TransportViews
 
     if options.transport_views is None or options.profiles_between is None:
@@ -179,6 +203,16 @@ def _transport_views(options: SensorOptions) -> Any:
     return TransportViews(
         folder=options.transport_views, profiles_between=options.profiles_between, on_stage=options.on_stage
     )
+
+
+def _block_views(options: SensorOptions) -> BlockViews | None:
+    from gpuvision.workflows.calibrating_sensor import BlockViews
+
+    if options.block is None or options.block_heights is None:
+        return None
+    count = options.block_heights.count(",") + 1
+    heights = quantities(options.block_heights, "--block-heights", ",".join(["m"] * count))
+    return BlockViews(folder=options.block, heights=heights)
 
 
 def _show(done: SensorCalibration, show: Callable[[Calibration, bool], None], *, to_stderr: bool) -> None:

@@ -34,7 +34,7 @@ class SensorPicture:
     image : Path
         Laser image to draw.
     grid : numpy.ndarray
-        (rows, columns, 2): points of the target in this image [px].
+        (rows, columns, 2): points of the target in this image [px]; (0, 0, 2) without a target.
     line : numpy.ndarray
         (n, 2): readings of the laser line in this image [px].
     lines : tuple of numpy.ndarray
@@ -84,10 +84,11 @@ def draw_sensor_calibration(path: str | Path, picture: SensorPicture, *, overwri
 def _draw_image(axes: Axes, picture: SensorPicture) -> None:
     image = read_frame(picture.image)
     axes.imshow(image, cmap="gray", vmin=0, vmax=float(np.percentile(image, 99.8)))
-    columns, rows = picture.grid[..., 0], picture.grid[..., 1]
-    axes.plot(columns, rows, color="tab:cyan", linewidth=0.6)
-    axes.plot(columns.T, rows.T, color="tab:cyan", linewidth=0.6)
-    axes.plot(columns.ravel(), rows.ravel(), "+", color="tab:cyan", markersize=4.0, label="target points")
+    if picture.grid.size:
+        columns, rows = picture.grid[..., 0], picture.grid[..., 1]
+        axes.plot(columns, rows, color="tab:cyan", linewidth=0.6)
+        axes.plot(columns.T, rows.T, color="tab:cyan", linewidth=0.6)
+        axes.plot(columns.ravel(), rows.ravel(), "+", color="tab:cyan", markersize=4.0, label="target points")
     axes.plot(*picture.line.T, ".", color="tab:red", markersize=1.0, label="laser line")
     axes.legend(fontsize=7, markerscale=3.0)
     axes.set_title(f"{picture.image.name}: target and laser line found", fontsize=9)

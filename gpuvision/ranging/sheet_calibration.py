@@ -94,10 +94,14 @@ class LaserLine(NamedTuple):
         (n, 2): measured (column, row) of the line [px].
     target : PoseResponse
         Pose of the target (its plane is Z = 0), the covariance of the pose, and its derivative by the camera.
+    height : numpy.ndarray or float
+        (n,) or one number: height of the lit surface over the target's plane, towards the camera [m]. Default 0; other
+        heights are those of a stepped block on the plane.
     """
 
     points: Float64
     target: PoseResponse
+    height: Float64 | float = 0.0
 
 
 class BendTest(NamedTuple):
@@ -274,7 +278,7 @@ def _triangulated(
 ) -> _Readings:
     """Intersect the viewing rays of all readings with their target's plane."""
     used = [each for each in lines if len(each.points) >= limits.min_readings]
-    if len(used) < 2:
+    if len(used) < 2 and not any(np.ptp(each.height) > 0.0 for each in used):
         raise ValueError(
             f"the laser line was read on {len(used)} targets, expected two at least, at different distances"
         )
@@ -284,7 +288,9 @@ def _triangulated(
     ray = camera.rays(pixels)
     normal = np.stack([each.target.pose.rotation[:, 2] for each in lines])[view]
     place = np.stack([each.target.pose.translation for each in lines])[view]
-    distance = np.sum(normal * place, axis=1) / np.sum(normal * ray, axis=1)
+    height = np.concatenate([np.broadcast_to(each.height, len(each.points)) for each in lines])
+    reach = np.sum(normal * place, axis=1)
+    distance = (reach - np.sign(reach) * height) / np.sum(normal * ray, axis=1)
     known = np.isfinite(distance) & (distance > 0.0)
     return _Readings(
         lines=tuple(lines),
@@ -365,7 +371,7 @@ def _system(frame: _Frame, bend: Float64, readings: _Readings, count: int) -> _S
         - (2.0 * gg * g + gh * h)[:, None] * frame.axes[0]
         - (gh * g + 2.0 * hh * h)[:, None] * frame.axes[1]
     )
-    # P = s ray on the plane N . P = N . T: dP = s (dray - ray (N . dray) / (N . ray)), and for the plane
+    # P = s ray on the plane N . P = N . T + constant: dP = s (dray - ray (N . dray) / (N . ray)), and for the plane
     # dP = ray (dN . (T - P) + N . dT) / (N . ray) with dN = w x N.
     steep = np.sum(readings.normal * readings.ray, axis=1)
     length = np.linalg.norm(readings.point, axis=1)

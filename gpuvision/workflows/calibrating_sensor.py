@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from gpuvision.camera.lines.vanishing_points import straightness_px
 from gpuvision.camera.views.camera_fit import CameraFit
 from gpuvision.camera.views.planar_calibration import fit_camera
 from gpuvision.camera.views.pose_response import PoseResponse, pose_responses
-from gpuvision.camera.views.target_views import View, make_view
+from gpuvision.camera.views.target_views import make_view
 from gpuvision.formats.json import json_tree
 from gpuvision.formats.sensor_file import sensor_text
 from gpuvision.host import Device
@@ -35,13 +35,25 @@ from gpuvision.ranging.sensor_geometry import SensorGeometry
 from gpuvision.ranging.sheet_calibration import Along, LaserLine, SheetFit, fit_sheet
 from gpuvision.ranging.transport_calibration import TransportFit, fit_transport
 from gpuvision.workflows.calibrating import detect_targets
-from gpuvision.workflows.laser_images import LineImage, line_direction, pair_images, read_line
+from gpuvision.workflows.laser_images import (
+    ImagePairs,
+    LightImage,
+    LineImage,
+    image_light,
+    line_direction,
+    pair_images,
+    read_block,
+    read_line,
+    target_light,
+)
 
 Float64 = npt.NDArray[np.float64]
 Progress = Callable[[int, int | None], object]
 
 # Share of the readings of a view that the sheet rejects, above which a warning names the view (chosen).
 _MANY_OUTLIERS = 0.5
+# Laser images that decide on the direction of the line.
+_FIRST = 3
 # Every n-th reading serves for the covariance of the triangulation, which is smooth over the image.
 _EVERY = 16
 # Reduced chi-square of views above which a warning says that they disagree (chosen: three times the predicted scatter).
@@ -69,6 +81,23 @@ class TransportViews:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BlockViews:
+    """Images of a stepped block on the stage, which give the sheet of light without laser images of the target.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder with a pair of images for each place of the block: ``block1.png`` and ``block1_laser.png``.
+    heights : tuple of float
+        Heights of the lit steps over the plane of the target in the transport views [m], in the order of the samples of
+        the line. The steps are parallel to the stage.
+    """
+
+    folder: Path
+    heights: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class SensorCalibration:
     """Calibrated laser sensor with the images that were used.
 
@@ -86,6 +115,8 @@ class SensorCalibration:
         Channel of colour images that holds the laser.
     lines : tuple of LineImage or None
         Laser line of each target view; None without a laser image.
+    block_lines : tuple of LineImage
+        Laser lines on a stepped block.
     cell : float
         Cell of the height map for scans [m].
     warnings : tuple of str
@@ -98,18 +129,24 @@ class SensorCalibration:
     along: Along
     channel: Channel
     lines: tuple[LineImage | None, ...]
+    block_lines: tuple[LineImage, ...]
     cell: float
     warnings: tuple[str, ...]
+
+    @property
+    def readings(self) -> tuple[LineImage, ...]:
+        """All laser lines, in the order of the sheet's residuals."""
+        return (*(each for each in self.lines if each is not None), *self.block_lines)
 
     def summary(self) -> str:
         """Return one line: readings, residual, bend and step."""
         sheet, geometry = self.geometry.sheet, self.geometry
-        used = sum(each is not None for each in self.lines)
+        used = len(self.readings)
         readings = sum(map(len, sheet.residuals))
         shape = "flat" if sheet.bend is None else "bent by " + ", ".join(f"{each:.3g}" for each in sheet.bend) + " /m"
         how = "given" if geometry.transport is None else f"+- {self.step_sigma * 1e9:.2g} nm"
         return (
-            f"laser line on {used} targets, {readings} readings ({sheet.outliers} rejected): residual "
+            f"laser line in {used} images, {readings} readings ({sheet.outliers} rejected): residual "
             f"{sheet.rms_px:.3g} px rms, sheet {shape}; step {geometry.step * 1e6:.6g} um ({how})"
         )
 
@@ -133,8 +170,7 @@ class SensorCalibration:
             "sheet": _sheet_report(geometry.sheet, geometry.camera_covariance),
             "laser_images": [
                 {"name": each.image.name, "readings": len(each.points), "threshold": each.threshold, "note": each.note}
-                for each in self.lines
-                if each is not None
+                for each in self.readings
             ],
             "transport": None if geometry.transport is None else self._transport_report(geometry.transport),
             "step": geometry.step,
@@ -160,6 +196,7 @@ def calibrate_sensor(
     pitch: float,
     laser: str | Path | None = None,
     transport: TransportViews | None = None,
+    block: BlockViews | None = None,
     step: float | None = None,
     pattern: TargetPattern = "dots",
     model: str = "auto",
@@ -185,6 +222,9 @@ def calibrate_sensor(
         Folder of the laser images, matched by name or by the last number in the name.
     transport : TransportViews, optional
         Images of the target on the moving stage. Default: the transport is perpendicular to the sheet.
+    block : BlockViews, optional
+        Images of a stepped block on the stage; they need `transport`, which gives the plane of the stage. Laser images
+        of the target may be given as well, and need not.
     step : float, optional
         Transport per profile [m]; required without `transport`, which measures it. The part moves along -(g x h) of the
         sheet, or along g x h if the step is negative.
@@ -220,63 +260,90 @@ def calibrate_sensor(
         raise ValueError("give either transport views, which measure the step, or the step [m per profile]")
     if step is not None and (step == 0.0 or not math.isfinite(step)):
         raise ValueError(f"step is {step}, expected metres per profile, not 0")
-    pairs = pair_images([Path(each) for each in images], None if laser is None else Path(laser))
+    if block is not None and transport is None:
+        raise ValueError("a block needs transport views: they show the plane of the stage that carries it")
+    folder = None if laser is None else Path(laser)
+    pairs = pair_images([Path(each) for each in images], folder, required=block is None)
     moved = [] if transport is None else image_files(transport.folder)
     detected, skipped, size = detect_targets([*pairs.targets, *moved], pattern, inner_corners, progress)
     _check_transport_targets(detected, skipped, moved)
     views = [make_view(_grid(each), pitch) for each in detected]
     fit = fit_camera(views, size, model=model, focal_length=focal_length, loss=loss)
     targets = dict(zip((each.image for each in detected), pose_responses(fit, views), strict=True))
-    lit = _lit_targets(detected, dict(zip(pairs.targets, pairs.lasers, strict=True)))
-    along = along or line_direction(lit, channel)
-    lines = {each.image: read_line(each, file, along=along, channel=channel, device=device) for each, file in lit}
-    geometry = _geometry(fit, views, detected, targets, lines, along, transport, moved, step)
-    calibration = _camera_calibration(fit, detected, skipped, size, pattern)
-    return SensorCalibration(
-        name=name,
-        calibration=calibration,
-        geometry=geometry,
-        along=along,
-        channel=channel,
-        lines=tuple(lines.get(each.image) for each in detected),
-        cell=_cell(geometry, list(lines.values()), along),
-        warnings=(*fit.warnings, *_warnings(geometry, list(lines.values()), along)),
-    )
-
-
-def _geometry(
-    fit: CameraFit,
-    views: Sequence[View],
-    detected: Sequence[DetectedTarget],
-    targets: dict[Path, PoseResponse],
-    lines: dict[Path, LineImage],
-    along: Along,
-    transport: TransportViews | None,
-    moved: Sequence[Path],
-    step: float | None,
-) -> SensorGeometry:
-    """Fit the sheet to the laser lines, and the transport to the transport views."""
-    sheet = fit_sheet(
-        fit.camera,
-        [LaserLine(line.points, targets[image]) for image, line in lines.items()],
-        along=along,
-        names=fit.names,
-        camera_covariance=fit.covariance,
-    )
-    motion = None
-    if transport is not None:
-        first = [each.image for each in detected].index(moved[0])
-        numbers = np.arange(len(moved)) * transport.profiles_between
-        motion = fit_transport([targets[each] for each in moved], numbers, views[first].target.mean(axis=0))
-    return SensorGeometry(
+    lit = _lit_targets(detected, dict(zip(pairs.targets, pairs.lasers, strict=True)), at_least=0 if block else 2)
+    steps = None if block is None else pair_images(image_files(block.folder), None)
+    if along is None:
+        along = line_direction(_first_lights(lit, steps, channel))
+    lines = {
+        each.image: read_line(target_light(each, file, channel), file, along=along, device=device) for each, file in lit
+    }
+    blocks = [] if block is None or steps is None else _block_lines(steps, block, along, channel, device)
+    middle = views[[each.image for each in detected].index(moved[0])].target.mean(axis=0) if moved else np.zeros(3)
+    motion = None if transport is None else _motion(transport, [targets[each] for each in moved], middle)
+    geometry = SensorGeometry(
         camera=fit.camera,
         camera_names=fit.names,
         camera_covariance=fit.covariance,
-        sheet=sheet,
+        sheet=fit_sheet(
+            fit.camera,
+            [
+                *(LaserLine(line.points, targets[image]) for image, line in lines.items()),
+                *(LaserLine(line.points, targets[moved[0]], heights) for line, heights in blocks),
+            ],
+            along=along,
+            names=fit.names,
+            camera_covariance=fit.covariance,
+        ),
         transport=motion,
         step=motion.length if motion is not None else float(step or 0.0),
         zero_at_stage=transport is not None and transport.on_stage,
     )
+    readings = [*lines.values(), *(line for line, _ in blocks)]
+    return SensorCalibration(
+        name=name,
+        calibration=_camera_calibration(fit, detected, skipped, size, pattern),
+        geometry=geometry,
+        along=along,
+        channel=channel,
+        lines=tuple(lines.get(each.image) for each in detected),
+        block_lines=tuple(line for line, _ in blocks),
+        cell=_cell(geometry, readings, along),
+        warnings=(*fit.warnings, *_warnings(geometry, readings)),
+    )
+
+
+def _first_lights(
+    lit: Sequence[tuple[DetectedTarget, Path]], block: ImagePairs | None, channel: Channel
+) -> Iterator[LightImage]:
+    """Yield the light of some laser images, for the direction of the line."""
+    for target, file in lit[:_FIRST]:
+        yield target_light(target, file, channel)
+    if block is not None:
+        for dark, laser in _pairs(block)[:_FIRST]:
+            yield image_light(dark, laser, channel)
+
+
+def _pairs(images: ImagePairs) -> list[tuple[Path, Path]]:
+    return [(dark, laser) for dark, laser in zip(images.targets, images.lasers, strict=True) if laser is not None]
+
+
+def _block_lines(
+    images: ImagePairs, block: BlockViews, along: Along, channel: Channel, device: Device | None
+) -> list[tuple[LineImage, Float64]]:
+    """Read the laser lines on the block; return each with the heights of its readings."""
+    if len(block.heights) < 2:
+        raise ValueError(f"the block has {len(block.heights)} height, expected those of two steps at least")
+    found = []
+    for dark, laser in _pairs(images):
+        light = image_light(dark, laser, channel)
+        line, step = read_block(light, laser, len(block.heights), along=along, device=device)
+        found.append((line, np.array(block.heights)[step]))
+    return found
+
+
+def _motion(transport: TransportViews, targets: Sequence[PoseResponse], middle: Float64) -> TransportFit:
+    """Fit the transport to the poses of the transport views."""
+    return fit_transport(targets, np.arange(len(targets)) * transport.profiles_between, middle)
 
 
 def _camera_calibration(
@@ -322,7 +389,7 @@ def _check_transport_targets(
 
 
 def _lit_targets(
-    detected: Sequence[DetectedTarget], lasers: dict[Path, Path | None]
+    detected: Sequence[DetectedTarget], lasers: dict[Path, Path | None], *, at_least: int
 ) -> list[tuple[DetectedTarget, Path]]:
     """Return the detected targets that have a laser image."""
     found = []
@@ -330,7 +397,7 @@ def _lit_targets(
         laser = lasers.get(each.image)
         if laser is not None:
             found.append((each, laser))
-    if len(found) < 2:
+    if len(found) < at_least:
         raise ValueError(
             f"{len(found)} target images with a laser image show the target, expected two at least, at different "
             "distances"
@@ -348,7 +415,7 @@ def _cell(geometry: SensorGeometry, lines: Sequence[LineImage], along: Along) ->
     return float(f"{math.ceil(largest / digit) * digit:.2g}")
 
 
-def _warnings(geometry: SensorGeometry, lines: Sequence[LineImage], along: Along) -> list[str]:
+def _warnings(geometry: SensorGeometry, lines: Sequence[LineImage]) -> list[str]:
     """Return doubts about sheet and transport."""
     warnings = [f"{each.image.name}: {each.note}" for each in lines if each.note]
     sheet, transport = geometry.sheet, geometry.transport
@@ -422,7 +489,7 @@ def write_sensor_calibration(
     """
     used = calibration.calibration
     images = [each.image for each in used.detected_targets] + [each for each, _ in used.skipped_images]
-    images += [each.image for each in calibration.lines if each is not None]
+    images += [each.image for each in calibration.readings]
     text = sensor_text(
         calibration.geometry,
         name=calibration.name,
@@ -430,7 +497,7 @@ def write_sensor_calibration(
         along=calibration.along,
         channel=calibration.channel,
         cell=calibration.cell,
-        pixels=np.concatenate([each.points for each in calibration.lines if each is not None])[::_EVERY],
+        pixels=np.concatenate([each.points for each in calibration.readings])[::_EVERY],
     )
     report = json.dumps(json_tree(calibration.report()), indent=1) + "\n"
     outputs = Outputs("calibrate", inputs=[*images, *inputs], overwrite=overwrite)
@@ -442,20 +509,20 @@ def write_sensor_calibration(
 
 
 def _picture(calibration: SensorCalibration) -> SensorPicture:
-    """Return the plain data of the picture; its image is the laser image with the most readings."""
-    known = [
-        (target, line)
+    """Return the plain data of the picture; its image is the laser image with the most readings, on a target if any."""
+    grids = {
+        line.image: _grid(target)
         for target, line in zip(calibration.calibration.detected_targets, calibration.lines, strict=True)
         if line is not None
-    ]
-    target, line = max(known, key=lambda each: len(each[1].points))
+    }
+    line = max(calibration.readings, key=lambda each: (each.image in grids, len(each.points)))
     sheet = calibration.geometry.sheet
     return SensorPicture(
         title=f"{calibration.calibration.summary()}\n{calibration.summary()}",
         image=line.image,
-        grid=_grid(target),
+        grid=grids.get(line.image, np.zeros((0, 0, 2))),
         line=line.points,
-        lines=tuple(each.points for _, each in known),
+        lines=tuple(each.points for each in calibration.readings),
         coordinates=sheet.coordinates,
         residuals=sheet.residuals,
         sigma_px=sheet.sigma_px,

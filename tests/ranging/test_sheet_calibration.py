@@ -10,7 +10,7 @@ from gpuvision.camera.camera import Camera
 from gpuvision.camera.views.camera_fit import Pose
 from gpuvision.camera.views.pose_response import PoseResponse, change_camera
 from gpuvision.ranging.sheet_calibration import LaserLine, SheetFit, fit_sheet
-from laser_sensor import LaserSensor, poses, readings, sensor
+from laser_sensor import LaserSensor, on_stage, poses, readings, sensor
 
 TRUTH = sensor(20.0)
 BENT = sensor(20.0, (0.05, 0.0, -0.03))
@@ -77,7 +77,7 @@ def test_reflections_are_rejected(rng: np.random.Generator) -> None:
     lines = lines_of(TRUTH, rng)
     clean = fit_sheet(camera_of(TRUTH), lines)
     wrong = 0
-    for number, (points, _) in enumerate(lines):
+    for number, (points, _, _) in enumerate(lines):
         chosen = rng.random(len(points)) < (0.33 if number == 0 else 0.1)
         points[chosen, 1] -= rng.uniform(5.0, 40.0, np.count_nonzero(chosen))
         wrong += np.count_nonzero(chosen)
@@ -93,7 +93,7 @@ def test_wrong_poses_widen_the_uncertainty(rng: np.random.Generator) -> None:
     lines = lines_of(TRUTH, rng)
     moved = [
         LaserLine(points, target._replace(pose=Pose(target.pose[0], target.pose[1] + rng.normal(0.0, 1e-4, 3))))
-        for points, target in lines
+        for points, target, _ in lines
     ]
     known, doubtful = fit_sheet(camera_of(TRUTH), lines), fit_sheet(camera_of(TRUTH), moved)
     assert doubtful.view_ratio > 10.0 * known.view_ratio
@@ -106,7 +106,7 @@ def test_derivative_by_the_camera_predicts_another_fit(rng: np.random.Generator)
     """Another k1, and poses that follow it: the sheet moves by its derivative, in the frame of the first fit."""
     change, camera = 2e-3, camera_of(BENT)
     first, second = [], []
-    for points, target in lines_of(BENT, rng, sigma=0.01):
+    for points, target, _ in lines_of(BENT, rng, sigma=0.01):
         response = rng.normal(size=(6, 1)) * np.array([[0.05], [0.05], [0.05], [0.01], [0.01], [0.01]])
         rotation, translation = target.pose
         turn = Rotation.from_rotvec(change * response[:3, 0]).as_matrix()
@@ -122,6 +122,28 @@ def test_derivative_by_the_camera_predicts_another_fit(rng: np.random.Generator)
     moved_by = parameters_of(fit, places)
     np.testing.assert_allclose(moved_by, change * fit.by_camera[:, 0], rtol=0.05, atol=2e-6)
     assert np.abs(moved_by[:3]).min() > 2e-6
+
+
+def test_stepped_block_on_one_plane_gives_the_sheet(rng: np.random.Generator) -> None:
+    """Steps of known heights over one plane, which share the error of its pose."""
+    rotation, translation = on_stage(TRUTH, 0.0)
+    towards = -rotation[:, 2] * np.sign(rotation[:, 2] @ translation)
+    points, heights = [], []
+    for number, height in enumerate((0.0, 0.02, 0.01)):
+        rows = TRUTH.line(rotation[:, 2], translation + height * towards)
+        columns = np.arange(120.0, 200.0) + 80.0 * number
+        points.append(np.stack([columns, rows[columns.astype(int)] + rng.normal(0.0, 0.1, 80)], axis=1))
+        heights.append(np.full(80, height))
+    known = np.diag([1e-10] * 3 + [1e-12] * 3)
+    target = PoseResponse(Pose(rotation, translation), known, np.zeros((6, 0)))
+    line = LaserLine(np.concatenate(points), target, np.concatenate(heights))
+    found = fit_sheet(camera_of(TRUTH), [line])
+    assert found.bend is None
+    error = errors_of(found, TRUTH)
+    assert error @ np.linalg.solve(found.covariance(np.zeros((0, 0))), error) < 16.3
+    assert abs(found.normal @ TRUTH.normal) > np.cos(np.radians(1.0))
+    with pytest.raises(ValueError, match="read on 1 targets"):
+        fit_sheet(camera_of(TRUTH), [LaserLine(points[0], target, 0.01)])
 
 
 def test_one_target_or_parallel_lines_in_one_place_are_refused(rng: np.random.Generator) -> None:

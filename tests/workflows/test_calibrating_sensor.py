@@ -20,7 +20,7 @@ from gpuvision.cli.main import application
 from gpuvision.host import Device
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.calibrating_sensor import TransportViews, calibrate_sensor
-from gpuvision.workflows.laser_images import pair_images
+from gpuvision.workflows.laser_images import pair_images, split_steps
 from gpuvision.workflows.scanning import scan
 from laser_sensor import PITCH, PROFILES_BETWEEN, LaserSensor, sensor, up, write_images
 
@@ -180,6 +180,8 @@ def test_inputs_are_not_replaced(images: Path) -> None:
         (("--sensor", "--pitch", 0.01), "--sensor needs either --transport-views"),
         (("--sensor", "--pitch", 0.01, "--transport-views", "x"), "need each other"),
         (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--on-stage"), "--on-stage has no effect"),
+        (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--block", "x"), "--block and --block-heights need each other"),
+        (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--block", "x", "--block-heights", "0,1mm"), "--block needs"),
         (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--channel", "pink"), "--channel is 'pink'"),
         (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--method", "lines"), "--sensor needs poses|--pitch has no"),
         (("--step", 1e-3), "--step has no effect without --sensor"),
@@ -207,6 +209,22 @@ def test_pairs_are_found_by_name_and_number(tmp_path: Path) -> None:
     (lasers / "010_laser.png").touch()
     with pytest.raises(ValueError, match="has two laser images"):
         pair_images(targets, lasers)
+
+
+def test_steps_of_a_block_are_told_apart() -> None:
+    rng = np.random.default_rng(2)
+    sample = np.delete(np.arange(300.0), [40, 41, 180])
+    position = 50.0 + 0.2 * sample + 12.0 * (sample >= 100.0) - 20.0 * (sample >= 210.0) + rng.normal(0.0, 0.1, 297)
+    position[97:100] = 75.0  # reflections at an edge
+    inside, step = split_steps(np.stack([sample, position], axis=1), 3)
+    kept = sample[inside]
+    np.testing.assert_array_equal(step, (kept >= 100.0).astype(int) + (kept >= 210.0))
+    assert np.min(np.abs(kept - 100.0)) >= 3.0
+    assert len(kept) > 265
+    with pytest.raises(ValueError, match="has 2 steps up or down, expected 3"):
+        split_steps(np.stack([sample, position], axis=1), 4)
+    with pytest.raises(ValueError, match="30 readings of the laser line, too few for 3 steps"):
+        split_steps(np.stack([sample, position], axis=1)[:30], 3)
 
 
 def test_cut_off_transport_view_is_refused(images: Path, tmp_path: Path) -> None:
@@ -250,3 +268,31 @@ def test_scan_measures_a_step_block(written: Path, device: Device) -> None:
     pixel = 0.73e-3
     assert np.abs(np.diff(heights) - 0.006).max() < 0.02 * pixel
     assert np.abs(np.subtract(heights, (-0.006, 0.0, 0.006))).max() < 0.02 * pixel
+
+
+@pytest.mark.slow
+def test_stepped_block_gives_the_sheet_without_laser_images(images: Path, tmp_path: Path) -> None:
+    """A flat sheet and a block with steps of 8 mm on the stage; the target is never lit by the laser."""
+    truth, rng = sensor(25.0), np.random.default_rng(9)
+    (tmp_path / "block").mkdir()
+    write_images(tmp_path, truth, rng, VIEWS, MOVED)
+    row = np.arange(360.0)[:, None]
+    dark = np.full((360, 480), 60.0)
+    lit = dark.copy()
+    for number, height in enumerate((0.0, 0.008, 0.016)):
+        rows = truth.line(up(truth), truth.origin + height * up(truth))
+        step = slice(60 + 120 * number, 180 + 120 * number)
+        lit[:, step] += 120.0 * np.exp(-0.5 * ((row - rows[step]) / 1.4) ** 2)
+    for name, image in (("a.png", dark), ("a_laser.png", lit)):
+        noisy = np.clip(np.rint(image + rng.normal(0.0, 1.5, image.shape)), 0.0, 255.0)
+        cv2.imwrite(str(tmp_path / "block" / name), noisy.astype(np.uint8))
+    targets = [each for each in sorted(tmp_path.glob("*.png")) if not each.stem.endswith("_laser")]
+    block = ["--block", tmp_path / "block", "--block-heights", "0,8mm,16mm"]
+    moved = ["--transport-views", tmp_path / "moved", "--profiles-between", PROFILES_BETWEEN, "--on-stage"]
+    run("calibrate", *targets, "--sensor", "--pitch", PITCH, *moved, *block, "--out", tmp_path / "out" / "sensor.toml")
+    table, report = read(tmp_path / "out" / "sensor.toml")
+    assert [each["name"] for each in report["laser_images"]] == ["a_laser.png"]
+    heights = [
+        float(np.mean(scene_points(table, readings(truth, height, 0.0), 0.0)[:, 2])) for height in (0.0, 0.006, 0.012)
+    ]
+    assert np.abs(np.diff(heights) - 0.006).max() < 0.02 * 0.73e-3

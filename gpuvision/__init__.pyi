@@ -228,6 +228,15 @@ from .ranging.line import (
 from .ranging.line import (
     LineReadout as LineReadout,
 )
+from .ranging.merge_heights import (
+    MergedHeights as MergedHeights,
+)
+from .ranging.merge_heights import (
+    MergeHeights as MergeHeights,
+)
+from .ranging.merge_heights import (
+    merge_height_maps as merge_height_maps,
+)
 from .ranging.psd import (
     PsdNoise as PsdNoise,
 )

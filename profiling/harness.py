@@ -32,6 +32,7 @@ OPERATIONS = {
     "line": "line",
     "triangulation": "triangulation",
     "range_image": "range_image",
+    "merge_heights": "merge_heights",
     "undistort": "undistort_image",
     "points": "undistort_points",
     "calibration": "calibration",

@@ -38,6 +38,7 @@ def application() -> typer.Typer:
     from gpuvision.cli.inspect import inspect
     from gpuvision.cli.locate import locate
     from gpuvision.cli.locate_robot import locate_robot
+    from gpuvision.cli.merge import merge
     from gpuvision.cli.profile import profile
     from gpuvision.cli.scan import scan
     from gpuvision.cli.select import select
@@ -55,6 +56,7 @@ def application() -> typer.Typer:
     app.callback()(root)
     for command in (
         scan,
+        merge,
         simulate,
         calibrate,
         undistort,

@@ -1,0 +1,266 @@
+"""Merge of the height maps of two scans: files in, one height map with pictures and a report out."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.formats.height_files import read_heights
+from gpuvision.formats.range_image import read_npz, write_npz, write_png16, write_tiff
+from gpuvision.host import Device, to_numpy
+from gpuvision.host.errors import ReadError
+from gpuvision.host.files import write_text_atomic
+from gpuvision.host.outputs import Outputs
+from gpuvision.plots.range_image import draw_height_map
+from gpuvision.ranging.merge_heights import (
+    DISAGREES,
+    FIRST,
+    SECOND,
+    Disagreement,
+    MergedHeights,
+    merge_height_maps,
+)
+from gpuvision.ranging.regrid import Grid, HeightMap
+from gpuvision.status import Status
+
+MERGE_FILES = ("range_image.tiff", "range_image.png", "range_image.npz", "picture.png", "report.json")
+"""Names of the files that `HeightMapMerge.write` writes; ``range_image_sigma.tiff`` is added if sigma is known."""
+SIGMA_FILE = "range_image_sigma.tiff"
+# Standard deviation of a normal distribution over its median absolute deviation.
+_NORMAL_MAD = 1.4826
+# Median difference of the maps, in standard deviations of one difference, from which a warning names an offset of the
+# frames. Chosen: half a standard deviation moves 12 % of the agreeing cells beyond two.
+_OFFSET = 0.5
+# Share of the common cells that disagree from which a warning asks for a larger tolerance. Chosen.
+_MANY = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeightMapMerge:
+    """Merged height map of two scans.
+
+    Attributes
+    ----------
+    names : (str, str)
+        Files of the two scans.
+    heights : MergedHeights
+        Merged map, NumPy arrays.
+    grid : Grid
+        Cells of the map.
+    differences : numpy.ndarray
+        Second minus first height of the cells that both maps have [m].
+    settings : dict
+        Parameters of the merge.
+    """
+
+    names: tuple[str, str]
+    heights: MergedHeights
+    grid: Grid
+    differences: npt.NDArray[np.float64]
+    settings: dict[str, Any]
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of cells by source; ``disagrees`` counts cells where the maps disagree."""
+        source = to_numpy(self.heights.source)
+        taken = source & (FIRST | SECOND)
+        return {
+            "first": int(np.count_nonzero(taken == FIRST)),
+            "second": int(np.count_nonzero(taken == SECOND)),
+            "both": int(np.count_nonzero(taken == FIRST | SECOND)),
+            "none": int(np.count_nonzero(taken == 0)),
+            "common": len(self.differences),
+            "disagrees": int(np.count_nonzero(source & DISAGREES)),
+        }
+
+    def offset(self) -> tuple[float, float]:
+        """Return the median difference of the two maps and its robust standard deviation [m]; NaN without one."""
+        if not len(self.differences):
+            return math.nan, math.nan
+        middle = float(np.median(self.differences))
+        return middle, _NORMAL_MAD * float(np.median(np.abs(self.differences - middle)))
+
+    def advice(self) -> tuple[str, ...]:
+        """Return what to check: no common cells, an offset of the two frames, or many cells that disagree."""
+        counts, (middle, spread) = self.counts(), self.offset()
+        if not counts["common"]:
+            return ("the two maps have no common cell: are both in one frame?",)
+        found = []
+        if abs(middle) > _OFFSET * max(spread, np.finfo(np.float64).tiny):
+            found.append(
+                f"the second map lies {1e6 * middle:+.3g} um from the first one (median; robust deviation "
+                f"{1e6 * spread:.3g} um): check that both sensors are calibrated in one frame"
+            )
+        if counts["disagrees"] > _MANY * counts["common"]:
+            found.append(
+                f"the maps disagree in {100.0 * counts['disagrees'] / counts['common']:.0f} % of their common cells: "
+                "give --tolerance of the calibration's errors, or check the frames"
+            )
+        return tuple(found)
+
+    def summary(self) -> str:
+        """Return one line: size, sources of the heights and disagreement."""
+        counts = self.counts()
+        cells = max(self.grid.rows * self.grid.columns, 1)
+        part = {name: f"{100.0 * number / cells:.1f} %" for name, number in counts.items()}
+        return (
+            f"{self.grid.columns} x {self.grid.rows} cells: {part['both']} from both, {part['first']} from the first "
+            f"alone, {part['second']} from the second alone, {part['none']} without a height; the maps disagree in "
+            f"{part['disagrees']}"
+        )
+
+    def report(self) -> dict[str, Any]:
+        """Return the content of ``report.json``."""
+        middle, spread = (None if math.isnan(each) else each for each in self.offset())
+        return {
+            "gpuvision": version("gpuvision"),
+            "first": self.names[0],
+            "second": self.names[1],
+            **self.settings,
+            "cells": self.counts(),
+            "difference": {"median": middle, "robust_sigma": spread},
+            "weights": "equal" if self.heights.sigma is None else "inverse variance",
+            "map": dataclasses.asdict(self.grid),
+            "warnings": list(self.advice()),
+        }
+
+    def files(self) -> tuple[str, ...]:
+        """Return the names of the files that `write` writes."""
+        return MERGE_FILES if self.heights.sigma is None else (*MERGE_FILES, SIGMA_FILE)
+
+    def write(self, folder: str | Path, *, inputs: tuple[Path, ...] = (), overwrite: bool = False) -> None:
+        """Write the merged map as TIFF, 16-bit PNG and NPZ, a picture and a report; after an error no file remains.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Output folder; created if it is missing.
+        inputs : tuple of Path
+            Files that are never replaced.
+        overwrite : bool
+            Whether files may be replaced that no earlier merge wrote. Default False.
+
+        Raises
+        ------
+        FileExistsError
+            A file exists, and is not an unchanged output of an earlier merge; see `gpuvision.host.outputs`.
+        OSError
+            The folder cannot be written.
+        """
+        heights, grid = self.heights, self.grid
+        with Outputs("merge", inputs=inputs, overwrite=overwrite).folder(folder) as inside:
+            write_tiff(inside / "range_image.tiff", heights.z, grid)
+            write_png16(inside / "range_image.png", heights.z, grid)
+            held: dict[str, tuple[Any, str]] = {
+                "map_x": (grid.x, "m"),
+                "map_y": (grid.y, "m"),
+                "map_z": (heights.z, "m"),
+                "map_status": (heights.status, "flags"),
+                "map_intensity": (heights.intensity, ""),
+                "map_source": (heights.source, "flags: 1 first, 2 second, 4 disagree"),
+            }
+            if heights.sigma is not None:
+                write_tiff(inside / SIGMA_FILE, heights.sigma, grid)
+                held["map_sigma"] = (heights.sigma, "m")
+            arrays, units = ({name: each[part] for name, each in held.items()} for part in (0, 1))
+            write_npz(inside / "range_image.npz", arrays, units)
+            shown = HeightMap(heights.z, heights.intensity, heights.status)
+            draw_height_map(inside / "picture.png", shown, grid, title="Merged height map")
+            write_text_atomic(inside / "report.json", json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
+
+
+def height_map_file(path: str | Path) -> Path:
+    """Return the file with the height map of a scan: the path, or ``range_image.npz`` in a folder."""
+    file = Path(path)
+    return file / "range_image.npz" if file.is_dir() else file
+
+
+def read_height_map(path: str | Path) -> tuple[HeightMap, Grid]:
+    """Read the height map of a scan.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder of ``gpuvision scan`` or ``gpuvision merge``, its NPZ file, or another file that
+        `gpuvision.formats.height_files.read_heights` reads (without intensity and standard deviation).
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    ReadError
+        The file holds no height map with a grid.
+    """
+    file = height_map_file(path)
+    if not file.exists():
+        raise FileNotFoundError(f"{file}: no such file")
+    z, grid, sigma = read_heights(file)
+    arrays = read_npz(file)[0] if file.suffix.lower() == ".npz" else {}
+    for name in ("map_status", "map_intensity"):
+        if name in arrays and arrays[name].shape != z.shape:
+            raise ReadError(f"{file}: {name} has shape {arrays[name].shape}, expected {z.shape} as map_z")
+    status = arrays.get("map_status", np.where(np.isfinite(z), Status.OK, Status.NO_DATA)).astype(np.uint8)
+    intensity = np.asarray(arrays.get("map_intensity", np.where(np.isfinite(z), 0.0, z)))
+    return HeightMap(z, intensity, status, sigma), grid
+
+
+def merge_scans(
+    first: str | Path,
+    second: str | Path,
+    *,
+    max_sigmas: float = 3.0,
+    tolerance: float = 0.0,
+    disagreement: Disagreement = "drop",
+    device: Device | None = None,
+) -> HeightMapMerge:
+    """Merge the height maps of two scans of one part, by two sensors or by one sensor in two positions.
+
+    Parameters
+    ----------
+    first, second : str or Path
+        Scans, see `read_height_map`. Both are in one frame, with cells of one size.
+    max_sigmas, tolerance, disagreement, device
+        As for `gpuvision.merge_height_maps`.
+
+    Raises
+    ------
+    OSError, ReadError
+        A file cannot be read.
+    ValueError
+        The cells do not fit together, or neither standard deviations nor a tolerance are given.
+    """
+    maps = read_height_map(first), read_height_map(second)
+    if tolerance <= 0.0 and any(each.sigma is None for each, _ in maps):
+        raise ValueError(
+            "a scan has no standard deviations (a noise model in its sensor file gives them); give a tolerance, the "
+            "largest difference of heights that agree"
+        )
+    merged, grid = merge_height_maps(
+        *maps, max_sigmas=max_sigmas, tolerance=tolerance, disagreement=disagreement, device=device
+    )
+    return HeightMapMerge(
+        names=(str(first), str(second)),
+        heights=merged,
+        grid=grid,
+        differences=_differences(maps, grid),
+        settings={"max_sigmas": max_sigmas, "tolerance": tolerance, "disagreement": disagreement},
+    )
+
+
+def _differences(maps: tuple[tuple[HeightMap, Grid], tuple[HeightMap, Grid]], grid: Grid) -> npt.NDArray[np.float64]:
+    """Return second minus first height of the cells that both maps have."""
+    placed = []
+    for heights, own in maps:
+        z = np.full(grid.shape, np.nan)
+        row, column = round((grid.top - own.top) / grid.cell_y), round((own.left - grid.left) / grid.cell_x)
+        z[row : row + own.rows, column : column + own.columns] = to_numpy(heights.z)
+        placed.append(z)
+    difference = placed[1] - placed[0]
+    return np.asarray(difference[np.isfinite(difference)])

@@ -1,0 +1,150 @@
+"""Merge of two scans on files: occlusion filled, disagreement flagged, wrong files refused."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpuvision.cli import main as cli
+from gpuvision.formats.range_image import read_npz, read_tiff, write_npz, write_tiff
+from gpuvision.host.errors import ReadError
+from gpuvision.ranging.merge_heights import DISAGREES, FIRST, SECOND
+from gpuvision.ranging.regrid import Grid
+from gpuvision.status import Status
+from gpuvision.workflows.merging import MERGE_FILES, SIGMA_FILE, merge_scans, read_height_map
+
+CELL = 1e-4
+BOTH = FIRST | SECOND
+Run = Callable[..., tuple[int, str, str]]
+
+
+def write_scan(folder: Path, z: np.ndarray, left: float = 0.0, sigma: float | None = 2e-6) -> Path:
+    """Write the height map of a scan as `Scan.write` does."""
+    folder.mkdir()
+    rows, columns = z.shape
+    grid = Grid(left=left, top=0.01, cell_x=CELL, cell_y=CELL, columns=columns, rows=rows)
+    arrays = {
+        "map_x": grid.x,
+        "map_y": grid.y,
+        "map_z": z,
+        "map_status": np.where(np.isfinite(z), 0, Status.NO_DATA).astype(np.uint8),
+        "map_intensity": np.ones_like(z),
+    }
+    if sigma is not None:
+        arrays["map_sigma"] = np.full_like(z, sigma)
+    write_npz(folder / "range_image.npz", arrays, dict.fromkeys(arrays, "m"))
+    write_tiff(folder / "range_image.tiff", z, grid)
+    return folder
+
+
+def step(rng: np.random.Generator, hidden: slice, noise: float = 2e-6) -> np.ndarray:
+    """Return a step of 1 mm seen by a sensor that does not see some columns at its foot."""
+    z = np.where(np.arange(60) < 30, 1e-3, 0.0) + rng.normal(0.0, noise, (40, 60))
+    z[:, hidden] = math.nan
+    return z.astype(np.float32)
+
+
+@pytest.fixture
+def scans(rng: np.random.Generator, tmp_path: Path) -> tuple[Path, Path]:
+    """Two sensors on both sides of a step; the second one reads a reflection in three rows."""
+    second = step(rng, slice(22, 30))
+    second[5:8, 40:50] += 2e-4
+    return (
+        write_scan(tmp_path / "first", step(rng, slice(30, 38))),
+        write_scan(tmp_path / "second", second[:, 10:], left=10 * CELL),
+    )
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    def call(*words: Any) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["gpuvision", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        code = ended.value.code
+        return code if isinstance(code, int) else 0, *capsys.readouterr()
+
+    return call
+
+
+def test_occlusion_is_filled_and_disagreement_flagged(scans: tuple[Path, Path], run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "merged"
+    code, text, err = run("merge", *scans, "--out", out)
+    assert code == 0, err
+    assert {each.name for each in out.iterdir() if not each.name.startswith(".")} >= {*MERGE_FILES, SIGMA_FILE}
+    arrays, _ = read_npz(out / "range_image.npz")
+    source = arrays["map_source"]
+    assert np.all(source[:, 30:38] == SECOND)
+    assert np.all(source[:, :10] == FIRST)
+    assert np.all(source[:, 22:30] == FIRST)
+    assert np.all(source[5:8, 40:50] == DISAGREES)
+    assert np.all(np.isnan(arrays["map_z"][5:8, 40:50]))
+    assert np.all(arrays["map_status"][5:8, 40:50] == Status.AMBIGUOUS)
+    both = source == BOTH
+    np.testing.assert_allclose(arrays["map_sigma"][both], 2e-6 / math.sqrt(2.0), rtol=1e-6)
+    true = np.broadcast_to(np.where(np.arange(60) < 30, 1e-3, 0.0), source.shape)
+    assert np.std((arrays["map_z"] - true)[both]) == pytest.approx(2e-6 / math.sqrt(2.0), rel=0.1)
+    np.testing.assert_array_equal(read_tiff(out / "range_image.tiff").z, arrays["map_z"])
+    report = json.loads((out / "report.json").read_text())
+    assert report["weights"] == "inverse variance"
+    assert report["cells"]["second"] == np.count_nonzero(source == SECOND)
+    assert report["cells"]["disagrees"] == np.count_nonzero(source & DISAGREES)
+    assert "from the second alone" in text
+    assert "warning" not in err
+    # A merged map is the input of the next merge.
+    assert read_height_map(out)[0].sigma is not None
+
+
+def test_an_offset_of_the_frames_is_said(rng: np.random.Generator, tmp_path: Path, run: Run) -> None:
+    first, second = step(rng, slice(0, 0)), step(rng, slice(0, 0)) + np.float32(2e-5)
+    write_scan(tmp_path / "first", first)
+    write_scan(tmp_path / "second", second)
+    code, _, err = run("merge", tmp_path / "first", tmp_path / "second", "--out", tmp_path / "out")
+    assert code == 0
+    assert re.search(r"the second map lies \+(19\.9|20(\.[0-2])?) um from the first one", " ".join(err.split()))
+    assert "disagree in 100 % of their common cells" in " ".join(err.split())
+    found = merge_scans(tmp_path / "first", tmp_path / "second", tolerance=5e-5)
+    assert found.counts()["disagrees"] == 0
+
+
+def test_heights_without_sigma_need_a_tolerance(rng: np.random.Generator, tmp_path: Path) -> None:
+    first = write_scan(tmp_path / "first", step(rng, slice(30, 38)), sigma=None)
+    second = write_scan(tmp_path / "second", step(rng, slice(22, 30)))
+    with pytest.raises(ValueError, match="give a tolerance"):
+        merge_scans(first, second)
+    found = merge_scans(first / "range_image.tiff", second / "range_image.tiff", tolerance=2e-5)
+    assert found.heights.sigma is None
+    assert np.all(found.heights.source[:, 30:38] == SECOND)
+    assert found.report()["weights"] == "equal"
+
+
+def test_wrong_files_are_refused(rng: np.random.Generator, tmp_path: Path) -> None:
+    scan = write_scan(tmp_path / "first", step(rng, slice(0, 0)))
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        merge_scans(scan, tmp_path / "nowhere")
+    write_npz(tmp_path / "other.npz", {"x": np.zeros(3)}, {"x": "m"})
+    with pytest.raises(ReadError, match=r"other\.npz"):
+        merge_scans(scan, tmp_path / "other.npz")
+    arrays, units = read_npz(scan / "range_image.npz")
+    write_npz(tmp_path / "cut.npz", {**arrays, "map_x": arrays["map_x"][:-1]}, units)
+    with pytest.raises(ReadError, match="map_z has shape"):
+        merge_scans(scan, tmp_path / "cut.npz")
+    write_tiff(tmp_path / "bare.tiff", np.zeros((4, 4)))
+    with pytest.raises(ReadError, match="states no grid"):
+        merge_scans(scan, tmp_path / "bare.tiff", tolerance=1e-6)
+
+
+def test_inputs_are_not_replaced(scans: tuple[Path, Path], run: Run) -> None:
+    before = (scans[0] / "range_image.npz").read_bytes()
+    code, _, err = run("merge", *scans, "--out", scans[0], "--overwrite")
+    assert code == 1
+    assert "range_image.npz" in err
+    assert (scans[0] / "range_image.npz").read_bytes() == before

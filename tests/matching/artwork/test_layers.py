@@ -8,12 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from gerbonara import ExcellonFile, GerberFile
 
 from gpuvision.cli import main as cli
 from gpuvision.cli.arguments import layers_of
 from gpuvision.host.errors import ReadError
 from gpuvision.matching.artwork.artwork import read_artwork
-from gpuvision.matching.artwork.board_files import open_board
+from gpuvision.matching.artwork.board_files import open_board, parsed
 
 HEAD = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\n"
 GERBER = f"{HEAD}%ADD10C,1.0*%\nD10*\nX5000000Y5000000D03*\nX9000000Y5000000D03*\nM02*\n"
@@ -125,6 +126,19 @@ def test_gerbonara_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[s
         assert names["top mask"] == "soldermask_top.art"
         assert len(names) == 7
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_drill_file_that_gerbonara_scaled_is_not_read_again(tmp_path: Path) -> None:
+    """Gerbonara scales the holes of Allegro's boards in memory. Its Gerber files are read again, with our checks."""
+    drill, gerber = tmp_path / "board.drl", tmp_path / "board.gbr"
+    drill.write_text(DRILL)
+    gerber.write_text(GERBER)
+    scaled = ExcellonFile.open(drill)
+    scaled.objects[0].scale(10.0)
+    assert [(hole.x, hole.y) for hole in parsed(scaled).objects] == [(20.0, 50.0)]
+    moved = GerberFile.open(gerber)
+    moved.objects[0].x = 7.0
+    assert [flash.x for flash in parsed(moved).objects] == [5.0, 9.0]
 
 
 @pytest.mark.realdata

@@ -199,6 +199,22 @@ def test_work_falls_as_the_tolerance_rises(device: Device, variant: Any) -> None
     assert not cut.has_pairs
 
 
+@TWO_WAYS
+def test_far_light_is_one_cluster_for_each_wall(device: Device, variant: Any) -> None:
+    """At 50 times its size, light that cannot be left out is replaced by one segment for each wall of the groove."""
+    segments, _, weights, reading = valley(32, 1, 40)
+    segments[:, :6] *= 0.1
+    x, y = np.meshgrid(np.linspace(-0.03, 0.03, 8), np.linspace(-0.03, 0.03, 5))
+    place = np.stack([x, y, np.full_like(x, 1.0)], axis=2).reshape(1, -1, 3)
+    receivers = np.concatenate([place, np.broadcast_to([0.0, 0.0, -1.0], place.shape)], axis=2)
+    clustering = LightClustering(tolerance=0.0, variant=variant)
+    least = clustering(segments, receivers, weights, reading, device=device).bound_if_omitted.max()
+    cut = clustering(segments, receivers, weights, reading, tolerance=1e-2 * least, device=device)
+    assert np.all(off_by(cut, receivers, weights, reading, segments) <= cut.bound)
+    assert cut.counts["clustered"] == cut.counts["pairs"]
+    assert cut.counts["work"] == 2 * receivers.shape[1]
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("with_scene", [False, True])
 def test_bounds_hold_far_from_the_origin(device: Device, dtype: Any, with_scene: bool) -> None:

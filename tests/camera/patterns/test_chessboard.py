@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -123,6 +124,17 @@ def test_many_small_squares(rng: np.random.Generator) -> None:
     errors = _errors(find_chessboard(photo(chessboard(camera, (70, 60)), rng)).points, camera.nodes(60, 70))
     assert len(errors) > 0.995 * 60 * 70
     assert _rms(errors) < 0.04
+
+
+def test_memory_of_the_refinement_is_limited(rng: np.random.Generator) -> None:
+    """Windows of about 2^17 pixels in all, 1 MB for each of their 16 arrays, are refined at the same time."""
+    image = photo(chessboard(view((420, 400), 30, 30, 12.0, turn=3.0, tilt=10.0), (30, 30)), rng)
+    tracemalloc.start()
+    try:
+        assert np.isfinite(find_chessboard(image).points).all()
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("inner", [(9, 6), (6, 9), [6, 9]])

@@ -67,8 +67,8 @@ class PlanePolynomial:
     terms are not complete: G has to run approximately along c, and H along r; omitted terms remain as a model error. On
     1280 x 1024 pixels at a focal length of 1700 px this error is 0.04 px for a lens with k1 = -0.05 and 0.6 px for
     -0.2; 0.05 px for a sensor rotated by 10 degrees about one axis, 0.4 px for 20, and 3 px for 10 about both. Outside
-    the fitted points the cubic terms diverge, so results outside ``region`` are NaN. For triangulation use
-    `Triangulation` with a `Lens`.
+    the fitted points the cubic terms diverge, so results outside ``region`` are NaN. For triangulation
+    prefer a calibrated camera, or a `Lens`; `Triangulation.from_polynomial` takes polynomials.
 
     References
     ----------
@@ -119,8 +119,7 @@ class PlanePolynomial:
         offset, matrix, _ = self._parts
         moved = (np.asarray(points, dtype=np.float64) - offset) @ np.linalg.inv(matrix).T
         points = invert_displacement(self._displacement, moved)
-        middle, half = self._middle_and_half
-        return np.asarray(middle + half * np.where(_is_within(points, _INVERSE_BORDER)[..., None], points, np.nan))
+        return self._to_sensor_units(np.where(_is_within(points, _INVERSE_BORDER)[..., None], points, np.nan))
 
     def covariance_at(self, points: npt.ArrayLike) -> Float64:
         """Propagate the covariance of the coefficients to (G, H) at sensor points.
@@ -150,15 +149,49 @@ class PlanePolynomial:
         ]
         return np.asarray(np.stack(variances, -1)[..., None] * np.eye(2))
 
+    # ---- affine part and displacement ----------------------------------------------------------------------
+
+    @property
+    def affine(self) -> Float64:
+        """Linear part (2, 3): ``(G, H) = affine (c, r, 1)`` of sensor points that `undistort` has displaced [m]."""
+        middle, half = self._middle_and_half
+        offset, matrix, _ = self._parts
+        return np.column_stack([matrix / half, offset - matrix @ (middle / half)])
+
+    def undistort(self, points: npt.ArrayLike, /) -> Float64:
+        """Return sensor points (..., 2) displaced by the higher terms; `affine` maps them to the plane.
+
+        NaN outside the region.
+        """
+        points = self._to_conditioned(points)
+        move, _, _ = self._displacement(points)
+        return self._to_sensor_units(np.where(_is_within(points, _BORDER)[..., None], points + move, np.nan))
+
+    def distort(self, points: npt.ArrayLike, /) -> Float64:
+        """Return the sensor points (..., 2) of displaced ones: the inverse of `undistort`; NaN outside the region."""
+        found = invert_displacement(self._displacement, self._to_conditioned(points))
+        return self._to_sensor_units(np.where(_is_within(found, _INVERSE_BORDER)[..., None], found, np.nan))
+
+    def jacobian(self, points: npt.ArrayLike, /) -> Float64:
+        """Return d(displaced) / d(measured), (..., 2, 2), at sensor points (..., 2)."""
+        _, half = self._middle_and_half
+        _, jacobian, _ = self._displacement(self._to_conditioned(points))
+        return np.asarray(half[:, None] * jacobian / half)
+
+    @property
+    def displacement(self) -> tuple[Float64, Float64, Float64]:
+        """Middle (2,) and half extents (2,) of the region, and the terms (2, 7) of ``plane.h`` for these units."""
+        return *self._middle_and_half, self._parts[2]
+
     # ---- kernel tables and defines -------------------------------------------------------------------------
 
     @property
     def defines(self) -> dict[str, None]:
-        """Defines of ``kernels/undistort_points/plane.h``."""
+        """Defines of ``kernels/common/plane.h``."""
         return {"PLANE": None}
 
     def packed(self, real: npt.DTypeLike) -> npt.NDArray[Any]:
-        """Return the parameter table of ``kernels/undistort_points/plane.h`` for float32 or float64."""
+        """Return the parameter table of ``kernels/common/plane.h`` for float32 or float64."""
         middle, half = self._middle_and_half
         # Round origin and scale first and compute the other entries from the rounded values, so that they compensate.
         origin = middle.astype(real).astype(np.float64)
@@ -178,6 +211,10 @@ class PlanePolynomial:
     def _to_conditioned(self, points: npt.ArrayLike) -> Float64:
         middle, half = self._middle_and_half
         return np.asarray((np.asarray(points, dtype=np.float64) - middle) / half)
+
+    def _to_sensor_units(self, points: Float64) -> Float64:
+        middle, half = self._middle_and_half
+        return np.asarray(middle + half * points)
 
     @cached_property
     def _powers(self) -> Float64:

@@ -25,8 +25,9 @@ class SheetPoints(NamedTuple):
         Coordinates along the sheet and up in the sheet [m]; NaN where the status is not OK.
     status
         uint8 `Status` flags: NOT_FINITE (u or v is not finite, or lies more than 1e6 half extents of the region away),
-        NOT_INVERTIBLE (beyond the fold of the lens, or behind the tilted sensor), HORIZON (the ray does not meet the
-        sheet in front of the sensor, or meets it too far away).
+        NOT_INVERTIBLE (beyond the fold of the lens, or behind the tilted sensor), OUT_OF_RANGE (outside of the
+        region of plane polynomials), HORIZON (the ray does not meet the sheet in front of the sensor, or meets it too
+        far away).
     sigma_g, sigma_h
         Standard deviations of g and h [m]; ``None`` unless the triangulation has the ``sigma`` of the sensor.
     """
@@ -39,7 +40,7 @@ class SheetPoints(NamedTuple):
 
 
 class SheetTable(NamedTuple):
-    """Parameters of ``kernels/common/sheet.h``, in the order of its struct ``SheetTable``; ``camera`` only with one."""
+    """Parameters of ``kernels/common/sheet.h``, in the order of its struct; unused distortions are empty."""
 
     position_origin: float
     position_scale: float
@@ -53,6 +54,10 @@ class SheetTable(NamedTuple):
     factor_g: npt.ArrayLike
     factor_h: npt.ArrayLike
     camera: npt.ArrayLike = ()
+    plane_origin: npt.ArrayLike = ()
+    plane_scale: npt.ArrayLike = ()
+    plane_unit: npt.ArrayLike = ()
+    plane_terms: npt.ArrayLike = ()
 
 
 @dataclass(frozen=True, kw_only=True)

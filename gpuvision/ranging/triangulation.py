@@ -21,6 +21,7 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.distortion import Distortion, ExchangedAxes
 from gpuvision.camera.lens import Lens
+from gpuvision.camera.polynomial import PlanePolynomial
 from gpuvision.host import (
     Define,
     Device,
@@ -47,7 +48,7 @@ _LANES, _GROUP = 16, 256
 # Points of a strip in the vector variant. Long strips keep the hardware prefetchers running; several strips per core
 # balance the load.
 _SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
-_KEYS = ("homography", "region", "model", "along", "lens", "camera", "covariance", "sigma", "horizon")
+_KEYS = ("homography", "region", "model", "along", "lens", "camera", "polynomial", "covariance", "sigma", "horizon")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +76,9 @@ class Triangulation(VisionOperation[SheetPoints]):
     camera : Camera, optional
         Calibrated camera, instead of a lens: its lens terms and the tilt of its sensor are corrected before the
         homography, which then starts from ideal pixels (of the same camera matrix). u and v are pixels.
+    polynomial : PlanePolynomial, optional
+        Polynomials from (c, r) = (v, u) to (G, H), instead of lens and camera; ``homography`` is their linear part. Use
+        `from_polynomial`.
     covariance : (8, 8) array_like, optional
         Covariance of (g0, gx, gy, h0, hx, hy, dx, dy), the parameters of the displacement form over ``region`` (see
         `conditioned`). It is added to the sigmas.
@@ -92,7 +96,7 @@ class Triangulation(VisionOperation[SheetPoints]):
     ------
     ValueError
         The homography is singular (the sensor sees the sheet edge-on), the middle of the region lies on the horizon,
-        both a lens and a camera are given, or a parameter is out of range.
+        several of lens, camera and polynomial are given, or a parameter is out of range.
 
     Notes
     -----
@@ -114,6 +118,7 @@ class Triangulation(VisionOperation[SheetPoints]):
     along: Along = "columns"
     lens: Lens | None = None
     camera: Camera | None = None
+    polynomial: PlanePolynomial | None = None
     covariance: tuple[tuple[float, ...], ...] | None = None
     sigma: tuple[float, float] | None = None
     horizon: float = 1e-3
@@ -139,6 +144,13 @@ class Triangulation(VisionOperation[SheetPoints]):
             raise ValueError(f"Triangulation.along is {self.along!r}, expected 'columns' or 'rows'")
         if self.lens is not None and self.camera is not None:
             raise ValueError("Triangulation has a lens and a camera; the camera includes a lens, give one of them")
+        if self.polynomial is not None:
+            if self.lens is not None or self.camera is not None:
+                raise ValueError("Triangulation has a polynomial and a lens or camera; the polynomial includes them")
+            if self.homography != _linear_part(self.polynomial):
+                raise ValueError("Triangulation.homography is no linear part of the polynomial; use from_polynomial")
+            if self.covariance is not None:
+                raise ValueError("Triangulation.covariance is that of a homography; a polynomial has one itself")
         if not 0.0 < self.horizon < 1.0:
             raise ValueError(f"Triangulation.horizon is {self.horizon}, expected a number between 0 and 1")
         if self.sigma is not None and min(self.sigma) < 0.0:
@@ -156,7 +168,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             _, half = self._centre_and_half_extent()
             options |= self.camera.correction_defines(real, float(half[0]), self._image_region)
             options |= flags(SHEET_ROWS=self.along == "rows")
-        return options
+        return options if self.polynomial is None else {**options, **self.polynomial.defines}
 
     def packed(self, real: npt.DTypeLike, axes: SampleAxes | None = None) -> npt.NDArray[Any]:
         """Return the parameter table of the device functions of ``kernels/common/sheet.h`` (`SheetTable`).
@@ -186,6 +198,15 @@ class Triangulation(VisionOperation[SheetPoints]):
             camera = self.camera.packed_correction(
                 real, first[to_image], pitch[to_image], (pitch / scale)[to_image], self._image_region
             )
+        plane: dict[str, Float64] = {}
+        if self.polynomial is not None:
+            plane_middle, plane_half, displacement = self.polynomial.displacement
+            plane = {
+                "plane_origin": (plane_middle - first[::-1]) / pitch[::-1],
+                "plane_scale": pitch[::-1] / plane_half,
+                "plane_unit": plane_half / (pitch / scale)[::-1],
+                "plane_terms": displacement.ravel(),
+            }
         g0, gx, gy, h0, hx, hy, dx, dy = terms
         factor_g, factor_h = self._factors()
         table = SheetTable(
@@ -201,6 +222,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             factor_g=factor_g,
             factor_h=factor_h,
             camera=camera,
+            **plane,
         )
         with np.errstate(over="ignore"):
             return np.hstack(table).astype(real)
@@ -339,7 +361,9 @@ class Triangulation(VisionOperation[SheetPoints]):
 
     @property
     def distortion(self) -> Distortion | None:
-        """Lens or camera for points in (u, v) order; None without both."""
+        """Lens, camera or higher terms of the polynomial for points in (u, v) order; None without them."""
+        if self.polynomial is not None:
+            return ExchangedAxes(self.polynomial)
         return _in_sensor_order(self.camera if self.lens is None else self.lens, self.along)
 
     # ---- construction --------------------------------------------------------------------------------------
@@ -468,6 +492,21 @@ class Triangulation(VisionOperation[SheetPoints]):
         return cls(homography=inverse, along=along, camera=calibrated, **more)
 
     @classmethod
+    def from_polynomial(cls, polynomial: PlanePolynomial, **more: Any) -> Triangulation:
+        """Build a triangulation from polynomials between the sensor and the plane of the sheet.
+
+        Parameters
+        ----------
+        polynomial : PlanePolynomial
+            From (c, r) = (v, u) to (G, H). Positions outside of its region have the flag OUT_OF_RANGE. Its covariance
+            is not in the sigmas of the triangulation, see `PlanePolynomial.covariance_at`.
+        **more
+            Other parameters of the class. Default of ``region``: the region of the polynomial.
+        """
+        (v, u) = polynomial.region
+        return cls(**{"region": (u, v), **more, "homography": _linear_part(polynomial), "polynomial": polynomial})
+
+    @classmethod
     def from_stand_off(
         cls,
         *,
@@ -543,6 +582,8 @@ class Triangulation(VisionOperation[SheetPoints]):
             table["lens"] = self.lens.to_dict()
         if self.camera is not None:
             table["camera"] = self.camera.to_dict()
+        if self.polynomial is not None:
+            table["polynomial"] = self.polynomial.to_dict()
         return table
 
     @classmethod
@@ -559,7 +600,15 @@ class Triangulation(VisionOperation[SheetPoints]):
             values["lens"] = Lens.from_dict(values["lens"])
         if "camera" in values:
             values["camera"] = Camera.from_dict(values["camera"])
+        if "polynomial" in values:
+            values["polynomial"] = PlanePolynomial.from_dict(values["polynomial"])
         return cls(**values, precision=precision)
+
+
+def _linear_part(polynomial: PlanePolynomial) -> Matrix:
+    """Return the homography of the polynomial without its higher terms, for points in (u, v) order."""
+    rows: Matrix = numbers([*polynomial.affine[:, [1, 0, 2]], (0.0, 0.0, 1.0)], (3, 3), "Triangulation.homography")
+    return rows
 
 
 def _in_sensor_order(model: Lens | Camera | None, along: Along) -> Distortion | None:

@@ -21,7 +21,7 @@ Tables of the file (the files in ``gpuvision/presets/sensors`` are commented exa
                       ``g_axis``, ``h_axis`` and, if it is bent, ``bend`` (see `BentSheet`), with a table ``[camera]``,
                       or without it with ``focal_length_px`` and ``principal_point_px``; or ``homography``; or
                       ``constants`` (`Triangulation.from_constants`); or ``points``: calibration points (u, v, G, H) to
-                      fit. ``covariance``: see `Triangulation`
+                      fit; or ``p`` and ``q`` of a `PlanePolynomial` from (v, u). ``covariance``: see `Triangulation`
 ``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`;
                       with an encoder ``encoder``, a file with a count for each profile, and ``metres_per_count`` or
                       ``radians_per_count`` instead of a step

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gpuvision.camera.polynomial import PlanePolynomial
 from gpuvision.ranging.sheet import BentSheet
 from gpuvision.ranging.triangulation import Along, Triangulation
 from gpuvision.schema import Section
@@ -76,6 +77,15 @@ def _from_points(table: Section, common: dict[str, Any]) -> Triangulation:
     return replace(fitted, horizon=horizon)
 
 
+def _from_polynomial(table: Section, common: dict[str, Any]) -> Triangulation:
+    """Read the polynomials of a `PlanePolynomial`, with c = v and r = u."""
+    p, q = table.numbers("p", "m", (8,)), table.numbers("q", "m", (8,))
+    (v, u) = common["region"][::-1]
+    region = table.rows("region", "sensor unit", 2, (v, u))
+    with table.checking():
+        return Triangulation.from_polynomial(PlanePolynomial(p=p, q=q, region=region), **common)
+
+
 def _from_stand_off(table: Section, common: dict[str, Any]) -> Triangulation:
     return Triangulation.from_stand_off(
         baseline=table.number("baseline", "m", above=0.0),
@@ -122,6 +132,7 @@ _WAYS: dict[str, _Reader] = {
     "points": _from_points,
     "baseline": _from_stand_off,
     "focal_length_px": _from_pinhole,
+    "p": _from_polynomial,
 }
 _WAYS_OF_CAMERA: dict[str, _Reader] = {
     "homography": _from_homography,

@@ -9,15 +9,16 @@
 //
 // The host folds all other constants into these numbers in double precision. Origins and scales are rounded to the
 // kernel's real type before that, so a single-precision result is within a few roundings of the double-precision one.
-// Build options: the distortion: LENS, LENS_K2, LENS_K3, LENS_K4 (lens.h), or CAMERA and its options (camera.h) with
-// SHEET_ROWS where the samples run along the rows axis of the image (positions are columns); SHEET_COVARIANCE adds the
-// covariance of the parameters to the sigmas.
+// Build options: the distortion: LENS, LENS_K2, LENS_K3, LENS_K4 (lens.h); or CAMERA and its options (camera.h) with
+// SHEET_ROWS where the samples run along the rows axis of the image (positions are columns); or PLANE (the higher terms of
+// plane.h). SHEET_COVARIANCE adds the covariance of the parameters to the sigmas.
 #ifndef SHEET_H
 #define SHEET_H
 
 #include "common/camera.h"
 #include "common/lanes.h"
 #include "common/lens.h"
+#include "common/plane.h"
 #include "common/status.h"
 
 // Parameters, in the order of SheetTable in triangulation.py (tests/ranging/test_tables.py compares them).
@@ -32,6 +33,12 @@ typedef struct {
                                            // (h0, hx, hy, dx, dy), column by column
 #ifdef CAMERA
     real camera[63];                       // table of camera.h: pixels are positions and samples, the output is x and y
+#endif
+#ifdef PLANE
+    real plane_origin[2], plane_scale[2];  // c = (sample - origin[0]) scale[0], r = (position - origin[1]) scale[1]:
+                                           // -1 .. 1 in the region of the polynomials
+    real plane_unit[2];                    // units of c and r in y and x
+    real plane_terms[14];                  // a0 .. a6 and b0 .. b6 of plane.h
 #endif
 } SheetTable;
 
@@ -62,8 +69,19 @@ static inline __attribute__((always_inline)) masks sheet_correction(reals positi
 }
 #endif
 
+#ifdef PLANE
+#define SHEET_FOLDED STATUS_OUT_OF_RANGE  // outside of the region of the polynomials
+// Compute the coordinates (c, r) of the polynomials.
+static inline void sheet_plane(reals position, reals sample, constant SheetTable *sheet, reals *c, reals *r) {
+    *c = (sample - sheet->plane_origin[0]) * sheet->plane_scale[0];
+    *r = (position - sheet->plane_origin[1]) * sheet->plane_scale[1];
+}
+#else
+#define SHEET_FOLDED STATUS_NOT_INVERTIBLE
+#endif
+
 // Compute the undistorted, scaled place (x, y) of a light position, and the mask of positions without one: beyond the
-// fold of the lens, or behind the tilted sensor. Return the squared distance of the measured place from the centre of
+// fold of the lens, behind the tilted sensor, or outside of the region of the polynomials. Return the squared distance of the measured place from the centre of
 // the lens, or without a lens from the middle of the sensor region.
 static inline reals sheet_place(reals position, reals sample, constant SheetTable *sheet, reals *x, reals *y,
                                 masks *folded) {
@@ -80,6 +98,14 @@ static inline reals sheet_place(reals position, reals sample, constant SheetTabl
     *x += back_x * sheet->camera[SHEET_OF_POSITION(CAMERA_FOCAL)];
     *y += back_y * sheet->camera[SHEET_OF_SAMPLE(CAMERA_FOCAL)];
     return square;
+#elif defined(PLANE)
+    const reals square = *x * *x + *y * *y;
+    reals c, r;
+    sheet_plane(position, sample, sheet, &c, &r);
+    *folded = ~LANED(plane_within)(c, r, PLANE_EDGE);
+    *x += sheet->plane_unit[1] * LANED(plane_bend)(c, r, sheet->plane_terms + 7);
+    *y += sheet->plane_unit[0] * LANED(plane_bend)(c, r, sheet->plane_terms);
+    return square;
 #else
     *folded = 0;
     return *x * *x + *y * *y;
@@ -87,8 +113,8 @@ static inline reals sheet_place(reals position, reals sample, constant SheetTabl
 }
 
 // Compute G and H (NaN where the status is not 0) and return the status: NOT_FINITE; NOT_INVERTIBLE: beyond the fold of
-// the lens or behind the tilted sensor; HORIZON: the ray does not meet the sheet in front of the sensor, or meets it too
-// far away.
+// the lens or behind the tilted sensor; OUT_OF_RANGE: outside of the region of the polynomials; HORIZON: the ray does not
+// meet the sheet in front of the sensor, or meets it too far away.
 static inline bytes sheet_point(reals position, reals sample, constant SheetTable *sheet, reals *g, reals *h) {
     constant real *in_w = sheet->w_terms, *in_g = sheet->g_terms, *in_h = sheet->h_terms;
     reals x, y;
@@ -106,7 +132,7 @@ static inline bytes sheet_point(reals position, reals sample, constant SheetTabl
     if (any_lane(flagged)) {
         *g = nan_where(flagged, *g);
         *h = nan_where(flagged, *h);
-        const masks which = (folded & STATUS_NOT_INVERTIBLE) | (~folded & hidden & STATUS_HORIZON);
+        const masks which = (folded & SHEET_FOLDED) | (~folded & hidden & STATUS_HORIZON);
         status = convert_bytes((lost & STATUS_NOT_FINITE) | (~lost & which));
     }
     return status;
@@ -144,6 +170,17 @@ static inline void sheet_pull_back(reals position, reals sample, constant SheetT
 #endif
     *slope_x /= focal_x;
     *slope_y /= focal_y;
+#elif defined(PLANE)
+    // The displaced place is (x + unit_r b(c, r), y + unit_c a(c, r)) with c = y / unit_c and r = x / unit_r.
+    const real ratio = sheet->plane_unit[0] / sheet->plane_unit[1];
+    reals c, r, a_c, a_r, b_c, b_r;
+    sheet_plane(position, sample, sheet, &c, &r);
+    LANED(plane_slopes)(c, r, sheet->plane_terms, &a_c, &a_r);
+    LANED(plane_slopes)(c, r, sheet->plane_terms + 7, &b_c, &b_r);
+    const reals by_x = *slope_x + *slope_x * b_r + *slope_y * ratio * a_r;
+    const reals by_y = *slope_y + *slope_y * a_c + *slope_x / ratio * b_c;
+    *slope_x = by_x;
+    *slope_y = by_y;
 #endif
 }
 

@@ -10,7 +10,7 @@
 //          work-group.
 #include "common/camera.h"
 #include "common/lens.h"
-#include "undistort_points/plane.h"
+#include "common/plane.h"
 #include "common/status.h"
 
 #ifdef VECTOR_VARIANT

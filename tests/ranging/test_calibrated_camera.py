@@ -262,7 +262,7 @@ def test_tables_and_errors() -> None:
     assert Triangulation.from_dict(operation.to_dict()) == operation
     with pytest.raises(ValueError, match=r"has a lens and a camera; the camera includes a lens"):
         replace(operation, lens=Lens(k1=1e-9))
-    with pytest.raises(ValueError, match=r"SensorView.triangulation has a camera"):
+    with pytest.raises(ValueError, match=r"SensorView.triangulation has a camera or a polynomial"):
         SensorView(
             triangulation=operation,
             transport=StraightTransport(),

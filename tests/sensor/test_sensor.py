@@ -17,10 +17,12 @@ from hypothesis import strategies as st
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
+from gpuvision.camera.polynomial import PlanePolynomial
 from gpuvision.formats.camera_file import write_lens
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.range_image import RotatingSheet, StraightTransport
+from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.schema import DescriptionError, Section
 from gpuvision.sensor.sensor import Sensor
 
@@ -540,6 +542,19 @@ def test_a_calibrated_camera_before_a_rotating_sheet() -> None:
     assert sensor.transport == expected
     with pytest.raises(DescriptionError, match=r"unknown key 'transport\.focal_length_px'"):
         sensor_of(changed("corner_scene") | {"camera": TILTED_CAMERA.to_dict()})
+
+
+def test_plane_polynomials_of_a_triangulation() -> None:
+    """G = p(v, u) and H = q(v, u) in the coordinates of the axes."""
+    p = [0.001, 2e-4, 1e-6, 0.0, 1e-8, 0.0, 0.0, 1e-11]
+    q = [0.002, -1e-4, 2e-6, 1e-8, 0.0, 0.0, 1e-11, 0.0]
+    table = changed("camera_line", lens=None, triangulation={"p": p, "q": q})
+    triangulation = sensor_of(table).readout.triangulation
+    assert triangulation is not None
+    polynomial = PlanePolynomial(p=tuple(p), q=tuple(q), region=((-239.5, 239.5), (-15.0, 48.0)))
+    assert triangulation == Triangulation.from_polynomial(polynomial)
+    with pytest.raises(DescriptionError, match=r"triangulation: .*has a polynomial and a lens"):
+        sensor_of(changed("camera_line", triangulation={"p": p, "q": q}))
 
 
 def test_errors_of_a_calibrated_camera(tmp_path: Path) -> None:

@@ -111,8 +111,10 @@ class SensorView:
     limits: ViewLimits = ViewLimits()
 
     def __post_init__(self) -> None:
-        if self.triangulation.camera is not None:
-            raise ValueError("SensorView.triangulation has a camera; a simulation takes one with a lens, or without")
+        if self.triangulation.camera is not None or self.triangulation.polynomial is not None:
+            raise ValueError(
+                "SensorView.triangulation has a camera or a polynomial; a simulation takes one with a lens, or without"
+            )
         if self.transport.bend is not None:
             raise ValueError("SensorView.transport has a bent sheet; a simulation takes a flat one")
         object.__setattr__(self, "lens", numbers(self.lens, (3,), "SensorView.lens"))

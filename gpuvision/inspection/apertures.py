@@ -133,11 +133,31 @@ def read_apertures(
         with reading(name, "Gerber file"):
             objects = drawn_objects(parsed(found))
     groups = _touching(objects)
-    apertures = [make_aperture(str(number), group) for number, group in enumerate(groups, 1)]
+    # Most apertures of a board are copies of a few: each shape is measured once.
+    measured: dict[tuple[bytes | bool, ...], tuple[float, Float64]] = {}
+    apertures = []
+    for number, group in enumerate(groups, 1):
+        corner, key = _relative(group)
+        if key not in measured:
+            area, centroid = area_and_centroid(group)
+            measured[key] = area, centroid - corner
+        area, arm = measured[key]
+        apertures.append(Aperture(name=str(number), shapes=group, area=area, centroid=corner + arm))
     kept = [each for each in apertures if each.area >= _SMALLEST_AREA]
     if not kept:
         raise ReadError(f"{path}: the paste layer {name} has no aperture; expected the apertures of a stencil")
     return _named(kept, pads)
+
+
+def _relative(shapes: Sequence[Shape]) -> tuple[Float64, tuple[bytes | bool, ...]]:
+    """Return the first corner of shapes, and a key that is equal for copies up to a nanometre."""
+    corner = shapes[0].outline[0]
+    parts: list[bytes | bool] = []
+    for each in shapes:
+        for outline in (each.outline, *each.holes):
+            parts.append(np.rint((outline - corner) * 1e9).tobytes())
+        parts.append(each.dark)
+    return corner, tuple(parts)
 
 
 def _touching(objects: Sequence[DrawnObject]) -> list[tuple[Shape, ...]]:

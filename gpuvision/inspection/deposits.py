@@ -26,6 +26,7 @@ from gpuvision.validation import finite, integer
 
 _DOUBLINGS = 4  # of the width of the ring, until it has enough cells
 _LAGS = 4  # cells up to which the noise is taken for correlated; regridding correlates neighbours. Chosen
+_MOST_RINGS = 50  # rings from which the correlation is estimated. Chosen: they have 100 000 cells
 _SIGNIFICANT = 3.0  # standard deviations of a correlation that counts, and of a volume that is a deposit
 _CLIPPED = 3.0  # residuals beyond this many standard deviations are not noise
 _TOP_PATCH = 0.15  # half width of the patch of the largest height, in square roots of the area. Chosen
@@ -229,7 +230,7 @@ def measure_deposits(
             for window, surface in zip(windows, surfaces, strict=True)
             if window is not None and surface is not None
         ]
-        correlated = _correlation_area(rings)
+        correlated = _correlation_area(rings[:: max(len(rings) // _MOST_RINGS, 1)])
     else:
         correlated = finite(correlation_area, "correlation_area", minimum=1.0)
     to_board = np.asarray(np.linalg.inv(placement.matrix), np.float64)

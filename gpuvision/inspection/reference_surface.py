@@ -13,7 +13,8 @@ _TUKEY = 4.685  # tuning constant of Tukey's biweight: 95 % efficiency for norma
 _MAD = 1.4826  # standard deviation of normal residuals over their median absolute value
 _LEAST_SCALE = 1e-12  # [m]: residuals of a noise-free plane are rounding errors
 _LAD_STEPS, _TUKEY_STEPS = 15, 30
-_TOLERANCE = 1e-6  # of the weights
+_LAD_TOLERANCE = 0.02  # change of the residuals, in their scale: the result is only the start of the second fit
+_TOLERANCE = 1e-5  # of the weights
 
 
 class ReferenceSurface(NamedTuple):
@@ -92,13 +93,15 @@ def fit_reference(x: Float64, y: Float64, z: Float64, order: int) -> ReferenceSu
     for _ in range(_LAD_STEPS):
         scale = max(_MAD * float(np.median(np.abs(residual))), _LEAST_SCALE)
         coefficients = _weighted(design, z - level, 1.0 / np.maximum(np.abs(residual), 1e-2 * scale))
-        residual = z - level - design @ coefficients
+        before, residual = residual, z - level - design @ coefficients
+        if np.max(np.abs(residual - before)) < _LAD_TOLERANCE * scale:
+            break
     scale = max(_MAD * float(np.median(np.abs(residual))), _LEAST_SCALE)
     weights = np.zeros_like(residual)
     for _ in range(_TUKEY_STEPS):
         ratio = np.minimum((residual / (_TUKEY * scale)) ** 2, 1.0)
-        before, weights = weights, (1.0 - ratio) ** 2
-        if np.max(np.abs(weights - before)) < _TOLERANCE:
+        former, weights = weights, (1.0 - ratio) ** 2
+        if np.max(np.abs(weights - former)) < _TOLERANCE:
             break
         coefficients = _weighted(design, z - level, weights)
         residual = z - level - design @ coefficients

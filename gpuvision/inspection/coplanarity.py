@@ -16,7 +16,7 @@ from scipy.optimize import linprog
 
 from gpuvision.inspection.apertures import Aperture
 from gpuvision.inspection.coverage import covered
-from gpuvision.inspection.deposits import cells_of
+from gpuvision.inspection.deposits import cells_of, complete_sigmas
 from gpuvision.inspection.top_height import top_height
 from gpuvision.matching.artwork.shapes import Float64
 from gpuvision.ranging.regrid import Grid
@@ -190,7 +190,7 @@ def measure_coplanarity(
         raise ValueError(f"heights have shape {heights.shape}, the grid has {grid.shape}; expected the same")
     parts = [_region(heights, grid, each) for each in regions]
     noise = _noise(parts) if sigma is None else sigma
-    sigmas = np.broadcast_to(np.asarray(noise, np.float64), heights.shape)
+    sigmas = complete_sigmas(np.asarray(noise, np.float64), grid.shape)
     tops = np.full((len(regions), 2), math.nan)
     for index, (each, (part, inside, rows, columns)) in enumerate(zip(regions, parts, strict=True)):
         if inside.any():

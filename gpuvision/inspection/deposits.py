@@ -125,6 +125,8 @@ class Deposits(NamedTuple):
         Height of the reference surface at the centre [m].
     noise
         Standard deviation of the heights [m] that the sigmas use: median over all cells.
+    board_scatter
+        Robust standard deviation of the board about the reference surfaces [m]: noise and roughness.
     correlation_area
         Number of cells whose noise is common, 1 for independent cells: variances of sums are larger by this factor.
     """
@@ -147,6 +149,7 @@ class Deposits(NamedTuple):
     valid: Float64
     reference: Float64
     noise: float
+    board_scatter: float
     correlation_area: float
 
 
@@ -260,6 +263,7 @@ def measure_deposits(
         valid=table[:, 12],
         reference=table[:, 13],
         noise=float(np.median(known)),
+        board_scatter=estimated,
         correlation_area=correlated,
     )
 
@@ -270,7 +274,22 @@ def _sigmas(sigma: float | npt.NDArray[np.floating] | None, estimated: float, gr
         raise ValueError(f"sigma has shape {given.shape}, the grid has {grid.shape}; expected the same, or one number")
     if np.any(given < 0):
         raise ValueError("sigma is negative, expected standard deviations [m]")
-    return np.broadcast_to(given, grid.shape)
+    return complete_sigmas(given, grid.shape)
+
+
+def complete_sigmas(sigma: Float64, shape: tuple[int, int]) -> Float64:
+    """Return standard deviations of all cells: unknown ones (NaN) are the median of the known ones.
+
+    Parameters
+    ----------
+    sigma : numpy.ndarray
+        One standard deviation, or one per cell.
+    shape : tuple of int
+        Shape of the height map.
+    """
+    known = np.isfinite(sigma)
+    level = float(np.median(sigma[known])) if known.any() else math.nan
+    return np.broadcast_to(np.where(known, sigma, level), shape)
 
 
 def aperture_windows(apertures: Sequence[Aperture], grid: Grid, margin: float) -> list[_Window | None]:

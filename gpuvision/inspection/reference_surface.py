@@ -13,7 +13,7 @@ _TUKEY = 4.685  # tuning constant of Tukey's biweight: 95 % efficiency for norma
 _MAD = 1.4826  # standard deviation of normal residuals over their median absolute value
 _LEAST_SCALE = 1e-12  # [m]: residuals of a noise-free plane are rounding errors
 _LAD_STEPS, _TUKEY_STEPS = 15, 30
-_LAD_TOLERANCE = 0.02  # change of the residuals, in their scale: the result is only the start of the second fit
+_LAD_TOLERANCE = 0.1  # change of the residuals, in their scale: the result is only the start of the second fit
 _TOLERANCE = 1e-5  # of the weights
 
 

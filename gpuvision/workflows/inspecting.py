@@ -36,6 +36,7 @@ SEARCH_RANGE = (2e-3, math.radians(3.0))
 """Default search range of a board: shift [m] and rotation [rad]."""
 # Correlation of the pattern below which the alignment is doubtful. Chosen: without paste it is below 0.2.
 _WEAK_CORRELATION = 0.3
+_ROUGH = 2.0  # scatter of the board over the sigma of its heights, from which on they disagree. Chosen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,6 +150,12 @@ class PasteInspection:
                 f"the height map correlates with the paste pattern by {self.alignment.correlation:.2f} only; check the "
                 "side of the board and the initial pose"
             )
+        if self.deposits.board_scatter > _ROUGH * self.deposits.noise:
+            found.append(
+                f"the board scatters by {1e6 * self.deposits.board_scatter:.3g} um about the reference surfaces, the "
+                f"sigma of the heights is {1e6 * self.deposits.noise:.3g} um: the board is rough, or the sigma is too "
+                "small"
+            )
         if self.deposits.noise * 4 > self.settings.level:
             found.append(
                 f"the noise of the heights is {1e6 * self.deposits.noise:.3g} um, the threshold of the area only "
@@ -235,7 +242,7 @@ class PasteInspection:
             "pose": asdict(self.placement),
             "alignment": alignment,
             "noise": self.deposits.noise,
-            "noise_source": "height map" if self.heights.sigma is not None else "board about the reference surfaces",
+            "board_scatter": self.deposits.board_scatter,
             "correlation_area_cells": self.deposits.correlation_area,
             "map": asdict(self.heights.grid),
             "deposits": self.rows(),

@@ -144,6 +144,17 @@ def test_the_height_of_the_pad_is_subtracted():
     np.testing.assert_allclose(found.height_mean, 100e-6, rtol=1e-9)
 
 
+def test_cells_of_unknown_sigma_have_the_median():
+    grid = board_grid(100, 80)
+    z = paste_map(grid, HERE, [(Box((300e-6, 200e-6), 110e-6), (0.5e-3, 0.4e-3))])
+    sigma = np.full(grid.shape, 2e-6)
+    known = measure_deposits(z, grid, [rectangle("1", (0.5e-3, 0.4e-3), (300e-6, 200e-6))], HERE, SETTINGS, sigma=sigma)
+    sigma[30:50, 40:60] = np.nan
+    found = measure_deposits(z, grid, [rectangle("1", (0.5e-3, 0.4e-3), (300e-6, 200e-6))], HERE, SETTINGS, sigma=sigma)
+    np.testing.assert_array_equal(found.volume_sigma, known.volume_sigma)
+    np.testing.assert_array_equal(found.noise, 2e-6)
+
+
 def test_deposits_that_cannot_be_measured_say_why(rng):
     grid = board_grid(200, 100)
     z = paste_map(grid, HERE, [(Cap(200e-6, 130e-6), (0.5e-3, 0.5e-3)), (Cap(200e-6, 130e-6), (1.5e-3, 0.5e-3))])

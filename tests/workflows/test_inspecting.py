@@ -84,6 +84,10 @@ def test_the_paste_of_a_board(gerbers: Path, paste: Path, tmp_path: Path, run: A
     assert [each["verdict"] for each in told["deposits"]] == ["high", "pass", "high", "high", "low"]
     assert told["alignment"] is None
     assert told["noise"] == 2e-6
+    assert told["warnings"] == []
+    ran = run(paste, "--board", gerbers, "--stencil=120um", *LAYERS, "--out", out, "--sigma=0.4um", pose[0])
+    assert "warning: the board scatters by 1" in ran.err
+    assert "the sigma of the heights is 0.4 um" in ran.err
 
 
 def test_an_image_with_a_scale(gerbers: Path, tmp_path: Path, run: Any) -> None:

@@ -51,6 +51,7 @@ G37*
 M02*
 """
 _OUTLINE = "%ADD10C,0.1*%\nD10*\nX0Y0D02*\nX8000000D01*\nY8000000D01*\nX0D01*\nY0D01*\nM02*\n"
+_PAD = "%ADD10C,0.8*%\nD10*\nX2000000Y3000000D03*\nM02*\n"
 _HOLES = "M48\nMETRIC,TZ\nFMAT,2\nT1C0.5\nT2C1.0\n%\nG90\nG05\nT1\nX2.0Y3.0\nR2X0.5\nT2\nX2.0Y5.0\nM30\n"
 _MATERIALS = """[[material]]
 name = "mask"
@@ -92,11 +93,17 @@ def main() -> None:
         cv2.imwrite(str(SEEDS / f"image.{kind}"), colour)
     cv2.imwrite(str(SEEDS / "image.pgm"), colour[..., 0])
     _write_tables()
-    for name, text in (("copper.gbr", _HEAD + _COPPER), ("outline.gbr", _HEAD + _OUTLINE), ("holes.drl", _HOLES)):
+    board = {
+        "copper.gbr": _HEAD + _COPPER,
+        "holes.drl": _HOLES,
+        "beside/outline.gbr": _HEAD + _OUTLINE,
+        "beside/pad.gbr": _HEAD + _PAD,
+    }
+    for name, text in board.items():
         (SEEDS / name).write_text(text)
     with zipfile.ZipFile(SEEDS / "board.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in ("copper.gbr", "outline.gbr", "holes.drl"):
-            archive.write(SEEDS / name, name)
+        for name in ("copper.gbr", "beside/outline.gbr", "holes.drl"):
+            archive.write(SEEDS / name, Path(name).name)
     box = trimesh.creation.box()
     box.export(SEEDS / "part.stl")
     box.export(SEEDS / "part.ply")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from gpuvision.workflows.light_cache import LightBlock
 from gpuvision.workflows.locating_robot import read_points
 
 SEEDS = Path(__file__).parent / "seeds"
-LAYERS = {"copper.gbr": "top copper", "outline.gbr": "mechanical outline", "holes.drl": "drill plated"}
+LAYERS = {"(copper|pad).gbr": "top copper", "outline.gbr": "mechanical outline", "holes.drl": "drill plated"}
 # Small limits: an image or a mesh that a mutation enlarges must not take memory that would hide a fault.
 LIMITS = {"GPUVISION_MAX_PIXELS": "1e6", "GPUVISION_MAX_TRIANGLES": "1e4", "GPUVISION_MAX_BOARD_OBJECTS": "1e4"}
 
@@ -44,7 +45,7 @@ class Reader:
     read : callable
         Function that reads the file at a path.
     beside : tuple of str
-        Names of seeds that are put beside the file.
+        Paths of files that are put beside the file, from the folder of the seeds.
     """
 
     seed: str
@@ -67,7 +68,7 @@ class Reader:
         for each in folder.iterdir():
             each.unlink()
         for name in self.beside:
-            (folder / name).write_bytes((SEEDS / name).read_bytes())
+            shutil.copyfile(SEEDS / name, folder / Path(name).name)
         path = folder / self.seed
         path.write_bytes(content)
         try:
@@ -122,8 +123,8 @@ _ALL = (
     Reader("features.toml", read_features),
     Reader("field.toml", read_field),
     Reader("materials.toml", read_materials),
-    Reader("copper.gbr", _board, ("outline.gbr", "holes.drl")),
-    Reader("holes.drl", _board, ("copper.gbr", "outline.gbr")),
+    Reader("copper.gbr", _board, ("beside/outline.gbr", "holes.drl")),
+    Reader("holes.drl", _board, ("beside/pad.gbr", "beside/outline.gbr")),
     Reader("board.zip", lambda path: read_artwork(path, layers=LAYERS)),
     *(Reader(f"part.{kind}", Scene.load) for kind in ("stl", "ply", "obj", "glb")),
     Reader("heights.tif", read_tiff),

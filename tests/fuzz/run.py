@@ -138,7 +138,8 @@ def main() -> int:
         os.environ |= LIMITS
         names, fuzz = given.readers or list(READERS), _fuzz
     else:
-        names = given.readers or sorted(each.name for each in (ROOT / "tests" / "fuzz" / "seeds").iterdir())
+        seeds = (ROOT / "tests" / "fuzz" / "seeds").iterdir()
+        names = given.readers or sorted(each.name for each in seeds if each.is_file())
         fuzz = _follow_coverage
         os.environ |= {"GPUVISION_MAX_PIXELS": "1e6", "GPUVISION_MAX_TRIANGLES": "1e4"}
     return int(sum(fuzz(name, given.runs, given.seconds) for name in names) > 0)

@@ -140,16 +140,17 @@ static inline Pose pose_of(real travelled, constant RangeTable *table) {
 //
 // With V the vector from (g, h) to the pinhole along the plane and F = f / D, the light is at the share s where
 //     s = F((g, h) + s V),  F quadratic:  F(V) s^2 - (1 - grad F . V) s + F(g, h) = 0
-// The smaller root is written as a quotient in which nothing cancels. It is exact: there is no iteration.
+// The root that grows from 0 with F is written as a quotient in which nothing cancels. It is exact, without an iteration.
+// Where F is too large for this root, the divisor is NaN or negative.
 static inline reals bent(reals *g, reals *h, constant RangeTable *table, masks *missed) {
     constant real *f = table->bend;
     const reals to_g = table->pinhole[0] - *g, to_h = table->pinhole[1] - *h;
     const reals here = *g * (f[0] * *g + f[1] * *h) + f[2] * *h * *h;
     const reals there = to_g * (f[0] * to_g + f[1] * to_h) + f[2] * to_h * to_h;
     const reals slope = to_g * (2 * f[0] * *g + f[1] * *h) + to_h * (f[1] * *g + 2 * f[2] * *h);
-    const reals b = 1 - slope, square = b * b - 4 * there * here;
-    const reals share = 2 * here / (b + sqrt(square));
-    *missed = ~(mask_of(b > 0) & mask_of(square >= 0) & mask_of(share < 1));
+    const reals b = 1 - slope, divisor = b + sqrt(b * b - 4 * there * here);
+    const reals share = 2 * here / divisor;
+    *missed = ~(mask_of(divisor > 0) & mask_of(share < 1));
     *g += share * to_g;
     *h += share * to_h;
     return share;

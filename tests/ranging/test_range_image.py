@@ -163,6 +163,30 @@ def test_points_of_a_bent_sheet_and_rays_that_miss_it(device):
         np.testing.assert_allclose(made.x[good], (g * (1.0 - share))[good], atol=1e-15)
 
 
+def test_bent_sheets_beyond_the_pinhole_and_saddles(device):
+    """The light lies between pinhole and sheet, on the intersection that a flat sheet that bends reaches first."""
+    geometry = StraightTransport(bend=BentSheet(terms=(40.0, 0.0, 0.0), pinhole=(0.1, 0.0, 0.1)))
+    # The normal through the pinhole meets the sheet at d = 0.4, beyond the pinhole.
+    made = RangeImage(geometry=geometry)(
+        np.array([[0.1, -0.1]]), np.zeros((1, 2)), np.zeros(1), np.zeros((1, 2), np.uint8), device=device
+    )
+    assert made.status[0].tolist() == [Status.HORIZON, 0]
+    # On a saddle: a ray whose root is lost as the bend grows, and one whose root stays (b is negative for both).
+    for start, pinhole, flag in (
+        ((0.03, 0.029), (0.33, -0.071, 0.1), Status.HORIZON),
+        ((0.02, 0.0), (0.12, 0.2, 0.1), Status.OK),
+    ):
+        bend = BentSheet(terms=(40.0, 0.0, -40.0), pinhole=pinhole)
+        g, h = (np.full((1, 1), each) for each in start)
+        op = RangeImage(geometry=dataclasses.replace(geometry, bend=bend))
+        made = op(g, h, np.zeros(1), np.zeros((1, 1), np.uint8), device=device)
+        assert made.status[0, 0] == flag
+    share = -made.y[0, 0] / 0.1
+    assert 0.0 < share < 1.0
+    assert share == pytest.approx(400.0 * ((0.02 + 0.1 * share) ** 2 - (0.2 * share) ** 2), abs=1e-12)
+    assert (made.x[0, 0], made.z[0, 0]) == pytest.approx((0.02 + 0.1 * share, 0.2 * share), abs=1e-15)
+
+
 def test_a_wrong_bent_sheet_is_refused():
     with pytest.raises(ValueError, match=r"g_axis and h_axis of a bent sheet are not two orthonormal"):
         dataclasses.replace(BENT, h_axis=(math.tan(0.3), 0.0, 1.0))

@@ -47,9 +47,12 @@ def test_a_component_that_cannot_stand_is_refused():
         seating_plane(x, y, np.zeros(4), (2e-3, 0.5e-3))
     with pytest.raises(ValueError, match="on one line"):
         seating_plane(x, 2 * x, np.zeros(4), (0.5e-3, 0.5e-3))
-    flat = seating_plane(x, y, np.full(4, 7e-6), (0.4e-3, 0.5e-3))
-    np.testing.assert_allclose(flat.coefficients, [7e-6, 0, 0], atol=1e-12)
-    assert len(set(flat.seats.tolist())) == 3
+    # Of four leads in one plane the seats are three around the centre of gravity.
+    for corner, centre in enumerate([(0.2e-3, 0.2e-3), (0.8e-3, 0.2e-3), (0.2e-3, 0.8e-3), (0.8e-3, 0.8e-3)]):
+        flat = seating_plane(x, y, np.full(4, 7e-6), centre)
+        np.testing.assert_allclose(flat.coefficients, [7e-6, 0, 0], atol=1e-12)
+        assert corner in flat.seats
+        assert len(set(flat.seats.tolist())) == 3
 
 
 def _component(lows):

@@ -97,6 +97,27 @@ def test_sigmas_are_the_spread_under_noise_of_many_draws(rng, given):
     _check_sigmas(rng, 60, given)
 
 
+def test_sigmas_contain_the_uncertainty_of_the_reference(rng):
+    """A flat cone on a board of few cells: the reference determines area and mean height, 1 within 3 of 150 draws."""
+    grid = board_grid(60, 60)
+    apertures = [circle("1", (0.3e-3, 0.3e-3), 180e-6)]
+    clean = paste_map(grid, HERE, [(Frustum(180e-6, 10e-6, 60e-6), (0.3e-3, 0.3e-3))])
+    away = np.hypot(*np.meshgrid(grid.x - 0.3e-3, grid.y - 0.3e-3))
+    clean[away > 191e-6] = np.nan
+    settings = PasteSettings(stencil=40e-6, margin=5e-6, ring=40e-6, least_reference=20)
+    draws = [
+        measure_deposits(
+            clean + rng.normal(0, 2e-6, clean.shape), grid, apertures, HERE, settings, sigma=2e-6, correlation_area=1.0
+        )
+        for _ in range(150)
+    ]
+    for name in ("volume", "area", "height_mean"):
+        values = np.array([getattr(each, name)[0] for each in draws])
+        sigmas = np.array([getattr(each, f"{name}_sigma")[0] for each in draws])
+        ratio = values.std(ddof=1) / np.sqrt(np.mean(sigmas**2))
+        assert abs(ratio - 1) < 3 / math.sqrt(2 * len(draws)), (name, ratio)
+
+
 def _check_correlated(rng, count):
     """Noise that neighbours share has larger sigmas: its correlation area is found in the board."""
     grid = board_grid(210, 210)

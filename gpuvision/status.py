@@ -27,6 +27,6 @@ class Status(enum.IntFlag):
     HORIZON = 32
     """The ray of the sample is parallel, or nearly parallel, to the sheet of light."""
     NO_DATA = 64
-    """No measurement lies near enough to this place."""
+    """No measurement lies near enough to this place, or the frame of the sample is damaged."""
     NOT_INVERTIBLE = 128
     """The mapping is not one-to-one here: the lens is beyond its fold, or the sampling runs backwards."""

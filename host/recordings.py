@@ -20,6 +20,7 @@ import numpy as np
 import tifffile
 
 from gpuvision.host.arrays import HostArray
+from gpuvision.host.damage import is_damaged_jpeg
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.image_header import image_size, is_tiff
 from gpuvision.host.reading import check_archive, check_pixels, reading
@@ -30,8 +31,8 @@ Channel = Literal["grey", "red", "green", "blue", "max", "red_difference", "gree
 
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
 _DIFFERENCE = "_difference"
-_TIFF = (".tif", ".tiff")
-_IMAGES = (".png", ".bmp", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".webp", *_TIFF)
+_TIFF, _JPEG = (".tif", ".tiff"), (".jpg", ".jpeg")
+_IMAGES = (".png", ".bmp", *_JPEG, ".pgm", ".ppm", ".pnm", ".webp", *_TIFF)
 _VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv", ".ts")
 _NPY, _ZIP = b"\x93NUMPY", b"PK"
 _PLACES = {"blue": 0, "green": 1, "red": 2}
@@ -78,8 +79,9 @@ def open_recording(path: str | Path, *, channel: Channel = "grey", key: str | No
 
     Notes
     -----
-    A video that is damaged in its middle raises no exception: the decoder conceals the damage, and the concealed frames
-    look like others.
+    A video that is damaged in its middle raises no exception: the decoder conceals the damage. `Source.damaged_frames`
+    names the frames, and JPEG images of a folder that are damaged. Codecs without redundancy (VP9, FFV1 without
+    checksums, arrays) do not show changed bytes.
     """
     if channel not in CHANNELS:
         raise ValueError(f"channel is {channel!r}, expected one of {', '.join(CHANNELS)}")
@@ -339,52 +341,43 @@ class Video(FrameSource):
     """One channel of the frames of a video; a video that ends before its announced length raises `RecordingError`."""
 
     def __init__(self, path: str | Path, channel: Channel = "grey") -> None:
+        # Imported here: the library takes 0.3 s, which other commands need not spend.
+        from gpuvision.host.video import VideoDecoder
+
         self._path = Path(path)
         with reading(path, "video", RecordingError):
             with self._path.open("rb") as file:
                 check_avi(file)
-            self._capture = cv2.VideoCapture(str(path))
-            self._grabbed = self._capture.isOpened() and self._capture.grab()
-        if not self._grabbed:
-            self._capture.release()
-            raise RecordingError(f"{path}: no frame of this video can be decoded: damaged, or of an unknown codec")
-        announced = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        sides = (self._capture.get(each) for each in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH))
-        check_pixels(tuple(map(int, sides)), f"{path}: a frame", RecordingError)
-        with reading(path, "video", RecordingError):
-            decoded, self._colour = self._capture.retrieve()
-        if not decoded or self._colour is None or self._colour.ndim != 3:
-            raise RecordingError(f"{path}: the first frame of this video cannot be decoded")
-        super().__init__(self._colour.shape[:2], self._colour.dtype)
-        # Containers of unknown length report a number of frames below 1.
-        self.length = announced if announced > 0 else None
-        self.rate = float(self._capture.get(cv2.CAP_PROP_FPS)) or None
-        self._pick = _picker(channel, self._colour.shape, str(path))
+            self._decoder = VideoDecoder(self._path)
+        super().__init__(self._decoder.shape[:2], np.dtype(np.uint8))
+        self.length, self.rate = self._decoder.length, self._decoder.rate
+        self._pick = _picker(channel, self._decoder.shape, str(path))
         self._next = 0
 
     def _ready(self) -> bool:
-        """Grab the next frame and return whether there is one."""
-        if not self._grabbed:
-            self._grabbed = self._capture.grab()
-            if not self._grabbed and self.length is not None and self._next < self.length:
-                raise RecordingError(
-                    f"{self._path}: truncated video: frame {self._next} of {self.length} cannot be decoded"
-                )
-        return self._grabbed
+        """Decode the next frame and return whether there is one."""
+        is_there = self._decoder.wait()
+        if not is_there and self.length is not None and self._next < self.length:
+            raise RecordingError(
+                f"{self._path}: truncated video: frame {self._next} of {self.length} cannot be decoded"
+            )
+        return is_there
 
     def _decode(self, out: HostArray) -> None:
-        with reading(f"{self._path}, frame {self._next}", "frame", RecordingError):
-            decoded, self._colour = self._capture.retrieve(self._colour)
-        self._grabbed = False
-        if not decoded or self._colour is None:
-            raise RecordingError(f"{self._path}: frame {self._next} cannot be decoded")
-        check_frame(self._colour[:, :, 0], self.shape, self.dtype, f"{self._path}, frame {self._next}")
-        self._pick(self._colour, out)
+        what = f"{self._path}, frame {self._next}"
+        with reading(what, "frame", RecordingError):
+            colour = self._decoder.read()
+        check_frame(colour[:, :, 0], self.shape, self.dtype, what)
+        self._pick(colour, out)
         self._next += 1
+
+    def damaged_frames(self) -> frozenset[int]:
+        """Return the numbers of the frames so far that are damaged; see `gpuvision.host.video.VideoDecoder`."""
+        return frozenset(number for number in self._decoder.damaged() if number < self._next)
 
     def close(self) -> None:
         """Close the file."""
-        self._capture.release()
+        self._decoder.close()
 
 
 class ImageFolder(FrameSource):
@@ -398,6 +391,7 @@ class ImageFolder(FrameSource):
         super().__init__(first.shape[:2], first.dtype)
         self.length: int = len(self._files)
         self._next = 0
+        self._jpegs, self._damaged = 0, set[int]()
 
     def _ready(self) -> bool:
         """Return whether an image is left."""
@@ -408,7 +402,15 @@ class ImageFolder(FrameSource):
         image = read_image(file)
         check_frame(image if image.ndim == 2 else image[:, :, 0], self.shape, self.dtype, str(file))
         _picker(self._channel, image.shape, str(file))(image, out)
+        if file.suffix.lower() in _JPEG:
+            self._jpegs += 1
+            if is_damaged_jpeg(file.read_bytes()):
+                self._damaged.add(self._next)
         self._next += 1
+
+    def damaged_frames(self) -> frozenset[int]:
+        """Return the numbers of the JPEG images that break the format; none if most of them do, as of some cameras."""
+        return frozenset(self._damaged if 2 * len(self._damaged) <= self._jpegs else ())
 
 
 def image_files(folder: Path) -> list[Path]:

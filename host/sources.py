@@ -86,6 +86,10 @@ class Source:
         """
         raise NotImplementedError
 
+    def damaged_frames(self) -> frozenset[int]:
+        """Return the numbers of the frames read so far whose content is damaged, from 0."""
+        return frozenset()
+
     def stop(self) -> None:
         """Make a blocked `wait` or `read_into` return soon; called from another thread."""
 
@@ -376,6 +380,10 @@ class PacedSource(Source):
                 _yield()
             now = self._clock()
         return now
+
+    def damaged_frames(self) -> frozenset[int]:
+        """Return the damaged frames of the underlying source."""
+        return self._source.damaged_frames()
 
     def stop(self) -> None:
         """End a wait for the due time."""

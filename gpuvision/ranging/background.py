@@ -44,6 +44,10 @@ class _Subtracted(Source):
         """Wait for the next frame; return False at the end."""
         return self._source.wait()
 
+    def damaged_frames(self) -> frozenset[int]:
+        """Return the damaged frames of the wrapped source."""
+        return self._source.damaged_frames()
+
     def stop(self) -> None:
         """Stop the wrapped source."""
         self._source.stop()
@@ -112,6 +116,11 @@ class PreviousSubtracted(_Subtracted):
         self._limit = _saturation(source.dtype, saturation)
         self._previous: HostArray | None = None
 
+    def damaged_frames(self) -> frozenset[int]:
+        """Return the damaged frames, and the frames after them, which are less a damaged one."""
+        damaged = self._source.damaged_frames()
+        return damaged | {number + 1 for number in damaged}
+
     def read_into(self, out: HostArray, arrived: Arrivals) -> int:
         """Read frames and subtract each one's previous frame in place."""
         count = self._source.read_into(out, arrived)
@@ -155,6 +164,10 @@ class PairsSubtracted(_Subtracted):
         self._pair = np.empty((2, *source.shape), source.dtype)
         self._times: Arrivals = np.zeros(2, np.int64)
         self._held = 0
+
+    def damaged_frames(self) -> frozenset[int]:
+        """Return the pairs with a damaged frame."""
+        return frozenset(number // 2 for number in self._source.damaged_frames())
 
     def wait(self) -> bool:
         """Wait for the next pair; return False at the end."""

@@ -64,6 +64,7 @@ from gpuvision.sensor.transports import Encoder, Transport, read_transport
 
 Background = Literal["none", "median", "previous", "dark_after", "dark_before"]
 BACKGROUNDS: tuple[Background, ...] = get_args(Background)
+Damaged = Literal["drop", "keep"]
 _NOISE_KEYS = ("read_noise", "gain", "speckle")
 Folded = Literal["drop", "top"]
 Ambiguous = Literal["drop", "keep"]
@@ -89,12 +90,16 @@ class Recording:
         - ``"dark_after"``, ``"dark_before"``: after, or before, each frame with light comes a frame without light. A
           pair of frames gives one profile.
         - a path: an image without the light.
+    damaged
+        Whether the samples of a damaged frame of a video keep their points (``"keep"``) or are NO_DATA (``"drop"``, the
+        default).
     """
 
     channel: Channel = "grey"
     key: str | None = None
     rate: float | None = None
     background: Background | Path = "none"
+    damaged: Damaged = "drop"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -304,8 +309,9 @@ def _recording(kind: str, table: Section | None) -> Recording:
     background: Background | Path = "none"
     if kind == "camera" and "background" in table:
         background = table.word("background", BACKGROUNDS) or table.file("background")
+    damaged = table.choice("damaged", get_args(Damaged), "drop")
     table.finish()
-    return Recording(channel=channel, key=key, rate=rate, background=background)
+    return Recording(channel=channel, key=key, rate=rate, background=background, damaged=damaged)
 
 
 def _frame(top: Section) -> tuple[int, int] | None:

@@ -153,7 +153,7 @@ class Scan:
         """Return one line: frames, throughput, fraction of valid samples, size of the height map.
 
         A replay at a rate also names its longest stall and the part of the stream that spent it. With an encoder the
-        line gives the number of profiles that do not advance.
+        line gives the number of profiles that do not advance, and of a damaged recording the number of damaged frames.
         """
         stream, sensor_rate, delay = self.stream, self.sensor.recording.rate, self.metadata["late"]
         dropped = f" ({stream.dropped} dropped)" if stream.dropped else ""
@@ -168,8 +168,10 @@ class Scan:
         stalled = "" if stall is None else f"; longest stall {stall}"
         backward = (self.metadata["encoder"] or {}).get("not_advancing", 0)
         unordered = f"; {backward} profiles do not advance" if backward else ""
+        count = len(self.metadata["damaged_frames"])
+        damaged = f"; {count} damaged frame{'s' * (count > 1)}" if count else ""
         size = f"{self.grid.columns} x {self.grid.rows} cells"
-        return f"{stream.frames} frames{dropped} at {speed}, {valid}, {size}{overdue}{stalled}{unordered}"
+        return f"{stream.frames} frames{dropped} at {speed}, {valid}, {size}{overdue}{stalled}{unordered}{damaged}"
 
     def error_budget(self) -> dict[str, Any]:
         """Return the predicted and measured errors of the points and heights: see `scan_errors.error_budget`."""
@@ -326,6 +328,10 @@ def scan_advice(status: npt.NDArray[np.uint8], sensor: Sensor) -> tuple[str, ...
     turning = isinstance(sensor.transport, RotatingSheet)
     frequent = {flag for flag in Status if flag and np.mean((status & flag) != 0) >= 1 / 3}
     sentences = []
+    if Status.NO_DATA in frequent:
+        sentences.append(
+            'many frames are damaged: copy it again, or keep their samples with [recording] damaged = "keep"'
+        )
     if Status.LOW_SIGNAL in frequent and isinstance(sensor.readout, LineReadout):
         threshold = "a lower [line] threshold" if sensor.auto_threshold else '[line] threshold = "auto"'
         sentences.append(

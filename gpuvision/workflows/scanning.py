@@ -104,6 +104,9 @@ def scan(
     device = Device.best() if device is None else device
     paced, stream = _pipeline(source, readout, device, rate, policy, timeline)
     fields, frame_numbers = _read_frames(stream, readout.outputs or (), source.length, progress)
+    if sensor.recording.damaged == "drop":
+        damaged = np.isin(frame_numbers, sorted(paced.damaged_frames()))
+        fields["status"][damaged] |= np.uint8(Status.NO_DATA)
     start = time.perf_counter()
     points, errors = _points(sensor, fields, frame_numbers, stream.device)
     intensity = fields["peak" if sensor.kind == "camera" else "total"]
@@ -146,6 +149,12 @@ def _scan_stack(
     opened = open_for_scan(recording, sensor)
     peak, stream = read_focus_peak(opened.source, stack, progress)
     assert isinstance(sensor.transport, StraightTransport)  # the reader of [focus] gives no other
+    sharpest = np.where(np.isfinite(peak.frame), np.rint(peak.frame), -1.0).astype(np.int64)
+    if sensor.recording.damaged == "drop":
+        near = np.arange(-stack.neighbours, stack.neighbours + 1)
+        damaged = np.isin(sharpest, np.add.outer(sorted(opened.source.damaged_frames()), near))
+        peak.status[damaged] |= np.uint8(Status.NO_DATA)
+        peak.frame[damaged] = np.nan
     start = time.perf_counter()
     points = stack.points(
         peak, sensor.transport, sensor.output.limits, np.float64 if precision == "double" else np.float32
@@ -161,7 +170,7 @@ def _scan_stack(
         intensity=intensity,
         heights=heights,
         grid=grid,
-        frame_numbers=np.where(np.isfinite(peak.frame), np.rint(peak.frame), -1.0).astype(np.int64),
+        frame_numbers=np.where(np.isfinite(peak.frame), sharpest, -1),
         device=device,
         stream=stream,
         seconds={"assemble": middle - start, "resample": time.perf_counter() - middle},
@@ -199,6 +208,7 @@ def _metadata(name: str, sensor: Sensor, rate: float | None, source: Source) -> 
         "sensor_rate": sensor.recording.rate,
         "rate": rate,
         "encoder": _encoder(sensor),
+        "damaged_frames": sorted(source.damaged_frames()),
         "late": source.late * 1e-9 if isinstance(source, PacedSource) else None,
     }
 

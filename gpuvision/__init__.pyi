@@ -91,6 +91,9 @@ from .camera.views.planar_calibration import (
     fit_camera as fit_camera,
 )
 from .camera.views.pose_response import (
+    fit_pose as fit_pose,
+)
+from .camera.views.pose_response import (
     pose_responses as pose_responses,
 )
 from .camera.views.target_views import (
@@ -290,6 +293,9 @@ from .ranging.sheet_calibration import (
 )
 from .ranging.sheet_calibration import (
     fit_sheet as fit_sheet,
+)
+from .ranging.sheet_from_points import (
+    sheet_from_points as sheet_from_points,
 )
 from .ranging.transport_calibration import (
     TransportFit as TransportFit,

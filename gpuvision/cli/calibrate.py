@@ -26,6 +26,7 @@ from gpuvision.cli.calibrate_sensor import (
     BlockFolder,
     BlockHeights,
     Channel,
+    KnownPoints,
     LaserFolder,
     LineAxis,
     OnStage,
@@ -128,6 +129,7 @@ def calibrate(
     on_stage: OnStage = False,
     block: BlockFolder = None,
     block_heights: BlockHeights = None,
+    points: KnownPoints = None,
     step: Step = None,
     along: LineAxis = None,
     channel: Channel = None,
@@ -140,7 +142,7 @@ def calibrate(
     parameters that the images do not determine.
     """
     options = SensorOptions(
-        laser, transport_views, profiles_between, on_stage, block, block_heights, step, along, channel
+        laser, transport_views, profiles_between, on_stage, block, block_heights, points, step, along, channel
     )
     if not sensor:
         reject_unused("without --sensor", **options._asdict())

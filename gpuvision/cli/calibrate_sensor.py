@@ -74,6 +74,15 @@ BlockHeights = Annotated[
         "direction of growing columns (or rows), such as 0,5mm,10mm.",
     ),
 ]
+KnownPoints = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE.csv",
+        parser=named_path,
+        help="With --sensor: known points of the sheet of light instead of laser images, with the header "
+        "column,row,x,y,z [px, m].",
+    ),
+]
 Step = Annotated[
     float | None,
     typer.Option(
@@ -104,6 +113,7 @@ class SensorOptions(NamedTuple):
     on_stage: bool
     block: Path | None
     block_heights: str | None
+    points: Path | None
     step: float | None
     along: Axis | None
     channel: str | None
@@ -142,7 +152,10 @@ def calibrate_sensor(
 
     channel = _checked_channel(options.channel)
     _check(options, camera)
-    inputs = [*images, *(each for each in (options.laser, options.transport_views, options.block) if each is not None)]
+    inputs = [
+        *images,
+        *(each for each in (options.laser, options.transport_views, options.block, options.points) if each is not None),
+    ]
     outputs = Outputs("calibrate", inputs=inputs, overwrite=overwrite)
     outputs.claim(*sensor_calibration_files(out), as_json)
     with progress_bar(f"detecting {camera['pattern']}") as progress:
@@ -151,6 +164,7 @@ def calibrate_sensor(
             laser=options.laser,
             transport=_transport_views(options),
             block=_block_views(options),
+            points=options.points,
             step=options.step,
             along=None if options.along is None else options.along.value,
             channel=channel,

@@ -334,15 +334,37 @@ def _robust_plane(readings: _Readings, limits: SheetLimits) -> _Frame:
 def _oriented(frame: _Frame, readings: _Readings) -> _Frame:
     """Turn g along the samples of the image and h towards the camera; the normal is g x h."""
     inside = readings.weight > 0.0
-    offset, sample = readings.point[inside] - frame.origin, readings.along[inside]
-    flat = offset @ frame.axes[:2].T
+    axes = sheet_axes(frame.origin, frame.axes, readings.point[inside], readings.along[inside])
+    return _Frame(frame.origin, axes)
+
+
+def sheet_axes(origin: Float64, axes: Float64, points: Float64, sample: Float64) -> Float64:
+    """Return the axes g, h and g x h of a plane: g along the samples of the image, h towards the camera.
+
+    Parameters
+    ----------
+    origin : numpy.ndarray
+        (3,): point of the plane in the camera's frame [m].
+    axes : numpy.ndarray
+        (3, 3): two unit vectors in the plane and the normal.
+    points : numpy.ndarray
+        (n, 3): points near the plane [m].
+    sample : numpy.ndarray
+        (n,): place of each point along the laser line in the image [px].
+
+    Returns
+    -------
+    numpy.ndarray
+        (3, 3): the axes as rows.
+    """
+    flat = (points - origin) @ axes[:2].T
     # G is the direction in the sheet in which the sample number grows fastest.
-    growth = np.linalg.lstsq(flat, sample - sample.mean(), rcond=None)[0]
-    g = growth @ frame.axes[:2]
+    growth = np.linalg.lstsq(flat - flat.mean(axis=0), sample - sample.mean(), rcond=None)[0]
+    g = growth @ axes[:2]
     g /= np.linalg.norm(g)
-    h = np.cross(frame.axes[2], g)
-    h = h if h @ frame.origin < 0.0 else -h
-    return _Frame(frame.origin, np.stack([g, h, np.cross(g, h)]))
+    h = np.cross(axes[2], g)
+    h = h if h @ origin < 0.0 else -h
+    return np.stack([g, h, np.cross(g, h)])
 
 
 class _System(NamedTuple):

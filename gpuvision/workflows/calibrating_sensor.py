@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ from gpuvision.camera.views.planar_calibration import fit_camera
 from gpuvision.camera.views.pose_response import PoseResponse, pose_responses
 from gpuvision.camera.views.target_views import make_view
 from gpuvision.formats.json import json_tree
+from gpuvision.formats.known_points_file import read_known_points
 from gpuvision.formats.sensor_file import sensor_text
 from gpuvision.host import Device
 from gpuvision.host.files import write_text_atomic
@@ -33,6 +34,7 @@ from gpuvision.host.recordings import Channel, image_files
 from gpuvision.plots.sensor_calibration import SensorPicture, draw_sensor_calibration
 from gpuvision.ranging.sensor_geometry import SensorGeometry
 from gpuvision.ranging.sheet_calibration import Along, LaserLine, SheetFit, fit_sheet
+from gpuvision.ranging.sheet_from_points import sheet_from_points
 from gpuvision.ranging.transport_calibration import TransportFit, fit_transport
 from gpuvision.workflows.calibrating import detect_targets
 from gpuvision.workflows.laser_images import (
@@ -115,8 +117,8 @@ class SensorCalibration:
         Channel of colour images that holds the laser.
     lines : tuple of LineImage or None
         Laser line of each target view; None without a laser image.
-    block_lines : tuple of LineImage
-        Laser lines on a stepped block.
+    other_lines : tuple of LineImage
+        Laser lines on a stepped block, or known points.
     cell : float
         Cell of the height map for scans [m].
     warnings : tuple of str
@@ -129,14 +131,14 @@ class SensorCalibration:
     along: Along
     channel: Channel
     lines: tuple[LineImage | None, ...]
-    block_lines: tuple[LineImage, ...]
+    other_lines: tuple[LineImage, ...]
     cell: float
     warnings: tuple[str, ...]
 
     @property
     def readings(self) -> tuple[LineImage, ...]:
         """All laser lines, in the order of the sheet's residuals."""
-        return (*(each for each in self.lines if each is not None), *self.block_lines)
+        return (*(each for each in self.lines if each is not None), *self.other_lines)
 
     def summary(self) -> str:
         """Return one line: readings, residual, bend and step."""
@@ -197,6 +199,7 @@ def calibrate_sensor(
     laser: str | Path | None = None,
     transport: TransportViews | None = None,
     block: BlockViews | None = None,
+    points: str | Path | None = None,
     step: float | None = None,
     pattern: TargetPattern = "dots",
     model: str = "auto",
@@ -225,6 +228,9 @@ def calibrate_sensor(
     block : BlockViews, optional
         Images of a stepped block on the stage; they need `transport`, which gives the plane of the stage. Laser images
         of the target may be given as well, and need not.
+    points : path, optional
+        CSV file ``column,row,x,y,z`` of points of the sheet: pixels, and places in the frame of a fixture [m]. They
+        give a flat sheet, instead of laser images.
     step : float, optional
         Transport per profile [m]; required without `transport`, which measures it. The part moves along -(g x h) of the
         sheet, or along g x h if the step is negative.
@@ -263,53 +269,98 @@ def calibrate_sensor(
     if block is not None and transport is None:
         raise ValueError("a block needs transport views: they show the plane of the stage that carries it")
     folder = None if laser is None else Path(laser)
-    pairs = pair_images([Path(each) for each in images], folder, required=block is None)
+    pairs = pair_images([Path(each) for each in images], folder, required=block is None and points is None)
+    if points is not None and (block is not None or any(pairs.lasers)):
+        raise ValueError("known points replace laser images and the block; give one of them")
     moved = [] if transport is None else image_files(transport.folder)
     detected, skipped, size = detect_targets([*pairs.targets, *moved], pattern, inner_corners, progress)
     _check_transport_targets(detected, skipped, moved)
     views = [make_view(_grid(each), pitch) for each in detected]
     fit = fit_camera(views, size, model=model, focal_length=focal_length, loss=loss)
     targets = dict(zip((each.image for each in detected), pose_responses(fit, views), strict=True))
-    lit = _lit_targets(detected, dict(zip(pairs.targets, pairs.lasers, strict=True)), at_least=0 if block else 2)
-    steps = None if block is None else pair_images(image_files(block.folder), None)
-    if along is None:
-        along = line_direction(_first_lights(lit, steps, channel))
-    lines = {
-        each.image: read_line(target_light(each, file, channel), file, along=along, device=device) for each, file in lit
-    }
-    blocks = [] if block is None or steps is None else _block_lines(steps, block, along, channel, device)
+    if points is None:
+        lit = _lit_targets(detected, dict(zip(pairs.targets, pairs.lasers, strict=True)), at_least=0 if block else 2)
+        light = _read_light(lit, block, along, channel, device)
+        sheet = _fit_light(light, fit, targets, moved)
+    else:
+        light, sheet = _sheet_of_points(Path(points), fit, along)
     middle = views[[each.image for each in detected].index(moved[0])].target.mean(axis=0) if moved else np.zeros(3)
     motion = None if transport is None else _motion(transport, [targets[each] for each in moved], middle)
     geometry = SensorGeometry(
         camera=fit.camera,
         camera_names=fit.names,
         camera_covariance=fit.covariance,
-        sheet=fit_sheet(
-            fit.camera,
-            [
-                *(LaserLine(line.points, targets[image]) for image, line in lines.items()),
-                *(LaserLine(line.points, targets[moved[0]], heights) for line, heights in blocks),
-            ],
-            along=along,
-            names=fit.names,
-            camera_covariance=fit.covariance,
-        ),
+        sheet=sheet,
         transport=motion,
         step=motion.length if motion is not None else float(step or 0.0),
         zero_at_stage=transport is not None and transport.on_stage,
     )
-    readings = [*lines.values(), *(line for line, _ in blocks)]
     return SensorCalibration(
         name=name,
         calibration=_camera_calibration(fit, detected, skipped, size, pattern),
         geometry=geometry,
-        along=along,
+        along=light.along,
         channel=channel,
-        lines=tuple(lines.get(each.image) for each in detected),
-        block_lines=tuple(line for line, _ in blocks),
-        cell=_cell(geometry, readings, along),
-        warnings=(*fit.warnings, *_warnings(geometry, readings)),
+        lines=tuple(light.lines.get(each.image) for each in detected),
+        other_lines=light.others,
+        cell=_cell(geometry, light.readings, light.along),
+        warnings=(*fit.warnings, *_warnings(geometry, light.readings)),
     )
+
+
+class _Light(NamedTuple):
+    """Laser lines of all images: on targets by target image, and on a block with the heights of the readings."""
+
+    along: Along
+    lines: dict[Path, LineImage]
+    blocks: tuple[tuple[LineImage, Float64], ...]
+    points: LineImage | None = None
+
+    @property
+    def others(self) -> tuple[LineImage, ...]:
+        """Readings that are not on a target."""
+        return (*(line for line, _ in self.blocks), *(() if self.points is None else (self.points,)))
+
+    @property
+    def readings(self) -> tuple[LineImage, ...]:
+        """All readings, in the order of the residuals of the sheet."""
+        return (*self.lines.values(), *self.others)
+
+
+def _read_light(
+    lit: Sequence[tuple[DetectedTarget, Path]],
+    block: BlockViews | None,
+    along: Along | None,
+    channel: Channel,
+    device: Device | None,
+) -> _Light:
+    """Read the laser lines on targets and block."""
+    steps = None if block is None else pair_images(image_files(block.folder), None)
+    if along is None:
+        along = line_direction(_first_lights(lit, steps, channel))
+    lines = {
+        each.image: read_line(target_light(each, file, channel), file, along=along, device=device) for each, file in lit
+    }
+    blocks = () if block is None or steps is None else _other_lines(steps, block, along, channel, device)
+    return _Light(along, lines, blocks)
+
+
+def _fit_light(light: _Light, fit: CameraFit, targets: dict[Path, PoseResponse], moved: Sequence[Path]) -> SheetFit:
+    """Fit the sheet to the laser lines; the first transport view has the plane of the block."""
+    lines = [
+        *(LaserLine(line.points, targets[image]) for image, line in light.lines.items()),
+        *(LaserLine(line.points, targets[moved[0]], heights) for line, heights in light.blocks),
+    ]
+    return fit_sheet(fit.camera, lines, along=light.along, names=fit.names, camera_covariance=fit.covariance)
+
+
+def _sheet_of_points(file: Path, fit: CameraFit, along: Along | None) -> tuple[_Light, SheetFit]:
+    """Fit the sheet to the known points of a file."""
+    pixels, places = read_known_points(file)
+    if along is None:
+        along = "columns" if np.var(pixels[:, 0]) >= np.var(pixels[:, 1]) else "rows"
+    sheet = sheet_from_points(fit.camera, places, pixels, along=along, names=fit.names)
+    return _Light(along, {}, (), LineImage(image=file, points=pixels, threshold=math.nan, note="")), sheet
 
 
 def _first_lights(
@@ -327,9 +378,9 @@ def _pairs(images: ImagePairs) -> list[tuple[Path, Path]]:
     return [(dark, laser) for dark, laser in zip(images.targets, images.lasers, strict=True) if laser is not None]
 
 
-def _block_lines(
+def _other_lines(
     images: ImagePairs, block: BlockViews, along: Along, channel: Channel, device: Device | None
-) -> list[tuple[LineImage, Float64]]:
+) -> tuple[tuple[LineImage, Float64], ...]:
     """Read the laser lines on the block; return each with the heights of its readings."""
     if len(block.heights) < 2:
         raise ValueError(f"the block has {len(block.heights)} height, expected those of two steps at least")
@@ -338,7 +389,7 @@ def _block_lines(
         light = image_light(dark, laser, channel)
         line, step = read_block(light, laser, len(block.heights), along=along, device=device)
         found.append((line, np.array(block.heights)[step]))
-    return found
+    return tuple(found)
 
 
 def _motion(transport: TransportViews, targets: Sequence[PoseResponse], middle: Float64) -> TransportFit:
@@ -516,11 +567,13 @@ def _picture(calibration: SensorCalibration) -> SensorPicture:
         if line is not None
     }
     line = max(calibration.readings, key=lambda each: (each.image in grids, len(each.points)))
+    first = calibration.calibration.detected_targets[0]
+    is_image = bool(grids) or not math.isnan(line.threshold)
     sheet = calibration.geometry.sheet
     return SensorPicture(
         title=f"{calibration.calibration.summary()}\n{calibration.summary()}",
-        image=line.image,
-        grid=grids.get(line.image, np.zeros((0, 0, 2))),
+        image=line.image if is_image else first.image,
+        grid=grids.get(line.image, np.zeros((0, 0, 2)) if is_image else _grid(first)),
         line=line.points,
         lines=tuple(each.points for each in calibration.readings),
         coordinates=sheet.coordinates,

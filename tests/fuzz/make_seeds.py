@@ -118,6 +118,7 @@ def main() -> None:
     cv2.imwrite(str(SEEDS / "levels.png"), (1000 * z).astype(np.uint16))
     (SEEDS / "surface.csv").write_text(_SURFACE)
     (SEEDS / "leads.csv").write_text(_LEADS)
+    (SEEDS / "known_points.csv").write_text(_KNOWN_POINTS)
     write_npz(SEEDS / "map.npz", {"map_x": grid.x, "map_y": grid.y, "map_z": z}, dict.fromkeys(_MAP, "m"))
     _write_light(z)
     (SEEDS / "points.csv").write_text("0.5,1.0\n-0.5,2e-1\n0.0,0.3\n")
@@ -128,6 +129,11 @@ def main() -> None:
 
 
 _MAP = ("map_x", "map_y", "map_z")
+_KNOWN_POINTS = """column,row,x,y,z
+120.5,200.25,0.0,0.0,0.0
+380.0,198.5,0.05,0.0,1e-3
+140.0,120.75,0.0,0.0,0.02
+"""
 _LEADS = "name,x,y,width,height,angle\nA1,1e-3,2e-3,4e-4,2e-4,1.5\nA2,0,0,1e-3,1e-3,0\n"
 _SURFACE = """Info
 CSV Version,Sensor Count

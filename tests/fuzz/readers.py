@@ -16,6 +16,7 @@ from gpuvision.formats.encoder_file import read_encoder
 from gpuvision.formats.features_file import read_features
 from gpuvision.formats.field_file import read_field
 from gpuvision.formats.height_files import ImageScale, read_heights
+from gpuvision.formats.known_points_file import read_known_points
 from gpuvision.formats.leads_file import read_leads
 from gpuvision.formats.materials_file import read_materials
 from gpuvision.formats.range_image import read_npz, read_ply, read_png16, read_tiff
@@ -133,6 +134,7 @@ _ALL = (
     Reader("surface.csv", read_heights),
     Reader("map.npz", read_heights),
     Reader("leads.csv", read_leads),
+    Reader("known_points.csv", read_known_points),
     Reader("points.ply", read_ply),
     Reader("result.npz", read_npz),
     Reader("light.npz", LightBlock.from_file),

@@ -296,3 +296,25 @@ def test_stepped_block_gives_the_sheet_without_laser_images(images: Path, tmp_pa
         float(np.mean(scene_points(table, readings(truth, height, 0.0), 0.0)[:, 2])) for height in (0.0, 0.006, 0.012)
     ]
     assert np.abs(np.diff(heights) - 0.006).max() < 0.02 * 0.73e-3
+
+
+@pytest.mark.slow
+def test_known_points_give_the_sheet(images: Path, tmp_path: Path) -> None:
+    """Corners of a fixture in the light, in its own frame; no image shows the laser."""
+    truth = sensor(25.0)
+    write_images(tmp_path, truth, np.random.default_rng(9), VIEWS, MOVED)
+    flat = np.stack(np.meshgrid(np.linspace(-0.04, 0.04, 4), np.linspace(-0.02, 0.02, 3)), axis=-1).reshape(-1, 2)
+    noise = np.random.default_rng(3).normal(0.0, 0.02, flat.shape)
+    rows = np.column_stack([truth.project(truth.surface(flat)) + noise, flat, np.zeros(len(flat))])
+    np.savetxt(tmp_path / "points.csv", rows, delimiter=",", header="column,row,x,y,z", comments="")
+    targets = [each for each in sorted(tmp_path.glob("*.png")) if not each.stem.endswith("_laser")]
+    moved = ["--transport-views", tmp_path / "moved", "--profiles-between", PROFILES_BETWEEN, "--on-stage"]
+    options = ["--sensor", "--pitch", PITCH, *moved, "--points", tmp_path / "points.csv"]
+    run("calibrate", *targets, *options, "--out", tmp_path / "out" / "sensor.toml")
+    table, _ = read(tmp_path / "out" / "sensor.toml")
+    heights = [
+        float(np.mean(scene_points(table, readings(truth, height, 0.0), 0.0)[:, 2])) for height in (0.0, 0.006, 0.012)
+    ]
+    assert np.abs(np.diff(heights) - 0.006).max() < 0.02 * 0.73e-3
+    with pytest.raises(ValueError, match="known points replace laser images"):
+        run("calibrate", *tmp_path.glob("*.png"), *options, "--out", tmp_path / "other" / "sensor.toml")

@@ -19,12 +19,16 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.camera import COEFFICIENT_NAMES, Camera
-from gpuvision.camera.tilted_projection import Floats
+from gpuvision.camera.tilted_projection import Floats, rotation_matrix
 from gpuvision.camera.views.camera_fit import CameraFit, Pose
 
 # Length of a residual [standard deviations of a coordinate] above which a point is an outlier, which a robust loss has
 # not used. Derived: one of 1e5 points at normal noise.
 _OUTLIER = 5.0
+# Points that fix a pose and leave residuals; ratio of extents below which they are collinear (above double rounding).
+_MIN_POINTS, _COLLINEAR = 4, 1e-9
+# Gauss-Newton steps from the algebraic solution, and movement of the projected points that ends them [px].
+_MAX_STEPS, _CONVERGED_PX = 50, 1e-9
 # Columns of OpenCV's Jacobian of projected points: rotation 3, translation 3, fx, fy, cx, cy, coefficients.
 _TRANSLATION, _FX, _COEFFICIENTS = 3, 6, 10
 
@@ -75,6 +79,55 @@ def pose_responses(fit: CameraFit, views: Sequence[tuple[npt.ArrayLike, npt.Arra
     return tuple(responses)
 
 
+def fit_pose(
+    camera: Camera, names: Sequence[str], points: npt.ArrayLike, pixels: npt.ArrayLike
+) -> tuple[PoseResponse, Floats]:
+    """Fit the pose of an object with known points to one view of a calibrated camera.
+
+    Parameters
+    ----------
+    camera : Camera
+        Calibrated camera.
+    names : sequence of str
+        Parameters of the camera for the derivative, as in `CameraFit.names`.
+    points : array_like
+        (n, 3): points of the object [m], four at least, not on one line; they may lie in one plane.
+    pixels : array_like
+        (n, 2): measured (column, row) [px].
+
+    Returns
+    -------
+    PoseResponse
+        Its covariance follows from the residuals.
+    numpy.ndarray
+        (n, 2): measured minus projected points [px].
+
+    Raises
+    ------
+    ValueError
+        The points do not determine a pose.
+    """
+    scene, measured = np.asarray(points, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
+    if len(scene) < _MIN_POINTS or np.linalg.matrix_rank(scene - scene.mean(axis=0), _COLLINEAR) < 2:
+        raise ValueError(f"{len(scene)} points, expected {_MIN_POINTS} at least that do not lie on one line")
+    rays = camera.rays(measured)
+    ideal = np.ascontiguousarray(rays[:, :2] / rays[:, 2:])
+    _, vector, translation = cv2.solvePnP(scene, ideal, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
+    pose = Pose(cv2.Rodrigues(vector)[0].astype(np.float64), np.asarray(translation, dtype=np.float64).ravel())
+    for _ in range(_MAX_STEPS):
+        errors = measured - camera.project(scene, *pose)
+        if not np.isfinite(errors).all():
+            raise ValueError("the points have no pose in front of the camera; check their order and the axes")
+        by_pose, by_camera = _projection_derivatives(camera, names, pose, np.ascontiguousarray(scene))
+        step = np.linalg.lstsq(by_pose, errors.ravel(), rcond=None)[0]
+        if np.abs(by_pose @ step).max() < _CONVERGED_PX:
+            break
+        pose = Pose(rotation_matrix(step[:3]) @ pose.rotation, pose.translation + step[3:])
+    inverse: Floats = np.linalg.inv(by_pose.T @ by_pose).astype(np.float64)
+    variance = float(np.sum(errors**2)) / (errors.size - 6)
+    return PoseResponse(pose, variance * inverse, -inverse @ by_pose.T @ by_camera), errors
+
+
 def _projection_derivatives(camera: Camera, names: Sequence[str], pose: Pose, points: Floats) -> tuple[Floats, Floats]:
     """Return the derivatives (2 n, 6) and (2 n, m) of projected points by the pose and by camera parameters."""
     rotated = points @ pose.rotation.T
@@ -85,7 +138,7 @@ def _projection_derivatives(camera: Camera, names: Sequence[str], pose: Pose, po
     # A rotation vector w from the left moves a point by w x (R X).
     by_rotation = np.cross(rotated[:, None, :], by_place)
     by_pose = np.concatenate([by_rotation, by_place], axis=2).reshape(-1, 6)
-    return by_pose, np.column_stack([_column(slopes, name) for name in names])
+    return by_pose, np.stack([np.zeros(len(slopes)), *(_column(slopes, name) for name in names)], axis=1)[:, 1:]
 
 
 def _column(slopes: Floats, name: str) -> Floats:

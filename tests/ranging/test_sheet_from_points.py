@@ -1,0 +1,48 @@
+"""Sheet of light from known points of a fixture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gpuvision.camera.camera import Camera
+from gpuvision.ranging.sheet_from_points import sheet_from_points
+from laser_sensor import sensor
+
+TRUTH = sensor(20.0)
+CAMERA = Camera(matrix=tuple(tuple(row) for row in TRUTH.matrix.tolist()), distortion=tuple(TRUTH.distortion.tolist()))
+FLAT = np.stack(np.meshgrid(np.linspace(-0.04, 0.04, 4), np.linspace(-0.02, 0.02, 3)), axis=-1).reshape(-1, 2)
+
+
+def known(rng: np.random.Generator, sigma: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points in the frame of a fixture, and their noisy pixels."""
+    points = TRUTH.surface(FLAT)
+    turn = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix()
+    return (points - [0.1, 0.02, 0.3]) @ turn, TRUTH.project(points) + rng.normal(0.0, sigma, (len(points), 2))
+
+
+def test_sheet_has_its_predicted_covariance(rng: np.random.Generator) -> None:
+    chi_squares = []
+    for _ in range(40):
+        found = sheet_from_points(CAMERA, *known(rng, 0.1))
+        offset = TRUTH.surface(FLAT) - found.origin
+        g, h, d = (offset @ np.stack([found.g_axis, found.h_axis, found.normal]).T).T
+        error = np.linalg.lstsq(np.stack([np.ones_like(g), g, h], axis=1), d, rcond=None)[0]
+        chi_squares.append(error @ np.linalg.solve(found.covariance(np.zeros((0, 0))), error))
+    # Three times F(3, 18): mean 3.4, standard deviation 3.4 per draw.
+    assert 1.5 < np.mean(chi_squares) < 3.4 + 4.0 * 3.4 / np.sqrt(40)
+    assert found.g_axis @ TRUTH.g > 0.999
+    assert found.h_axis @ TRUTH.h > 0.999
+    assert found.sigma_px == pytest.approx(0.1, rel=0.5)
+
+
+def test_points_on_a_line_or_in_no_plane_are_refused(rng: np.random.Generator) -> None:
+    points, pixels = known(rng, 0.0)
+    with pytest.raises(ValueError, match="do not lie on one line"):
+        sheet_from_points(CAMERA, points[:4], pixels[:4])
+    with pytest.raises(ValueError, match="3 points, expected 4"):
+        sheet_from_points(CAMERA, points[3:6], pixels[3:6])
+    raised = points + rng.normal(0.0, 0.01, points.shape)
+    with pytest.raises(ValueError, match="lie in no plane"):
+        sheet_from_points(CAMERA, raised, pixels)

@@ -34,8 +34,8 @@ class Selection(NamedTuple):
     left : list of pytest.Item
         The other tests.
     without_inline : set of pytest.Item
-        Chosen tests that run without PoCL's inline device, for which PoCL compiles each kernel once more: all tests
-        outside ``tests/host`` that are not in the smoke set.
+        Chosen tests that run without PoCL's inline device, for which PoCL compiles each kernel once more: kernel tests
+        that are not in the smoke set, outside ``tests/host`` and the folders of whole tasks, whose other tests use it.
     """
 
     chosen: list[pytest.Item]
@@ -78,7 +78,7 @@ def select_fast(items: Sequence[pytest.Item], best: Collection[Device]) -> Selec
             continue
         seen.add(case)
         selection.chosen.append(item)
-        if is_more and not _is_of_host(item):
+        if is_more and not _is_of_host(item) and item.path.parent.name not in _COMPOSED:
             selection.without_inline.add(item)
     return selection
 

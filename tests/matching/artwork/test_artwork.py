@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import tracemalloc
 from collections import Counter
 from pathlib import Path
 
@@ -117,6 +118,24 @@ def test_a_filled_outline_is_cut_along_its_contour(tmp_path: Path) -> None:
     corners = at(18, 0, "D01") + at(18, 9, "D01") + at(0, 9, "D01") + at(0, 0, "D01")
     board = read(tmp_path, outline="G36*\n" + at(0, 0, "D02") + corners + "G37*\n")
     assert board.bounds == pytest.approx(np.array([[0, 0], [18e-3, 9e-3]]), abs=1e-9)
+
+
+def test_a_hole_that_is_repeated_in_place_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its 2e6 pairs would take 200 MB, those of the 1e5 holes that a file may have all memory."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    once = read(tmp_path).holes
+    (tmp_path / "plated.drl").write_text(
+        PLATED.replace("X2.0Y5.0\n", "X2.0Y5.0\nR2000X0.0\nX1.9951Y5.0\nX2.0051Y5.0\n")
+    )
+    tracemalloc.start()
+    try:
+        repeated = read_artwork(tmp_path, layers=LAYERS).holes
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
+    # A hole 4.9 um away is the same one, a hole 5.1 um away is another one.
+    assert len(repeated.diameter) == len(once.diameter) + 1
+    assert repeated.start[:, 0] == pytest.approx(np.insert(once.start[:, 0], 1, 2.0051e-3), abs=1e-12)
 
 
 def test_says_what_each_spot_is_for(tmp_path: Path) -> None:

@@ -102,7 +102,7 @@ def test_noise_is_that_of_the_image(rng: np.random.Generator) -> None:
     assert estimate_pixel_noise(np.zeros((40, 40), np.uint8)) == 0.0
 
 
-@pytest.mark.parametrize("turned", [0.0, math.pi / 2, -2.2])
+@pytest.mark.parametrize("turned", [0.0, pytest.param(math.pi / 2, marks=pytest.mark.slow), -2.2])
 def test_a_camera_is_located_where_it_is(artwork: Artwork, turned: float, device: Device) -> None:
     pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, turned + 2e-3)
     located = locate_board(
@@ -116,7 +116,10 @@ def test_a_camera_is_located_where_it_is(artwork: Artwork, turned: float, device
     assert located.noise == pytest.approx(NOISE, rel=0.1)
 
 
-@pytest.mark.parametrize(("wrong", "is_refused"), [(1.005, True), (0.9978, False), (0.999, False), (1.001, False)])
+@pytest.mark.parametrize(
+    ("wrong", "is_refused"),
+    [(1.005, True), (0.999, False), *(pytest.param(each, False, marks=pytest.mark.slow) for each in (0.9978, 1.001))],
+)
 def test_a_wrong_scale_is_said(artwork: Artwork, wrong: float, is_refused: bool) -> None:
     """More edges lie on one side of the placement point: without the test 0.1 % moves the pose by 5 sigmas."""
     pose = (BOARD_MIDDLE[0] - 1.5e-3, BOARD_MIDDLE[1] + 1e-3, 1e-3)

@@ -136,7 +136,10 @@ def test_of_many_fields_nearly_all_are_found(rng: np.random.Generator) -> None:
     assert np.mean(found) > 0.9
 
 
-@pytest.mark.parametrize(("spots", "share"), [(0, 0.0), (60, 0.0), (0, 0.2), (20, 0.1)])
+@pytest.mark.parametrize(
+    ("spots", "share"),
+    [(0, 0.0), (20, 0.1), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((60, 0.0), (0, 0.2)))],
+)
 def test_fields_are_found(spots: int, share: float, device: Device, rng: np.random.Generator) -> None:
     """With objects on the floor, and occluding robots."""
     field = read_field("robocup_msl")

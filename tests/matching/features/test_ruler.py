@@ -441,6 +441,7 @@ def test_wrong_input(device: Device) -> None:
         ({"ambiguity": 0.5, "edge_selection": "all"}, ValueError, "edge_selection='strongest' only"),
         ({"spacing_px": (3.0, 5.0)}, ValueError, "pairs=True only"),
         ({"pairs": True, "spacing_px": (5.0, 3.0)}, ValueError, "0 <= least <= greatest"),
+        ({"pairs": True, "spacing_px": (-0.5, 3.0)}, ValueError, "0 <= least <= greatest"),
         ({"radius_px": 0.0}, ValueError, "radius_px is 0"),
         ({"noise": -1.0}, ValueError, "noise"),
         ({"model": 3}, TypeError, "expected a Lens or a Camera"),

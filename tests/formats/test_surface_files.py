@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import struct
 import zipfile
 
 import numpy as np
@@ -64,6 +65,18 @@ def test_a_sur_of_holes_and_zeros_can_be_read(tmp_path):
     heights = np.array([[-7e-3, 2e-3]])  # the hole's integer is below the smallest height
     write_sur(tmp_path / "low.sur", heights, pair)
     np.testing.assert_allclose(read(tmp_path / "low.sur")[0].T, heights, atol=7e-3 / 2**30)
+
+
+def test_units_of_steps_and_lengths_of_a_sur_are_the_same(tmp_path, z):
+    """Spacing and lengths have the same unit: their ratios, three floats at byte 276, are 1."""
+    write_sur(tmp_path / "map.sur", z, GRID)
+    content = (tmp_path / "map.sur").read_bytes()
+    assert [content[180 + 16 * k : 196 + 16 * k].strip() for k in range(6)] == [
+        b"mm",
+        b"mm",
+        "µm".encode("latin-1"),
+    ] * 2
+    assert struct.unpack_from("<3f", content, 276) == (1.0, 1.0, 1.0)
 
 
 def test_maps_that_do_not_fit_are_refused(tmp_path, z):

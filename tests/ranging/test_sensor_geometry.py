@@ -62,7 +62,7 @@ def test_points_and_distances_are_within_their_sigma(truth: LaserSensor, found: 
     errors, sigmas = height_errors(truth, found, np.random.default_rng(7))
     # The errors of one calibration are one draw, common to all points; the full tier counts over seeds.
     assert np.abs(errors / sigmas).max() < 4.0
-    # Reading noise of 0.1 px is 45 um of height; the calibration adds less to distances.
+    # Reading noise of 0.1 px is 60 to 70 um of height; the calibration adds less to distances.
     distances = sigmas[len(FLAT) :]
     assert np.median(distances) < 120e-6
 

@@ -197,7 +197,8 @@ def line_frames(count: int) -> Frames:
 def cases(device: Device) -> Iterator[Case]:
     """Yield both centroids on 1, 16 and 64 frames, the fits, readout along rows, and readout with triangulation.
 
-    The triangulation corrects a lens ("fused"), or a calibrated camera with a tilted sensor ("camera").
+    The triangulation corrects a lens ("fused"), or a calibrated camera with a tilted sensor ("camera"). The last cases
+    also compute the standard deviation of the position ("sigma").
     """
     centres: tuple[Method, ...] = ("centroid", "windowed")
     fits: tuple[Method, ...] = ("gauss3", "fir", "ml")
@@ -211,6 +212,8 @@ def cases(device: Device) -> Iterator[Case]:
         for count in (1, 16):
             yield _fused_case(device, method, count, "fused", {"lens": _LENS})
         yield _fused_case(device, method, 16, "camera", {"camera": _CAMERA})
+    for method in (*centres, *fits):
+        yield _sigma_case(device, method, 16)
 
 
 # Case names in the results. "whole" (the whole profile) is older than the method name "centroid"; it stays, because
@@ -278,6 +281,20 @@ def _fused_case(device: Device, method: Method, count: int, name: str, distortio
     error = float(np.nanmax(np.abs(to_numpy(fused.outputs.h) - to_numpy(expected.h))))
     peers = {"gpuvision": lambda: alone.run(shared)}
     return Case("line", f"{_ROWS[method]}-{name}/{count}", lambda: fused.run(shared), peers, error)
+
+
+def _sigma_case(device: Device, method: Method, count: int) -> Case:
+    """Return a case with the standard deviation of the position; the peer is our readout without it."""
+    settings: dict[str, Any] = {**_SETTINGS, "method": method, "gain": GAIN, "read_noise": 3.0}
+    alone, frames = _bound(device, LineReadout(**settings), line_frames(count))
+    with_sigma = {**settings, "outputs": (*OUTPUTS, "sigma")}
+    predicting = LineReadout(**with_sigma).bind(device, frames.shape, frames.dtype)
+    shared = alone.inputs[0]
+    predicting(shared).wait()
+    expected = LineReadout(**with_sigma, precision="double")(frames[:_DISTINCT], device=device).sigma
+    error = float(np.nanmax(np.abs(to_numpy(predicting.outputs.sigma)[:_DISTINCT] - expected)))
+    peers = {"gpuvision": lambda: alone.run(shared)}
+    return Case("line", f"{_ROWS.get(method, method)}-sigma/{count}", lambda: predicting.run(shared), peers, error)
 
 
 def _bound(device: Device, readout: LineReadout, frames: Frames) -> tuple[Any, Frames]:

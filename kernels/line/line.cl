@@ -240,7 +240,7 @@ static inline void read_frame(const Profiles *frame, int samples, constant LineT
     const Profiles profiles = profiles_from(frame, sample);
     Centroid centroid = profile_centroid(&profiles);
 #ifdef NOISE
-    set_variance(&centroid, &profiles, 0, profiles.length, table);
+    set_variance(&centroid, &profiles, table);
 #endif
     finish_centroid(&profiles, &centroid, table, to, first + sample, sample);
 }

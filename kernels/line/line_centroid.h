@@ -33,15 +33,42 @@ static inline reals add_noise(reals sum, reals v, reals d, constant LineTable *t
     return sum + choose_reals(int_mask(v > 0), noise * d * d, 0);
 }
 
-// Set the variance of the centroid of every lane. All samples above the threshold lie in begin <= index < end.
-static inline void set_variance(Centroid *centroid, const Profiles *profiles, int begin, int end,
-                                constant LineTable *table) {
-    reals sum = 0;
+// Fraction of the light at which the search for it ends. Integer samples sum to the total exactly. A float sample that
+// exceeds the threshold by less than 4e-6 of the total counts as dark: the sums differ by rounding.
+#if CODE_BITS == 32
+#define NEARLY_ALL ((real)0.999996)
+#else
+#define NEARLY_ALL 1
+#endif
+#define NOISE_MARGIN 6  // samples on either side of the centroids that are read first: about the half width of a line
+#define NOISE_STEP 4    // samples on either side by which the range grows
+
+// Add the samples begin <= k < end of every lane to the sum of the noise (add_noise) and to the light found.
+static inline void add_noises(const Centroid *centroid, const Profiles *profiles, int begin, int end, reals *sum,
+                              reals *found, constant LineTable *table) {
     for (int k = begin; k < end; k++) {
-        const codes level = sample_of(profiles, k);
-        if (!any_lit(level, profiles->threshold)) continue;
-        const reals v = over_threshold(level, profiles->threshold);
-        sum = add_noise(sum, v, (real)k - centroid->position, table);
+        const reals v = over_threshold(sample_of(profiles, k), profiles->threshold);
+        *sum = add_noise(*sum, v, (real)k - centroid->position, table);
+        *found += v;
+    }
+}
+
+// Set the variance of the centroid of every lane: read outwards from the centroids until all light is found, so that
+// the cost depends on the width of the line, not on the length of the profile.
+static inline void set_variance(Centroid *centroid, const Profiles *profiles, constant LineTable *table) {
+    const int length = profiles->length;
+    // The position of a sum that overflows is not finite.
+    const ints lit = int_mask(centroid->total > 0), at = clamp(to_ints(centroid->position), (ints)0, (ints)(length - 1));
+    int low = max(lowest_lane(choose_ints(lit, at, length)) - NOISE_MARGIN, 0);
+    int high = min(-lowest_lane(-choose_ints(lit, at, -length)) + NOISE_MARGIN + 1, length);
+    reals sum = 0, found = 0;
+    add_noises(centroid, profiles, low, high, &sum, &found, table);
+    while ((low > 0 || high < length) && any_lane(mask_of(found < centroid->total * NEARLY_ALL))) {
+        const int before = max(low - NOISE_STEP, 0), after = min(high + NOISE_STEP, length);
+        add_noises(centroid, profiles, before, low, &sum, &found, table);
+        add_noises(centroid, profiles, high, after, &sum, &found, table);
+        low = before;
+        high = after;
     }
     centroid->variance = sum / centroid->total / centroid->total;
 }

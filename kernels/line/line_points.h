@@ -59,20 +59,15 @@ static inline reals derivative(const CODE *window, int k) {
 }
 
 #ifdef NOISE
-// Variance of the zero crossing k + t between samples k and k + 1 of the window, in every lane. It is
-// sum w_j^2 variance_j / slope^2, where w_j = (1 - t) c(j - k) + t c(j - k - 1) with the coefficients c of the filter:
-// 1 before its middle, -1 after it.
-static inline reals crossing_variance(const CODE *window, ints k, reals t, reals slope, constant LineTable *table) {
-    int first[LANES];
-    *(ints_at *)first = k - FIR_HALF + REACH;
+// Variance of a zero crossing k + t between samples k and k + 1 of the window. It is sum w_j^2 variance_j / slope^2,
+// where w_j = (1 - t) c(j - k) + t c(j - k - 1) with the coefficients c of the filter: 1 before its middle, -1 after it.
+static inline reals crossing_variance(const CODE *window, int k, reals t, reals slope, constant LineTable *table) {
     reals noise = 0;
     for (int j = -FIR_HALF; j <= FIR_HALF + 1; j++) {
-        CODE level[LANES];
-        for (int lane = 0; lane < LANES; lane++) level[lane] = window[(first[lane] + j + FIR_HALF) * LANES + lane];
         const real here = j < 0 ? 1 : j == 0 || j > FIR_HALF ? 0 : -1;
-        const real next = j - 1 < -FIR_HALF || j == 1 ? 0 : j < 1 ? 1 : -1;
+        const real next = j == -FIR_HALF || j == 1 ? 0 : j < 1 ? 1 : -1;
         const reals weight = here + t * (next - here);
-        noise += weight * weight * sample_variance(*(const codes_at *)level, table);
+        noise += weight * weight * sample_variance(window_level(window, k + j + REACH), table);
     }
     return noise / (slope * slope);
 }
@@ -85,8 +80,7 @@ static inline Place place_by_points(const CODE *window, const Profiles *profiles
                                     constant LineTable *table) {
     reals reached = 2 * RADIUS, left = 2 * RADIUS, before = derivative(window, -RADIUS);
 #ifdef NOISE
-    ints crossing = 0;
-    reals slope = 1;
+    reals variance = 0;
 #endif
     for (int k = -RADIUS; k < RADIUS; k++) {
         const reals after = derivative(window, k + 1);
@@ -96,8 +90,10 @@ static inline Place place_by_points(const CODE *window, const Profiles *profiles
         reached = choose_reals(reaches, here, reached);
         left = choose_reals(leaves, here, left);
 #ifdef NOISE
-        crossing = choose_ints(reaches, k, crossing);
-        slope = choose_reals(reaches, after - before, slope);
+        if (any_lane(to_masks(reaches))) {
+            const reals here_variance = crossing_variance(window, k, here - (real)k, after - before, table);
+            variance = choose_reals(reaches, here_variance, variance);
+        }
 #endif
         before = after;
     }
@@ -105,8 +101,7 @@ static inline Place place_by_points(const CODE *window, const Profiles *profiles
     place.at = (reached + left) / 2;
 #ifdef NOISE
     // On a flat top the reached and the left place differ: no single crossing.
-    place.variance = nan_where(to_masks(int_mask(reached != left)),
-                               crossing_variance(window, crossing, reached - to_reals(crossing), slope, table));
+    place.variance = nan_where(to_masks(int_mask(reached != left)), variance);
 #endif
     place.flags = flag_where((int_mask(reached > RADIUS) | int_mask(left > RADIUS)) & peak->found, STATUS_LOW_SIGNAL);
     return place;

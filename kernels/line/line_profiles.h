@@ -53,21 +53,6 @@ static inline reals over_threshold(codes level, CODE threshold) {
 #endif
 }
 
-// Whether a sample of any lane is above the threshold. The lanes are combined in halves, as in any_lane().
-static inline int any_lit(codes level, CODE threshold) {
-#if !defined(VECTOR_VARIANT)
-    return level > threshold;
-#elif CODE_BITS == 8
-    const ulong2 lit = as_ulong2(level > (codes)threshold);
-    return (lit.x | lit.y) != 0;
-#elif CODE_BITS == 16
-    const ulong4 lit = as_ulong4(level > (codes)threshold);
-    return (lit.x | lit.y | lit.z | lit.w) != 0;
-#else
-    return any_lane(to_masks(level > (codes)threshold));
-#endif
-}
-
 // Sample k of every lane.
 static inline codes sample_of(const Profiles *profiles, int k) {
     global const CODE *at = profiles->first + (long)k * profiles->stride;
@@ -77,6 +62,18 @@ static inline codes sample_of(const Profiles *profiles, int k) {
     return *(const codes_at *)lane;
 #else
     return *(global const codes_at *)at;
+#endif
+}
+
+// Smallest value of the lanes.
+static inline int lowest_lane(ints v) {
+#ifdef VECTOR_VARIANT
+    const int8 a = min(v.lo, v.hi);
+    const int4 b = min(a.lo, a.hi);
+    const int2 c = min(b.lo, b.hi);
+    return min(c.x, c.y);
+#else
+    return v;
 #endif
 }
 

@@ -24,23 +24,6 @@ static inline Profiles profiles_of_quarter(const Profiles *frame, int begin, int
     return profiles;
 }
 
-#ifdef METHOD_CENTROID
-// Range of indices begin <= index < end that contains all samples above the threshold.
-typedef struct {
-    int begin, end;
-} Lit;
-
-static inline Lit nothing_lit(int length) {
-    const Lit lit = {length, 0};
-    return lit;
-}
-
-static inline void extend_lit(Lit *lit, int begin, int end) {
-    lit->begin = min(lit->begin, begin);
-    lit->end = max(lit->end, end);
-}
-#endif
-
 #if defined(METHOD_CENTROID) && !defined(ALONG_ROWS)
 // Read the columns begin <= column < end, at most MAX_STRIP: blocks of STEPS rows outside, groups of WIDE columns
 // inside.
@@ -49,20 +32,12 @@ static inline void read_strip(const Profiles *frame, int begin, int end, constan
     WideSums sums[MAX_GROUPS];
     const int columns = frame->stride, groups = (end - begin + WIDE - 1) / WIDE;
     for (int i = 0; i < groups; i++) clear_sums(&sums[i]);
-#ifdef NOISE
-    Lit lit[MAX_GROUPS];
-    for (int i = 0; i < groups; i++) lit[i] = nothing_lit(frame->length);
-#endif
     for (int row = 0; row < frame->length; row += STEPS) {
         global const CODE *at = frame->first + (long)row * columns;
         const int steps = min(STEPS, frame->length - row);
         Ahead ahead = prefetch_from(at + (long)BLOCKS_AHEAD * STEPS * columns + begin, groups * WIDE, columns);
         for (int i = 0; i < groups; i++) {
-            const int bright =
-                add_steps(&sums[i], at + group_start(begin, i, columns), columns, steps, row, frame->threshold, &ahead);
-#ifdef NOISE
-            if (bright) extend_lit(&lit[i], row, row + steps);
-#endif
+            add_steps(&sums[i], at + group_start(begin, i, columns), columns, steps, row, frame->threshold, &ahead);
         }
     }
     for (int i = 0; i < groups * QUARTERS; i++) {
@@ -70,7 +45,7 @@ static inline void read_strip(const Profiles *frame, int begin, int end, constan
         const Profiles profiles = profiles_of_quarter(frame, begin, i, &sample);
         Centroid centroid = wide_centroid(&sums[i / QUARTERS], i % QUARTERS);
 #ifdef NOISE
-        set_variance(&centroid, &profiles, lit[i / QUARTERS].begin, lit[i / QUARTERS].end, table);
+        set_variance(&centroid, &profiles, table);
 #endif
         finish_centroid(&profiles, &centroid, table, to, first + sample, sample);
     }
@@ -79,14 +54,14 @@ static inline void read_strip(const Profiles *frame, int begin, int end, constan
 #elif defined(METHOD_CENTROID)
 #ifdef NOISE
 // Sum of the noise of a row (add_noise), in vectors of 16 neighbouring samples: outwards from the centroid, until all
-// light is found. The last vector of a row is moved back to end with the row; samples before it are not counted again.
-static inline real row_noise(global const CODE *row, int length, CODE threshold, Lit lit, real position, real total,
+// light is found (set_variance). The last vector of a row is moved back to end with the row; samples before it are not counted again.
+static inline real row_noise(global const CODE *row, int length, CODE threshold, real position, real total,
                              constant LineTable *table) {
     const int middle = clamp((int)position / LANES * LANES, 0, length);
     int left = middle, right = middle;
     real found = 0;
     reals sum = 0;
-    while (found < total && (left > lit.begin || right < lit.end)) {
+    while (found < total * NEARLY_ALL && (left > 0 || right < length)) {
         reals light = 0;
         for (int side = 0; side < 2; side++) {
             const int begin = side ? left - LANES : right, at = clamp(begin, 0, length - LANES);
@@ -102,53 +77,44 @@ static inline real row_noise(global const CODE *row, int length, CODE threshold,
     return sum_of(sum);
 }
 
-static inline void set_row_variances(Centroid *centroid, const Profiles *profiles, const Lit *lit,
+static inline void set_row_variances(Centroid *centroid, const Profiles *profiles,
                                      constant LineTable *table) {
     real position[LANES], total[LANES], noise[LANES];
     *(reals_at *)position = centroid->position;
     *(reals_at *)total = centroid->total;
     for (int i = 0; i < LANES; i++) {
         global const CODE *row = profiles->first + (long)i * profiles->lane_stride;
-        noise[i] = row_noise(row, profiles->length, profiles->threshold, lit[i], position[i], total[i], table);
+        noise[i] = row_noise(row, profiles->length, profiles->threshold, position[i], total[i], table);
     }
     centroid->variance = *(const reals_at *)noise / centroid->total / centroid->total;
 }
 #endif
 
-// Sum a row lane by lane in steps of WIDE samples, then combine the lanes and add the remainder of the row. Return the
-// range that contains its light.
-static inline void read_row(global const CODE *row, int length, CODE threshold, RowSums *sums, Ahead *ahead,
-                            Lit *lit) {
+// Sum a row lane by lane in steps of WIDE samples, then combine the lanes and add the remainder of the row.
+static inline void read_row(global const CODE *row, int length, CODE threshold, RowSums *sums, Ahead *ahead) {
     WideSums wide;
     clear_sums(&wide);
     const int blocks = length / WIDE;
     for (int block = 0; block < blocks; block += STEPS) {
-        const int steps = min(STEPS, blocks - block);
-        const int bright = add_steps(&wide, row + block * WIDE, WIDE, steps, block, threshold, ahead);
-        if (bright) extend_lit(lit, block * WIDE, (block + steps) * WIDE);
+        add_steps(&wide, row + block * WIDE, WIDE, min(STEPS, blocks - block), block, threshold, ahead);
     }
     sum_lanes(&wide, sums);
-    for (int k = blocks * WIDE; k < length; k++) {
-        add_sample(sums, row[k], k, threshold);
-        if (row[k] > threshold) extend_lit(lit, k, k + 1);
-    }
+    for (int k = blocks * WIDE; k < length; k++) add_sample(sums, row[k], k, threshold);
 }
 
 // Read 16 rows.
 static inline void read_rows(const Profiles *profiles, constant LineTable *table, const Outputs *to, ulong first,
                              int sample) {
     RowSums rows[LANES];
-    Lit lit[LANES];
     for (int i = 0; i < LANES; i++) {
         global const CODE *row = profiles->first + (long)i * profiles->lane_stride;
         global const CODE *later = row + (long)BLOCKS_AHEAD * LANES * profiles->lane_stride;
         Ahead ahead = prefetch_from(later, profiles->length, profiles->length);
-        lit[i] = nothing_lit(profiles->length);
-        read_row(row, profiles->length, profiles->threshold, &rows[i], &ahead, &lit[i]);
+        read_row(row, profiles->length, profiles->threshold, &rows[i], &ahead);
     }
     Centroid centroid = row_centroid(rows);
 #ifdef NOISE
-    set_row_variances(&centroid, profiles, lit, table);
+    set_row_variances(&centroid, profiles, table);
 #endif
     finish_centroid(profiles, &centroid, table, to, first, sample);
 }

@@ -60,13 +60,7 @@ static inline void prefetch_lines(Ahead *ahead) {
     }
 }
 
-static inline int lowest(int16 v) {
-    const int8 a = min(v.lo, v.hi);
-    const int4 b = min(a.lo, a.hi);
-    const int2 c = min(b.lo, b.hi);
-    return min(c.x, c.y);
-}
-static inline int highest(int16 v) { return -lowest(-v); }
+static inline int highest(int16 v) { return -lowest_lane(-v); }
 
 static inline real sum_of(real16 v) {
     const real8 a = v.lo + v.hi;

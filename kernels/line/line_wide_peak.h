@@ -76,7 +76,7 @@ typedef struct {
 // Span of rows from the first to the last row of the lanes that are found, with a margin before and after.
 static inline Span span_of(ints rows, ints found, int before, int after, int length) {
     Span span;
-    span.begin = max(lowest(choose_ints(found, rows, NO_INDEX)) - before, 0);
+    span.begin = max(lowest_lane(choose_ints(found, rows, NO_INDEX)) - before, 0);
     span.end = min(highest(choose_ints(found, rows, -NO_INDEX)) + after + 1, length);
     return span;
 }
@@ -208,13 +208,13 @@ static inline int locate_in_row(global const CODE *row, CODE level, const WidePe
         const ints here = int_mask(((const codes *)&peak->level)[i] == (codes)level);
         block = min(block, choose_ints(here, convert_int16(((const step_lanes16 *)&peak->block)[i]), NO_INDEX));
     }
-    const int first = lowest(block) * WIDE;
+    const int first = lowest_lane(block) * WIDE;
     for (int i = 0; i < QUARTERS; i++) {
         const ints here = int_mask(*(global const codes_at *)(row + first + 16 * i) == (codes)level);
         lane = min(lane, choose_ints(here, LANE_NUMBERS + 16 * i, NO_INDEX));
     }
     // A row of NaN and -infinity only may have no sample that equals the level.
-    return first + min(lowest(lane), WIDE - 1);
+    return first + min(lowest_lane(lane), WIDE - 1);
 }
 
 // Find the largest sample of a row, its index, and whether a sample is not finite.

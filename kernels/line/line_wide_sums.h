@@ -91,9 +91,8 @@ static inline void add_block(WideSums *sums, const BlockSums *block, int first, 
 }
 
 // Add `steps` samples of every lane, at most STEPS: the first at `at`, the next ones `stride` elements further; `first`
-// is the index of the first sample. Full blocks are unrolled by hand, so that the sums stay in registers. Return whether
-// a sample is above the threshold.
-static inline int add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold,
+// is the index of the first sample. Full blocks are unrolled by hand, so that the sums stay in registers.
+static inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold,
                              Ahead *ahead) {
     BlockSums block;
     block.s = block.s_odd = block.m = block.m_odd = 0;
@@ -113,10 +112,6 @@ static inline int add_steps(WideSums *sums, global const CODE *at, int stride, i
     }
     sums->peak = block.peak;
     add_block(sums, &block, first, steps);
-    // Without light in the odd lanes, the packed sum is the sum of the even lanes.
-    const ulong8 light = __builtin_astype(block.s | block.s_odd, ulong8);
-    const ulong4 half_of_it = light.lo | light.hi;
-    return (half_of_it.x | half_of_it.y | half_of_it.z | half_of_it.w) != 0;
 }
 
 // Interleave even and odd lanes.

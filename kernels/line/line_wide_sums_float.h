@@ -8,8 +8,8 @@ typedef Sums WideSums;
 static inline void clear_sums(WideSums *sums) { *sums = zero_sums(); }
 
 // Add `steps` samples of every lane: the first at `at`, the next ones `stride` elements further; `first` is the index
-// of the first sample. Return whether a sample is above the threshold.
-static inline int add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold,
+// of the first sample.
+static inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold,
                              Ahead *ahead) {
     reals s = 0, m = 0, width = 0, poison = sums->poison;
     codes peak = sums->peak;
@@ -29,7 +29,6 @@ static inline int add_steps(WideSums *sums, global const CODE *at, int stride, i
     sums->peak = peak;
     sums->poison = poison;
     sums->width += width;
-    return any(s > 0);
 }
 
 // Centroids of the 16 lanes of a quarter (a wide vector of floats has one).

@@ -98,6 +98,13 @@ MaximumVolume = Annotated[
     float | None,
     typer.Option(min=0.0, help="Largest volume that passes, as a fraction of the expected one. Default: 1.5."),
 ]
+PinNames = Annotated[
+    bool,
+    typer.Option(
+        "--pin-names",
+        help="Name apertures by part and pin of the pads below them, such as U3.5 (Gerber X2). Default: numbers.",
+    ),
+]
 Leads = Annotated[
     str | None,
     typer.Option(
@@ -164,6 +171,7 @@ def inspect(
     pad_height: PadHeight = None,
     minimum_volume: MinimumVolume = None,
     maximum_volume: MaximumVolume = None,
+    pin_names: PinNames = False,
     leads: Leads = None,
     centre: Centre = None,
     maximum_gap: MaximumGap = None,
@@ -187,6 +195,7 @@ def inspect(
     from gpuvision.host.outputs import Outputs
     from gpuvision.inspection.apertures import BoardPlacement, read_apertures
     from gpuvision.inspection.deposits import PasteSettings
+    from gpuvision.matching.artwork.artwork import read_artwork
     from gpuvision.workflows.inspecting import (
         LEAD_FILES,
         PASTE_FILES,
@@ -222,6 +231,7 @@ def inspect(
             minimum_volume=minimum_volume,
             maximum_volume=maximum_volume,
             scale_sigma=scale_sigma,
+            pin_names=pin_names,
         )
         regions = _regions(leads, lead_file, board, layers, chosen)
         if lead_file is None and at is None:
@@ -262,10 +272,11 @@ def inspect(
             maximum=1.5 if maximum_volume is None else maximum_volume,
         )
         scales = None if scale_sigma is None else ScaleSigma(**_scale_sigmas(scale_sigma))
+        pads = read_artwork(board, side=chosen, layers=layers_of(layers)).pads if pin_names else ()
         reach = quantities(search_range or "2mm,3deg", "--search-range", "m,rad")
         found = inspect_paste(
             read_heights(heights, scale),
-            read_apertures(board, side=chosen, layers=layers_of(layers)),
+            read_apertures(board, side=chosen, layers=layers_of(layers), pads=pads),
             settings,
             side=chosen,
             pose=at,

@@ -85,7 +85,10 @@ def test_the_paste_of_a_board(gerbers: Path, paste: Path, tmp_path: Path, run: A
     assert told["alignment"] is None
     assert told["noise"] == 2e-6
     assert told["warnings"] == []
-    ran = run(paste, "--board", gerbers, "--stencil=120um", *LAYERS, "--out", out, "--sigma=0.4um", pose[0])
+    ran = run(
+        paste, "--board", gerbers, "--stencil=120um", *LAYERS, "--out", out, "--sigma=0.4um", pose[0], "--pin-names"
+    )
+    assert [each["name"] for each in rows_of(out / "paste.csv")] == ["U7.1", "U7.2", "U7.3", "U7.4", "U7.5"]
     assert "warning: the board scatters by 1" in ran.err
     assert "the sigma of the heights is 0.4 um" in ran.err
 
@@ -139,6 +142,7 @@ def test_the_leads_of_a_component(gerbers: Path, tmp_path: Path, run: Any, by_pa
         (("--leads=U7", "--board", "GERBERS", *LAYERS), "--leads is 'U7', a part: give --pose too"),
         (("--leads=U8", "--board", "GERBERS", *LAYERS), "no pad belongs to the part 'U8'; known parts: U7"),
         (("--leads=U7", "--stencil=1um"), "--stencil has no effect with --leads"),
+        (("--leads=U7", "--pin-names"), "--pin-names has no effect with --leads"),
         (("--centre=0,0",), "--centre has no effect without --leads"),
         (("--cell=1um",), "--height-step is missing"),
         (("--hole=1",), "--hole has no effect without --cell and --height-step"),

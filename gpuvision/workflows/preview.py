@@ -77,7 +77,8 @@ class Preview:
 
     def _settings(self) -> str:
         background = self.sensor.recording.background
-        subtracted = "" if background == "none" else f", background {background}"
+        shown = background.name if isinstance(background, Path) else background
+        subtracted = "" if background == "none" else f", background {shown}"
         return f"threshold {_line_readout(self.sensor).threshold:g} grey levels{subtracted}"
 
 

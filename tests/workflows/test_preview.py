@@ -15,6 +15,7 @@ from gpuvision.host.outputs import MANIFEST
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.workflows.preview import preview_scan
+from gpuvision.workflows.scanning import scan
 from scanning import Ran, check_refused, currents
 from scanning import line_frames as frames_of_lines
 
@@ -87,3 +88,21 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     )
     check_refused(ran, "a preview shows the line in camera frames; the sensor is of kind 'psd'")
     assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.realdata
+def test_the_guide_of_a_hobby_rig_finds_the_line_of_a_real_frame(data: Path, tmp_path: Path) -> None:
+    guide = Path(__file__).resolve().parents[2] / "docs" / "guides" / "hobby_rig.md"
+    (tmp_path / "hobby.toml").write_text(guide.read_text(encoding="utf-8").split("```toml\n")[1].split("```")[0])
+    (tmp_path / "background.png").write_bytes((data / "ciclop" / "laser_background.png").read_bytes())
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "frames" / "0.png").write_bytes((data / "ciclop" / "laser.png").read_bytes())
+    sensor = Sensor.load(tmp_path / "hobby.toml")
+    found = preview_scan(tmp_path / "frames", sensor)
+    assert found.summary().startswith("preview of 1 frames at threshold 40 grey levels, background background.png: ")
+    assert found.found_fraction > 0.85
+    # Most of the rows have a depth in front of the camera, and the heights are those of the same lines.
+    done = scan(tmp_path / "frames", sensor)
+    assert done.valid_fraction == pytest.approx(found.found_fraction, abs=0.01)
+    assert 0.1 < -float(np.nanmedian(done.points.z)) < 1.0

@@ -35,6 +35,7 @@ from gpuvision.matching.board.located_board import LocatedBoard
 from gpuvision.matching.board.view_features import select_features_in_view
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.imaging import Imaging
+from gpuvision.matching.features.ruler import best_smoothing
 from gpuvision.matching.pose.registration import Registration, prepare_board_registration
 from gpuvision.status import Status
 
@@ -298,6 +299,12 @@ class _Job:
         measurements = [(kind, measurer.measure(expected.view, kind)) for kind in kinds]
         kind, measurement = max(measurements, key=lambda each: (not each[1].reason, each[1].agreeing))
         reason = expected.reason or measurement.reason
+        imaging = features.imaging
+        if not reason and copper == "auto" and imaging.smoothing_px < best_smoothing(imaging.blur_px):
+            # Traces as wide as their gaps look the same with the other polarity, half a pitch away (measured).
+            reason = (
+                "the edges are too dense to tell whether copper is bright or dark: say which it is (copper, --copper)"
+            )
         if expected.other is not None and not reason:
             other = measurer.measure(expected.other, kind)
             reason = _reason_of_ambiguity(expected, measurement, other, self.limits.max_other_share)

@@ -148,13 +148,40 @@ def test_a_wrong_scale_beyond_the_tolerance_of_boards_is_refused(artwork: Artwor
     )
 
 
+def dense_board(folder: Path, count: int = 20) -> Artwork:
+    """Return a board of traces 0.2 mm wide and apart, ``count`` level ones left, as many upright right."""
+    head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n%ADD10C,0.2*%\nD10*\n"
+    level = [f"X0Y{400000 * k}D02*\nX9000000Y{400000 * k}D01*\n" for k in range(count)]
+    end = 400000 * count
+    upright = [f"X{10000000 + 400000 * k}Y0D02*\nX{10000000 + 400000 * k}Y{end}D01*\n" for k in range(count)]
+    (folder / "copper.gbr").write_text(head + "".join(level + upright) + "M02*\n")
+    return read_artwork(folder, layers={r"copper\.gbr": "top copper"})
+
+
+def test_a_dense_board_is_located_with_less_smoothing(tmp_path: Path) -> None:
+    """At 35 um per pixel the neighbours are 5.7 px away: too near for the best smoothing, which needs 6.7 px."""
+    dense, pose = dense_board(tmp_path), (9.53e-3, 3.97e-3, 1e-3)
+    image = camera_image(dense, pose, 35e-6)
+    located = locate_board(image, dense, scale=35e-6, initial_pose=(9.5e-3, 4e-3, 0.0), copper="bright")
+    assert located.reason == ""
+    assert located.features.imaging.smoothing_ratio == 1.0
+    error = np.array(located.view.pose) - pose
+    assert np.all(np.abs(error) < SIGMAS * np.sqrt(np.diag(located.covariance)))
+    assert np.hypot(*error[:2]) < 0.02 * 35e-6
+
+
+def test_dense_copper_may_be_bright_or_dark(tmp_path: Path) -> None:
+    """Half a pitch away (0.2 mm along x and y) the other polarity fits as well: no pose, instead of the wrong one."""
+    dense = dense_board(tmp_path)
+    image = camera_image(dense, (9.53e-3, 3.97e-3, 1e-3), 45e-6)
+    located = locate_board(image, dense, scale=45e-6, initial_pose=(9.5e-3, 4e-3, 0.0))
+    assert located.reason.startswith("the edges are too dense to tell whether copper is bright or dark")
+    assert np.all(np.isnan(located.covariance))
+
+
 def test_a_dense_board_names_a_pixel_that_would_do(tmp_path: Path) -> None:
     """Traces 0.2 mm wide and apart: at 60 um per pixel no edge has room, at the proposed pixel rulers have."""
-    head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n%ADD10C,0.2*%\nD10*\n"
-    level = [f"X0Y{400000 * k}D02*\nX9000000Y{400000 * k}D01*\n" for k in range(10)]
-    upright = [f"X{10000000 + 400000 * k}Y0D02*\nX{10000000 + 400000 * k}Y4000000D01*\n" for k in range(10)]
-    (tmp_path / "copper.gbr").write_text(head + "".join(level + upright) + "M02*\n")
-    dense = read_artwork(tmp_path, layers={r"copper\.gbr": "top copper"})
+    dense = dense_board(tmp_path, 10)
     image = np.zeros(SHAPE, np.uint8)
     with pytest.raises(
         ValueError, match=r"without another edge on both sides at 60 um per pixel; at [0-9.]+ um"

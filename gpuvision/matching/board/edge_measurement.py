@@ -22,7 +22,7 @@ from gpuvision.host import Device, to_numpy
 from gpuvision.matching.board.fiducial_detection import MIN_WEIGHT, FoundFiducials, find_fiducials
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.fiducials import search_distance
-from gpuvision.matching.features.ruler import MAX_LENGTH, RulerEdges, best_smoothing
+from gpuvision.matching.features.ruler import MAX_LENGTH, RulerEdges
 from gpuvision.matching.pose.pose import BoardPose, SolvePose, Transform, line_rows
 from gpuvision.status import Status
 
@@ -231,9 +231,14 @@ class BoardMeasurer:
             second_view if second.reason else move_view(second_view, second.pose), second_view, second
         )
 
+    @property
+    def _smoothing_px(self) -> float:
+        """Smoothing of the rulers [px]: that for which the features were selected, at this blur."""
+        return self.features.imaging.smoothing_ratio * self.blur_px
+
     def _second_length_px(self, scale: float) -> Float64:
         """(n,) lengths of the rulers of the second pass [px]."""
-        taps = 3 * best_smoothing(self.blur_px)
+        taps = 3 * self._smoothing_px
         return 2 * (self.limits.second_range_px + taps) + 3 + self.features.spacing / scale
 
     def _measure_once(
@@ -294,7 +299,7 @@ class BoardMeasurer:
         position, sigma = np.full(count, np.nan), np.full(count, np.nan)
         status = np.zeros(count, np.uint8)
         spacing_px = features.spacing / view.scale
-        smoothing = best_smoothing(self.blur_px)
+        smoothing = self._smoothing_px
         # All rulers have the same length, a multiple of 16: every further length would need another build of the
         # kernel.
         longest = max(float(length_px.max(initial=0.0)), 2 * math.ceil(3 * smoothing) + 3)

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.features.candidates import FeatureCandidates, find_ruler_candidates, pixel_hint
 from gpuvision.matching.features.feature_set import FeatureSet, select_feature_set
-from gpuvision.matching.features.fiducials import search_distance, select_fiducials
+from gpuvision.matching.features.fiducials import Fiducials, search_distance, select_fiducials
 from gpuvision.matching.features.imaging import Imaging
 from gpuvision.matching.features.ruler import MAX_LENGTH
 
 # Candidates of a view; with more expected, five windows of the view are examined instead of the whole (cost).
 _USUAL_CANDIDATES = 2500
+_MIN_FEATURES = 3  # as many as unknowns of a pose
+# Smoothing over blur where edges are too near for the best smoothing: blur and smoothing are then sqrt(2) blurs
+# together instead of sqrt(6), as in the coarse registration (chosen).
+_DENSE_SMOOTHING = 1.0
 _MAX_FIDUCIALS = 40  # number of rulers of the first pass (cost)
 
 
@@ -23,6 +29,8 @@ def select_features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging,
     """Select rulers and fiducials that lie in the image at every board position within ``imaging.shift``.
 
     In a view with thousands of candidates, rulers are taken from five windows of it only: its corners and its centre.
+    Where fewer than three features have room, rulers that smooth less (`_DENSE_SMOOTHING`) are tried: they need less
+    room between edges and are less precise, which the predicted covariance contains.
 
     Parameters
     ----------
@@ -39,6 +47,24 @@ def select_features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging,
         There are not enough edges, or they do not determine the pose.
     """
     placement = np.array(view.pose[:2])
+    rulers, fiducials = _candidates_in_view(artwork, view, imaging, placement)
+    if len(rulers.sigma) + len(fiducials.sigma) < _MIN_FEATURES and imaging.smoothing_ratio > _DENSE_SMOOTHING:
+        imaging = replace(imaging, smoothing_ratio=_DENSE_SMOOTHING)
+        rulers, fiducials = _candidates_in_view(artwork, view, imaging, placement)
+    if len(rulers.sigma) + len(fiducials.sigma) < _MIN_FEATURES:
+        raise ValueError(
+            f"{len(rulers.sigma)} edges of the {artwork.side} artwork in view have room for a ruler, and "
+            f"{len(fiducials.sigma)} round pads can serve as fiducials, expected 3 or more together; are the "
+            "initial pose and the scale right, is the blur less? "
+            + pixel_hint(artwork, view.bounds, placement, imaging)
+        )
+    return select_feature_set(rulers, imaging, artwork.side, fiducials=fiducials, are_free=True, budget=budget)
+
+
+def _candidates_in_view(
+    artwork: Artwork, view: BoardView, imaging: Imaging, placement: npt.NDArray[np.float64]
+) -> tuple[FeatureCandidates, Fiducials]:
+    """Return the candidates of rulers and the fiducials that lie in the image at every board position."""
     parts = [find_ruler_candidates(artwork, window, placement, imaging) for window in _windows(artwork, view, imaging)]
     joined = [np.concatenate(each) for each in zip(*(part[:-1] for part in parts), strict=True)]
     rulers = FeatureCandidates._make([*joined, placement])
@@ -47,15 +73,7 @@ def select_features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging,
     rulers = FeatureCandidates._make([*(each[fits] for each in rulers[:-1]), placement])
     fiducials = select_fiducials(artwork, view.bounds, placement, imaging, _MAX_FIDUCIALS)
     reach = fiducials.radius + search_distance(fiducials.point, placement, imaging)
-    fiducials = fiducials.subset(view.contains(fiducials.point, reach / imaging.pixel))
-    if len(rulers.sigma) + len(fiducials.sigma) < 3:
-        raise ValueError(
-            f"{len(rulers.sigma)} edges of the {artwork.side} artwork in view have room for a ruler, and "
-            f"{len(fiducials.sigma)} round pads can serve as fiducials, expected 3 or more together; are the "
-            "initial pose and the scale right, is the blur less? "
-            + pixel_hint(artwork, view.bounds, placement, imaging)
-        )
-    return select_feature_set(rulers, imaging, artwork.side, fiducials=fiducials, are_free=True, budget=budget)
+    return rulers, fiducials.subset(view.contains(fiducials.point, reach / imaging.pixel))
 
 
 def _windows(

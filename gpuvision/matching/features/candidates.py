@@ -77,7 +77,7 @@ def find_ruler_candidates(
     The whole width of a ruler stays on the edge at every board position within ``imaging.shift``. The artwork has edges
     cut where the mask, silk or other copper ends them (its clearance should be ``imaging.registration`` and two blurs,
     see `edge_clearance`). Edges are excluded where another border of copper, ink, a hole or a mask opening is nearer
-    than 3 times the best smoothing plus ``registration``: it would shift the measurement. All rulers may have the
+    than ``imaging.room_px`` plus ``registration``: it would shift the measurement. All rulers may have the
     length of the longest.
 
     Parameters
@@ -134,7 +134,7 @@ def pixel_hint(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike
 
     See `find_ruler_candidates` for the parameters.
     """
-    room = 3 * imaging.smoothing_px * imaging.pixel + imaging.registration
+    room = imaging.room_px * imaging.pixel + imaging.registration
     hint = f"an edge needs {1e6 * room:.0f} um without another edge on both sides"
     hint += f" at {1e6 * imaging.pixel:.3g} um per pixel"
     for factor in _FINER_PIXELS:
@@ -196,7 +196,7 @@ def _ruler_centres(start: Float64, end: Float64, imaging: Imaging) -> Float64:
 def _is_isolated(layers: tuple[VisibleLayer, ...], row: _Row, imaging: Imaging) -> bool:
     """Return whether no other step of any layer is near enough to shift an edge (see `RulerEdges.smoothing_px`)."""
     point, normal, across, _, _ = row
-    reach = 3 * imaging.smoothing_px * imaging.pixel
+    reach = imaging.room_px * imaging.pixel
     if 0 < across < reach:
         return False
     edges = (point,) if not across else (point - normal * across / 2, point + normal * across / 2)

@@ -19,7 +19,7 @@ from gpuvision.matching.artwork.artwork import Artwork, Side
 from gpuvision.matching.features.candidates import FeatureCandidates, find_ruler_candidates
 from gpuvision.matching.features.fiducials import SPOKES, Fiducials, append_fiducials, select_fiducials
 from gpuvision.matching.features.imaging import Imaging
-from gpuvision.matching.features.ruler import MAX_LENGTH, RulerEdges, best_smoothing
+from gpuvision.matching.features.ruler import MAX_LENGTH, RulerEdges
 from gpuvision.matching.features.selection import Selection, select_rulers
 
 Float64 = npt.NDArray[np.float64]
@@ -239,10 +239,10 @@ def _microseconds(rulers: FeatureCandidates, imaging: Imaging, device: Device | 
     device = Device.best() if device is None else device
     median_length = float(np.median(rulers.length)) if len(rulers.length) else 0.0
     length = min(
-        max(math.ceil(median_length / imaging.pixel), 2 * math.ceil(3 * best_smoothing(imaging.blur_px)) + 3),
+        max(math.ceil(median_length / imaging.pixel), 2 * math.ceil(3 * imaging.smoothing_px) + 3),
         MAX_LENGTH,
     )
-    smoothing = min(best_smoothing(imaging.blur_px), (length - 3) / 6.5)
+    smoothing = min(imaging.smoothing_px, (length - 3) / 6.5)
     ruler = RulerEdges(threshold=10.0, length=length, width=imaging.width_px, smoothing_px=smoothing)
     image = np.random.default_rng(1).integers(0, 255, (600, 800), np.uint8)
     placed = np.tile(np.array([400.3, 300.6, 0.8, 0.6], np.float32), (_TIMED_RULERS, 1))

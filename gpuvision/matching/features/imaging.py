@@ -35,6 +35,9 @@ class Imaging:
         Standard deviation of the etch bias, common to the whole board [m], default 10 um.
     registration : float
         Largest offset, along x and along y, of mask, silk and holes relative to the copper [m], default 50 um.
+    smoothing_ratio : float
+        Smoothing of the rulers over the blur, above 0, default sqrt(5): the best for isolated edges. A smaller ratio
+        needs less room between edges and is less precise (1.44 times the sigma at 1).
     shift, angle : float
         Search range: largest offset of the board along x and along y [m], above 0, default 100 um, and largest angle
         [rad], default 5 mrad.
@@ -54,12 +57,13 @@ class Imaging:
     width_px: int = 5
     etch_bias_sigma: float = 10e-6
     registration: float = 50e-6
+    smoothing_ratio: float = math.sqrt(5.0)
     shift: float = 100e-6
     angle: float = 5e-3
 
     def __post_init__(self) -> None:
         integer(self.width_px, "Imaging.width_px", minimum=1)
-        for name in ("pixel", "blur_px", "contrast_bare", "contrast_masked", "shift"):
+        for name in ("pixel", "blur_px", "contrast_bare", "contrast_masked", "smoothing_ratio", "shift"):
             if finite(getattr(self, name), f"Imaging.{name}") <= 0.0:
                 raise ValueError(f"Imaging.{name} is {getattr(self, name)}, it must be positive")
         for name in ("etch_bias_sigma", "registration", "angle"):
@@ -69,8 +73,17 @@ class Imaging:
 
     @property
     def smoothing_px(self) -> float:
-        """Best smoothing of an edge without motion [px]: sqrt(5) times the blur, see `best_smoothing`."""
-        return math.sqrt(5.0) * self.blur_px
+        """Smoothing of an edge without motion [px]; by default sqrt(5) times the blur, see `best_smoothing`."""
+        return self.smoothing_ratio * self.blur_px
+
+    @property
+    def room_px(self) -> float:
+        """Distance to other edges that an edge needs [px]: 2.74 standard deviations of blur and smoothing together.
+
+        For the best smoothing this is 3 times the smoothing, beyond which an edge moves another one by less than its
+        own error.
+        """
+        return 3.0 * math.sqrt(5.0 / 6.0) * math.hypot(self.blur_px, self.smoothing_px)
 
     @property
     def max_blur_px(self) -> float:

@@ -163,14 +163,14 @@ static inline Place span_centroid(const Profiles *profiles, const Peak *peak, Sp
         const sums16 v = to_sums(x > (codes)profiles->threshold ? x - (codes)profiles->threshold : (codes)0) & inside;
 #endif
         total += v;
-        const sums16 first = v * to_sums(offset);
-        moment += first;
+        // One expression: the compiler contracts it to a fused multiply-add.
+        moment += v * to_sums(offset);
 #ifdef NOISE
         const indices lit = to_indices(v > (sums16)0);
         lit_count -= lit;
         lit_moment += lit & offset;
         lit_square += lit & (offset * offset);
-        square += to_squares(first * to_sums(offset));
+        square += to_squares(v * to_sums(offset) * to_sums(offset));
 #endif
         const unsigned_indices other = as_unsigned(offset | to_indices(x == peak->level));
         past = other < past ? other : past;

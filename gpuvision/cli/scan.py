@@ -140,8 +140,7 @@ def scan(
 
     Files are written only after the whole recording was processed.
     """
-    # Silence the video decoder: the command reports a bad video in one line.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    # Silence OpenCV: the command reports a bad image in one line.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs

@@ -292,7 +292,7 @@ def _sigma_case(device: Device, method: Method, count: int) -> Case:
     shared = alone.inputs[0]
     predicting(shared).wait()
     expected = LineReadout(**with_sigma, precision="double")(frames[:_DISTINCT], device=device).sigma
-    error = float(np.nanmax(np.abs(to_numpy(predicting.outputs.sigma)[:_DISTINCT] - expected)))
+    error = float(np.nanmax(np.abs(to_numpy(predicting.outputs.sigma)[:_DISTINCT] - np.asarray(expected))))
     peers = {"gpuvision": lambda: alone.run(shared)}
     return Case("line", f"{_ROWS.get(method, method)}-sigma/{count}", lambda: predicting.run(shared), peers, error)
 

@@ -25,7 +25,8 @@ from gpuvision.cli.select import Side
 if TYPE_CHECKING:
     from gpuvision.formats.height_files import ImageScale
     from gpuvision.inspection.apertures import Aperture
-    from gpuvision.workflows.inspecting import LeadInspection, PasteInspection
+    from gpuvision.workflows.inspecting_leads import LeadInspection
+    from gpuvision.workflows.inspecting_paste import PasteInspection
 
 Heights = Annotated[
     Path,
@@ -196,14 +197,8 @@ def inspect(
     from gpuvision.inspection.apertures import BoardPlacement, read_apertures
     from gpuvision.inspection.deposits import PasteSettings
     from gpuvision.matching.artwork.artwork import read_artwork
-    from gpuvision.workflows.inspecting import (
-        LEAD_FILES,
-        PASTE_FILES,
-        ScaleSigma,
-        VolumeLimits,
-        inspect_leads,
-        inspect_paste,
-    )
+    from gpuvision.workflows.inspecting_leads import LEAD_FILES, inspect_leads
+    from gpuvision.workflows.inspecting_paste import PASTE_FILES, ScaleSigma, VolumeLimits, inspect_paste
 
     if not heights.exists():
         raise FileNotFoundError(f"{heights}: no such file")
@@ -301,7 +296,7 @@ def _regions(
     """Return the regions of leads: of a CSV file, or the pads of a part of the board."""
     from gpuvision.formats.leads_file import read_leads
     from gpuvision.matching.artwork.artwork import read_artwork
-    from gpuvision.workflows.inspecting import pads_of_part
+    from gpuvision.workflows.inspecting_leads import pads_of_part
 
     if lead_file is not None:
         reject_unused("with a CSV file of leads", board=board, layers=layers)

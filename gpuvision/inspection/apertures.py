@@ -17,7 +17,8 @@ from gpuvision.host.reading import reading
 from gpuvision.inspection.coverage import area_and_centroid
 from gpuvision.matching.artwork.board_artwork import Pad, Side
 from gpuvision.matching.artwork.board_files import open_board, parsed
-from gpuvision.matching.artwork.shapes import DrawnObject, Float64, Shape, drawn_objects
+from gpuvision.matching.artwork.drawn_objects import drawn_objects
+from gpuvision.matching.artwork.shapes import DrawnObject, Float64, Shape
 
 _SMALLEST_AREA = 1e-10  # [m^2]: 10 x 10 um; smaller objects of a paste layer are marks or rounding. Chosen
 

@@ -25,8 +25,9 @@ from gpuvision.host.reading import reading
 from gpuvision.matching.artwork.artwork_cache import artwork_key, load_artwork, store_artwork
 from gpuvision.matching.artwork.board_artwork import Artwork, Holes, Pad, Role, Side
 from gpuvision.matching.artwork.board_files import board_folder, layer_warnings, open_layers, parsed
+from gpuvision.matching.artwork.drawn_objects import drawn_objects
 from gpuvision.matching.artwork.edges import board_edges
-from gpuvision.matching.artwork.shapes import DrawnObject, Float64, Layer, area, drawn_objects, hull
+from gpuvision.matching.artwork.shapes import DrawnObject, Float64, Layer, area, hull
 
 __all__ = ["Artwork", "Holes", "Pad", "Role", "Side", "read_artwork"]
 

@@ -19,7 +19,8 @@ import pytest
 
 from gpuvision.matching.artwork.artwork import Artwork, Holes, read_artwork
 from gpuvision.matching.artwork.board_files import open_board, parsed
-from gpuvision.matching.artwork.shapes import Layer, Shape, capsule, drawn_objects, is_covered
+from gpuvision.matching.artwork.drawn_objects import drawn_objects
+from gpuvision.matching.artwork.shapes import Layer, Shape, capsule, is_covered
 
 Picture = npt.NDArray[np.bool_]
 

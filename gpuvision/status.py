@@ -25,7 +25,7 @@ class Status(enum.IntFlag):
     AMBIGUOUS = 16
     """More than one candidate is about equally strong."""
     HORIZON = 32
-    """The ray of the sample is parallel, or nearly parallel, to the sheet of light."""
+    """The ray of the sample does not meet the sheet of light in front of the sensor, or is nearly parallel to it."""
     NO_DATA = 64
     """No measurement lies near enough to this place, or the frame of the sample is damaged."""
     NOT_INVERTIBLE = 128

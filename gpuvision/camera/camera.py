@@ -41,7 +41,8 @@ _MAX_SQUARE = 1e12
 # Factor on the largest squared distorted radius of the sampled fold points: the fold of a decentred lens can lie
 # farther out between the sampled directions.
 _FOLD_SAMPLING = 1.05
-# Error of a correction without a test in the kernel, relative to the rounding of the corrected coordinate.
+# Largest error, relative to a rounding of the corrected coordinate, at which the kernel omits its convergence test.
+# Chosen.
 _SHARE_OF_ROUNDING = 0.25
 # Fitted starting polynomials that are kept, each some kilobytes.
 _KEPT_STARTS = 64

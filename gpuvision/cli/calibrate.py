@@ -75,7 +75,8 @@ LensFile = Annotated[
     typer.Option(
         metavar="FILE.toml",
         parser=named_path,
-        help="Camera file to write; the report (.json) and a plot (.png) are written to the same folder.",
+        help="Camera file to write, or with --sensor the sensor file. The report (.json) and a picture (.png) are "
+        "written to the same folder.",
     ),
 ]
 Pattern = Annotated[
@@ -92,8 +93,8 @@ Model = Annotated[
     str,
     typer.Option(
         metavar="MODEL",
-        help="auto: the smallest model that the data do not reject (F test). lines: none, or k1 up to k1,k2,k3,k4. "
-        "views: some of k1,k2,p1,p2,k3,tilt.",
+        help="auto: the smallest model that the data do not reject (F test; Wald's test for correlated residuals). "
+        "lines: none, or k1 up to k1,k2,k3,k4. views: none, or terms of k1,k2,p1,p2,k3,k4,k5,k6,tilt.",
     ),
 ]
 InnerCorners = Annotated[
@@ -103,7 +104,9 @@ InnerCorners = Annotated[
 Pitch = Annotated[
     float | None,
     typer.Option(
-        min=1e-9, help="Distance between neighbouring points on the target [m]; it scales the poses only. Default: 1."
+        min=1e-9,
+        help="Distance between neighbouring points on the target [m]. It scales the poses; with --sensor it is "
+        "required and scales all heights. Default without --sensor: 1.",
     ),
 ]
 FocalLength = Annotated[

@@ -71,7 +71,7 @@ BlockHeights = Annotated[
     typer.Option(
         metavar="H,H,...",
         help="Heights of the block's steps over the plane of the target on the stage, along the laser line in the "
-        "direction of growing columns (or rows), such as 0,5mm,10mm.",
+        "direction of increasing columns (or rows), such as 0,5mm,10mm.",
     ),
 ]
 KnownPoints = Annotated[
@@ -86,8 +86,8 @@ KnownPoints = Annotated[
 Step = Annotated[
     float | None,
     typer.Option(
-        help="With --sensor, without transport views: transport per profile [m], perpendicular to the sheet of light; "
-        "negative for a part that moves the other way.",
+        help="With --sensor, without transport views: movement of the part per profile [m], perpendicular to the sheet "
+        "of light, along -(g x h); a negative value means along g x h.",
     ),
 ]
 LineAxis = Annotated[

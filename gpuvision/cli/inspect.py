@@ -186,10 +186,10 @@ def inspect(
     as_json: ReportFile = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Measure solder paste on a board, or the coplanarity of leads, in a height map; every number has a sigma.
+    """Measure solder paste on a board, or the coplanarity of leads, in a height map.
 
-    Of each aperture of the board's paste layer: volume, area, mean and largest height, offset. Of each lead or ball:
-    distance from the seating plane and from the least-squares plane.
+    Each measured quantity has a standard deviation. Of each aperture of the board's paste layer: volume, area, mean and
+    largest height, offset. Of each lead or ball: distance from the seating plane and from the least-squares plane.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.height_files import read_heights

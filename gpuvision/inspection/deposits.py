@@ -205,11 +205,11 @@ def measure_deposits(
     Notes
     -----
     The volume is the sum of all heights above the reference surface within the margin, times the area of a cell:
-    a sum without a threshold has no bias by noise. Where cells have no height, those of the same aperture (or of its
-    margin) stand for them. The standard deviations contain the noise of the cells and the covariance of the reference
-    surface. They do not contain errors that all heights share (scale, calibration), nor the sampling of steep walls: a
-    vertical wall of height h and length p changes the volume by up to h p c / 2 with cells of size c, if it is parallel
-    to the cells, and by much less otherwise.
+    a sum without a threshold has no bias by noise. Cells without a height get the mean height of the valid cells of the
+    same aperture, or of its margin. The standard deviations contain the noise of the cells and the covariance of the
+    reference surface. They do not contain errors that all heights share (scale, calibration), nor the sampling of steep
+    walls: a vertical wall of height h and length p changes the volume by up to h p c / 2 with cells of size c, if it is
+    parallel to the cells, and by much less otherwise.
     """
     heights = np.asarray(z, np.float64)
     if heights.shape != grid.shape:

@@ -20,8 +20,8 @@ Float64 = npt.NDArray[np.float64]
 Measure = Literal["laplacian", "intensity"]
 MEASURES: tuple[Measure, ...] = get_args(Measure)
 
-# Two maxima are apart if the measure falls below this part of the smaller one between them: the half width of a peak.
-# Chosen: noise on the flank of a peak is not another maximum.
+# Two maxima are distinct if the measure between them falls below this fraction of the smaller one. Chosen: 0.5 (half
+# height), so that noise on the flank of a peak is not a second maximum.
 _VALLEY = 0.5
 _BLOCK_PIXELS = 1 << 18  # fitted at a time; bounds the memory of the fit to some 50 MB
 
@@ -310,7 +310,7 @@ class FocusSearch:
         for held, measure in zip(self._window, self._recent, strict=True):
             held[late] = measure[late]
         self._start[late] = self._count - size
-        # In units of the frame number; the focal length only has to lie before the first frame.
+        # The coordinate is the frame number, from 1; any focal length below 1 gives the same result.
         fit = DepthFromFocus(first=1.0, spacing=1.0, focal_length=0.5)
         place, status = np.empty(self._best.shape), np.empty(self._best.shape, np.uint8)
         rows = max(_BLOCK_PIXELS * len(place) // max(place.size, 1), 1)

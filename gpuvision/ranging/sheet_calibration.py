@@ -44,7 +44,7 @@ SHEET_PARAMETERS = ("offset", "slope_g", "slope_h", "gg", "gh", "hh")
 _SIGMA_OF_MAD = 1.4826
 # Tuning constant of Tukey's loss: 95 % efficiency for normal noise.
 _TUKEY = 4.685
-# Numbers that a view's line adds to the tests of the model: offset, direction and curvature of the line.
+# Degrees of freedom that the line of a view contributes to the tests: offset, direction and curvature.
 _NUMBERS_PER_VIEW = 3
 
 
@@ -69,7 +69,7 @@ class SheetLimits:
         Robust standard deviation of the readings about the sheet [px] above which they show no sheet. Chosen: real
         lines are read within a pixel; a laser image in a wrong pose is off by many.
     min_spread : float
-        Ratio of the second to the first principal extent of the points below which all lines are one: a plane needs
+        Ratio of the second to the first principal extent of the points below which all lines coincide: a plane needs
         targets at different distances.
     """
 

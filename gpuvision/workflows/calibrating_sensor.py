@@ -54,7 +54,7 @@ Progress = Callable[[int, int | None], object]
 
 # Share of the readings of a view that the sheet rejects, above which a warning names the view (chosen).
 _MANY_OUTLIERS = 0.5
-# Laser images that decide on the direction of the line.
+# Number of laser images from which the direction of the line is estimated. Chosen.
 _FIRST = 3
 # Every n-th reading serves for the covariance of the triangulation, which is smooth over the image.
 _EVERY = 16
@@ -474,7 +474,7 @@ def _warnings(geometry: SensorGeometry, lines: Sequence[LineImage]) -> list[str]
         if len(residual) and np.mean(np.isnan(residual)) > _MANY_OUTLIERS:
             warnings.append(
                 f"{each.image.name}: the sheet rejects {np.count_nonzero(np.isnan(residual))} of {len(residual)} "
-                "readings; did the target move between its two images?"
+                "readings; check that the target did not move between its two images"
             )
     if sheet.view_ratio > _DISAGREEMENT:
         warnings.append(
@@ -483,8 +483,8 @@ def _warnings(geometry: SensorGeometry, lines: Sequence[LineImage]) -> list[str]
         )
     if transport is None:
         warnings.append(
-            "no transport views: the part is taken to move perpendicular to the sheet, along -(g x h); a negative step "
-            "turns it round"
+            "no transport views: the part is assumed to move along -(g x h), perpendicular to the sheet; a negative "
+            "step reverses it"
         )
     elif transport.view_ratio > _DISAGREEMENT:
         warnings.append(

@@ -81,8 +81,8 @@ static inline void sheet_plane(reals position, reals sample, constant SheetTable
 #endif
 
 // Compute the undistorted, scaled place (x, y) of a light position, and the mask of positions without one: beyond the
-// fold of the lens, behind the tilted sensor, or outside of the region of the polynomials. Return the squared distance of the measured place from the centre of
-// the lens, or without a lens from the middle of the sensor region.
+// fold of the lens, behind the tilted sensor, or outside of the region of the polynomials. Return the squared distance of
+// the measured place from the centre of the lens, or without a lens from the middle of the sensor region.
 static inline reals sheet_place(reals position, reals sample, constant SheetTable *sheet, reals *x, reals *y,
                                 masks *folded) {
     *x = (position - sheet->position_origin) * sheet->position_scale;

@@ -143,7 +143,8 @@ static inline ints first_row_apart(const Profiles *profiles, codes level, ints b
 // offset past it is the smallest unsigned offset whose sample differs from the peak (negative offsets are large
 // unsigned numbers; an equal sample has all bits set by the OR with its mask).
 //
-// Under NOISE the loop also sums what centroid_variance() needs. The second moment of the light exceeds 16 bits.
+// Under NOISE the loop also accumulates the moments m2, n0, n1 and n2 of centroid_variance(). The second
+// moment of the light exceeds 16 bits.
 static inline Place span_centroid(const Profiles *profiles, const Peak *peak, Span span, ints *top,
                                   constant LineTable *table) {
     const indices at = to_indices(peak->at);

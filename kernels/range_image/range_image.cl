@@ -140,7 +140,8 @@ static inline Pose pose_of(real travelled, constant RangeTable *table) {
 //
 // With V the vector from (g, h) to the pinhole along the plane and F = f / D, the light is at the share s where
 //     s = F((g, h) + s V),  F quadratic:  F(V) s^2 - (1 - grad F . V) s + F(g, h) = 0
-// The root that grows from 0 with F is written as a quotient in which nothing cancels. It is exact, without an iteration.
+// Of the two roots, take the one that tends to 0 with F. The form 2c / (b + sqrt(b^2 - 4ac)) avoids cancellation; no
+// iteration is needed.
 // Where F is too large for this root, the divisor is NaN or negative.
 static inline reals bent(reals *g, reals *h, constant RangeTable *table, masks *missed) {
     constant real *f = table->bend;

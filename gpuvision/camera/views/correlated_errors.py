@@ -2,9 +2,9 @@
 
 Two errors are common to many points and do not average out. A lens model that is too small leaves a smooth field that
 is fixed in the image; `CorrelatedErrors.lack_of_fit` compares the residuals with a free field, as for straight lines
-(`gpuvision.camera.lines.lack_of_fit`). A bent target, a moving target or a finder that pulls differs from view to
-view; `view_p_value` tests whether one camera explains all views, against one camera for each view. If one of the tests
-finds correlation, the covariance is the sum of the field's part and of the delete-one-view jackknife (clusters by
+(`gpuvision.camera.lines.lack_of_fit`). A bent target, a moving target or a biased point detector causes errors that
+differ from view to view; `view_p_value` tests one camera for all views against one camera for each view. If one of the
+tests finds correlation, the covariance is the sum of the field's part and of the delete-one-view jackknife (clusters by
 view, which is the sandwich estimator with the small-sample correction CR3).
 
 All sums are inner products of the columns of one view, with the pose of the view projected out, so the memory does not

@@ -464,8 +464,8 @@ def _p_value(task: _Task, small: _Candidate, large: _Candidate) -> float:
     """Return the p-value of a model against a larger one.
 
     The F test assumes independent errors. If the residuals of the larger model are correlated, Wald's test compares
-    its further parameters with their covariance for correlated errors. Whether there is a lens at all remains a
-    question for the F test, and so does everything with too few views for a covariance by view.
+    its further parameters with their covariance for correlated errors. The F test is also used for the comparison with
+    the model "none", and if there are too few views for a covariance by view.
     """
     additional = large.free_parameters.count - small.free_parameters.count
     if additional == 0:

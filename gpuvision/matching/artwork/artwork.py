@@ -231,9 +231,9 @@ def _first_of_equals(points: Float64) -> npt.NDArray[np.int64]:
     """Return the indices of the points (n, dimensions) that have no earlier point within ``_SAME_PLACE``."""
     if not len(points):
         return np.empty(0, dtype=np.int64)
-    # Of a cell with a diagonal of at most the distance, only the first point can be one. A file may repeat a hole 1e5
-    # times: all pairs of its points would not fit the memory, but few cells are within the distance of a point. The
-    # side is a power of two, so that distinct points beyond the 53 bits of a cell number stay in distinct cells.
+    # The diagonal of a cell is at most `_SAME_PLACE`, so all points of a cell are duplicates of its first point. A file
+    # may repeat a hole 1e5 times; testing all pairs would exhaust the memory. The side of a cell is a power of two,
+    # so that distinct points beyond the 53 bits of a cell number stay in distinct cells.
     side = 2.0 ** math.floor(math.log2(_SAME_PLACE / math.sqrt(points.shape[1])))
     first = np.sort(np.unique(np.floor(points / side), axis=0, return_index=True)[1])
     near = cKDTree(points[first]).query_ball_tree(cKDTree(points), _SAME_PLACE)

@@ -35,7 +35,9 @@ def select_features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging,
     Parameters
     ----------
     artwork
-        The side in view of the camera. view Expected pose of the camera over the board.
+        The side in view of the camera.
+    view
+        Expected pose of the camera over the board.
     imaging
         Image quality and search range.
     budget
@@ -54,9 +56,8 @@ def select_features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging,
     if len(rulers.sigma) + len(fiducials.sigma) < _MIN_FEATURES:
         raise ValueError(
             f"{len(rulers.sigma)} edges of the {artwork.side} artwork in view have room for a ruler, and "
-            f"{len(fiducials.sigma)} round pads can serve as fiducials, expected 3 or more together; are the "
-            "initial pose and the scale right, is the blur less? "
-            + pixel_hint(artwork, view.bounds, placement, imaging)
+            f"{len(fiducials.sigma)} round pads can serve as fiducials, expected 3 or more together; check the "
+            "initial pose, the scale and the blur: " + pixel_hint(artwork, view.bounds, placement, imaging)
         )
     return select_feature_set(rulers, imaging, artwork.side, fiducials=fiducials, are_free=True, budget=budget)
 

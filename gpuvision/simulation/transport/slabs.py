@@ -49,12 +49,16 @@ class Slabs(NamedTuple):
     @classmethod
     def uniform(cls, count: int) -> Slabs:
         """Return ``count`` slabs; all but the outer two have the same width."""
-        # With this range the light in the outer slabs falls with the number of slabs as the inner slabs' width does.
+        # With the range sqrt(2 ln n), the light in the outer slabs and the width of the inner slabs decrease at about
+        # the same rate with n.
         reach = math.sqrt(2.0 * math.log(count)) if count > 2 else 0.0
         return cls.from_cuts(np.linspace(-reach, reach, count - 1))
 
     def with_outer(self, place: float) -> Slabs:
-        """Return the slabs with the light beyond +-``place`` [sigmas] as two more; the levels of the others stay."""
+        """Return the slabs plus two outer slabs for the light beyond +-``place`` [sigmas].
+
+        The other slabs keep their mean positions.
+        """
         cuts = self.high[:-1]
         first = min(-place, float(cuts[0]) - _OUTER_GAP)
         last = max(place, float(cuts[-1]) + _OUTER_GAP)

@@ -246,6 +246,8 @@ class LineReadout(VisionOperation[LineReading]):
         for name in self.outputs or ():
             if name not in possible:
                 raise ValueError(f"LineReadout.outputs has {name!r}, expected some of {', '.join(possible)}")
+        if self.triangulation is not None:
+            self.triangulation.check_systematic(self.outputs or (), "LineReadout")
         default = _FIELDS if self.triangulation is None else (*_FIELDS, "g", "h")
         object.__setattr__(self, "outputs", default if self.outputs is None else tuple(self.outputs))
 

@@ -83,7 +83,7 @@ class PolygonScan:
         -------
         SheetPoints
             Position x as ``g`` and height z as ``h`` [m], of the dtype of the readings; OUT_OF_RANGE where the facet
-            does not reflect the beam (`PolygonMirror.limits`).
+            does not reflect the beam (`PolygonMirror.limits`), and where the reading lies at or behind the mirror.
         """
         phi = self.rotations(reading.shape[-1])
         low, high = self.mirror.limits
@@ -91,6 +91,8 @@ class PolygonScan:
         phi = np.where(inside, phi, np.nan)
         shift = self.mirror.hit_shift(phi)
         path = self.mirror.drop + shift - reading.astype(np.float64)
+        inside = inside & ~(path <= 0.0)
+        path = np.where(inside, path, np.nan)
         position, height = shift + path * np.sin(2.0 * phi), self.mirror.drop - path * np.cos(2.0 * phi)
         flags = status | np.where(inside, np.uint8(0), np.uint8(Status.OUT_OF_RANGE))
         return SheetPoints(position.astype(reading.dtype), height.astype(reading.dtype), flags)

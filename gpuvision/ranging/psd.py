@@ -172,7 +172,8 @@ class PsdReadout(VisionOperation[PsdReading]):
         end cuts the light spot there, and the reading is biased (`clipping_bias`). Default: 3 ``noise.spot``, where the
         bias of a Gaussian spot is 0.0044 ``noise.spot``; 0 without a noise model.
     noise : PsdNoise, optional
-        Noise model for the output ``sigma``. The quantisation of integer codes is added.
+        Noise model for the output ``sigma``. The quantisation of integer codes is added. The slope of the linearity
+        correction is left out.
     triangulation, axes : Triangulation, SampleAxes
         Triangulate in the same kernel (outputs ``g`` and ``h``): u is the position, v the number of the strip,
         converted to sensor coordinates by ``axes``.
@@ -307,6 +308,8 @@ class PsdReadout(VisionOperation[PsdReading]):
         for name in self.outputs:
             if name not in possible:
                 raise ValueError(f"PsdReadout.outputs has {name!r}, expected some of {', '.join(possible)}")
+        if self.triangulation is not None:
+            self.triangulation.check_systematic(self.outputs, "PsdReadout")
         return tuple(self.outputs)
 
     def _check_linearity(self) -> None:

@@ -11,7 +11,7 @@ height H changes, and **v runs along the profile**. Both have the same unit, pix
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -353,6 +353,21 @@ class Triangulation(VisionOperation[SheetPoints]):
         w = np.where(w > self.horizon, w, np.nan)
         p = x / w[..., None]
         return p, p @ np.array([[gx, hx], [gy, hy]]), w
+
+    def check_systematic(self, outputs: Iterable[str], operation: str) -> None:
+        """Check that an operation that computes systematic errors has the covariance for them.
+
+        Raises
+        ------
+        ValueError
+            ``outputs`` has a systematic error, and the triangulation has no covariance.
+        """
+        for name in outputs:
+            if name.startswith("systematic") and self.covariance is None:
+                raise ValueError(
+                    f"{operation}.outputs has {name!r}, but its triangulation has no covariance; "
+                    "give Triangulation.covariance"
+                )
 
     @property
     def sensor_lens(self) -> Lens | None:

@@ -320,9 +320,8 @@ static inline __attribute__((always_inline)) masks LANED(camera_correction)(real
     const masks open = ~folded;
 #endif
     if (any_lane(open)) {
-        // The bit patterns of non-negative reals have the order of the reals, and the patterns of infinity and NaN are
-        // larger: one comparison of bits finds points that are too far or not finite.
-        const masks far = mask_of(as_masks(x * x + y * y) >= as_bits(camera[CAMERA_BENT]));
+        // One comparison finds points that are too far or not finite: it is false for NaN of either sign.
+        const masks far = ~mask_of(x * x + y * y < camera[CAMERA_BENT]);
 #ifdef CAMERA_BENDS
         folded |= far | LANED(newton_back)(x, y, open & ~far, camera, back_x, back_y);
 #else

@@ -42,10 +42,9 @@ typedef struct {
 #endif
 } SheetTable;
 
-// Bits of the squared distance, in half extents of the sensor region, from which a coordinate counts as not finite.
-// Smaller values do not overflow. As integers the bits of non-negative numbers, infinity and NaN (without sign) are in
-// ascending order, so one comparison finds all of them.
-#define SHEET_REACH as_bits((real)1e12)
+// Squared distance, in half extents of the sensor region, from which a coordinate counts as not finite. Smaller values do
+// not overflow. A comparison with NaN is false, whatever the sign of the NaN.
+#define SHEET_REACH ((real)1e12)
 
 #ifdef CAMERA
 // Entry of the camera's table for the axis of the positions, and for the axis of the samples.
@@ -124,7 +123,7 @@ static inline bytes sheet_point(reals position, reals sample, constant SheetTabl
     const reals p = x / w, q = y / w;
     *g = in_g[0] + (in_g[1] * p + in_g[2] * q);
     *h = in_h[0] + (in_h[1] * p + in_h[2] * q);
-    const masks lost = mask_of(as_masks(square) >= SHEET_REACH);
+    const masks lost = ~mask_of(square < SHEET_REACH);
     const masks hidden = mask_of(w <= sheet->horizon);
     const masks flagged = lost | hidden | folded;
     bytes status = STATUS_OK;

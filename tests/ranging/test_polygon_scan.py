@@ -101,6 +101,14 @@ def test_samples_beyond_the_facet_are_flagged() -> None:
     np.testing.assert_array_equal(status != 0, np.isnan(to_numpy(found.h)[0]))
 
 
+def test_readings_behind_the_mirror_are_flagged() -> None:
+    reading = np.array([[0.0, MIRROR.drop + 1e-2, math.nan]])
+    scan = PolygonScan(mirror=MIRROR, first_rotation=-0.01, rotation_step=0.01)
+    found = scan.locate(reading, np.array([[0, 0, Status.LOW_SIGNAL]], np.uint8))
+    np.testing.assert_array_equal(found.status, [[0, Status.OUT_OF_RANGE, Status.LOW_SIGNAL]])
+    np.testing.assert_array_equal(np.isnan(found.h), [[False, True, True]])
+
+
 @pytest.mark.parametrize("step", [0.01, -0.01])
 def test_the_object_moves_during_a_sweep(device: Device, step: float) -> None:
     """A roof that moves along y: every sample is traced at the place of the object at its time."""

@@ -13,6 +13,7 @@ from scipy.special import ndtr
 import gpuvision as gv
 from canary import Guarded
 from gpuvision.host import host_view
+from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Triangulation
@@ -418,6 +419,13 @@ def test_the_sheet_in_the_same_pass(device, rng, variant):
     for value, row in ((reading.g, 0), (reading.h, 1)):
         np.testing.assert_allclose(value[good], (place[row] / place[2])[good], rtol=0, atol=3 * tolerance(np.float32))
         assert np.isnan(value[~good]).all()
+
+
+def test_a_systematic_error_needs_a_covariance():
+    sheet = Triangulation(homography=np.eye(3), region=((-3e-3, 3e-3), (-4e-3, 4e-3)))
+    for readout in (lambda **more: PsdReadout(strip_length=LENGTH, **more), LineReadout):
+        with pytest.raises(ValueError, match=r"outputs has 'systematic_h', but its triangulation has no covariance"):
+            readout(triangulation=sheet, outputs=("position", "systematic_h"))
 
 
 def test_sigma_travels_to_the_sheet(device, rng):

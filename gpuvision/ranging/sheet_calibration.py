@@ -10,9 +10,9 @@ sheet is the plane d = 0, or the surface of the last three terms (a bent sheet).
 differ significantly from zero.
 
 Three independent errors enter, and the fit weights and propagates each: the noise of the readings (independent), the
-noise of the target's pose (common to a view), and the error of the camera (common to all views). The observations of a
-view have the covariance ``D + B O B'``, with the diagonal D of the readings, the covariance O of the pose and the
-derivatives B of the distances by the pose. The result keeps the derivative by the camera's parameters.
+noise of the target's pose (common to all lines on this pose), and the error of the camera (common to all lines). The
+observations of a pose have the covariance ``D + B O B'``, with the diagonal D of the readings, the covariance O of the
+pose and the derivatives B of the distances by the pose. The result keeps the derivative by the camera's parameters.
 
 References
 ----------
@@ -29,6 +29,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 from scipy.special import fdtrc
 
 from gpuvision.camera.camera import Camera
@@ -57,7 +58,7 @@ class SheetLimits:
     significance : float
         p-value of the F test below which the sheet is bent; as for the lens models.
     min_readings : int
-        Fewest readings of a view that are used: they must show a line.
+        Fewest readings of a view that are used: they must show a line. The readings of shorter lines count as outliers.
     trials : int
         Number of random triples of readings that the robust start tries. Derived: with 30 % outliers the chance that
         every triple has an outlier is 0.66^200 < 1e-36.
@@ -93,7 +94,8 @@ class LaserLine(NamedTuple):
     points : numpy.ndarray
         (n, 2): measured (column, row) of the line [px].
     target : PoseResponse
-        Pose of the target (its plane is Z = 0), the covariance of the pose, and its derivative by the camera.
+        Pose of the target (its plane is Z = 0), the covariance of the pose, and its derivative by the camera. Lines
+        with the same object share its error.
     height : numpy.ndarray or float
         (n,) or one number: height of the lit surface over the target's plane, towards the camera [m]. Default 0; other
         heights are those of a stepped block on the plane.
@@ -211,11 +213,14 @@ class _Readings:
     """Readings of all views, and derivatives of their points.
 
     ``ray`` are unit viewing directions, ``slope`` the change of a ray by a pixel across the line, and ``by_camera`` the
-    change of a ray by the camera's parameters. ``view`` is the number of the line.
+    change of a ray by the camera's parameters. ``view`` is the number of the line. ``targets`` are the poses without
+    repetition, and ``pose`` is the number of the pose of each line: lines on one pose share its error.
     """
 
     lines: tuple[LaserLine, ...]
     view: npt.NDArray[np.intp]
+    targets: tuple[PoseResponse, ...]
+    pose: tuple[int, ...]
     ray: Float64
     slope: Float64
     by_camera: Float64
@@ -291,13 +296,21 @@ def _triangulated(
     height = np.concatenate([np.broadcast_to(each.height, len(each.points)) for each in lines])
     reach = np.sum(normal * place, axis=1)
     distance = (reach - np.sign(reach) * height) / np.sum(normal * ray, axis=1)
+    slope = camera.rays(pixels + across) - camera.rays(pixels - across)
+    by_camera = ray_derivatives(camera, names, pixels)
+    # Past the fold of the lens a pixel has no ray; next to the fold its derivatives are missing.
     known = np.isfinite(distance) & (distance > 0.0)
+    known &= np.isfinite(slope).all(axis=1) & np.isfinite(by_camera).all(axis=(1, 2))
+    known &= np.array([len(each.points) >= limits.min_readings for each in lines])[view]
+    targets = {id(each.target): each.target for each in lines}
     return _Readings(
         lines=tuple(lines),
         view=view,
+        targets=tuple(targets.values()),
+        pose=tuple(list(targets).index(id(each.target)) for each in lines),
         ray=ray,
-        slope=camera.rays(pixels + across) - camera.rays(pixels - across),
-        by_camera=ray_derivatives(camera, names, pixels),
+        slope=slope,
+        by_camera=by_camera,
         point=ray * distance[:, None],
         normal=normal,
         along=pixels[:, 0 if along == "columns" else 1],
@@ -419,14 +432,15 @@ def _robust_fit(frame: _Frame, readings: _Readings, limits: SheetLimits) -> tupl
     for _ in range(limits.max_iterations):
         system = _system(frame, bend, readings, count)
         scale = np.abs(system.by_pixel)
-        root = np.sqrt(weight) / scale
-        step = np.linalg.lstsq(system.design * root[:, None], system.distance * root, rcond=None)[0]
+        # A reading without a viewing ray has the distance NaN, which a weight of 0 does not remove from a product.
+        root = np.sqrt(weight[known]) / scale[known]
+        step = np.linalg.lstsq(system.design[known] * root[:, None], system.distance[known] * root, rcond=None)[0]
         change = step.astype(np.float64)
         frame = frame.moved(change)
         bend = bend + (change[3:] if count > 3 else 0.0)
         pixels = (system.distance - system.design @ change) / scale
         before, sigma = sigma, max(_SIGMA_OF_MAD * float(np.median(np.abs(pixels[known]))), limits.noise_floor_px)
-        weight = known * np.clip(1.0 - (pixels / (_TUKEY * sigma)) ** 2, 0.0, None) ** 2
+        weight = np.where(known, np.clip(1.0 - (pixels / (_TUKEY * sigma)) ** 2, 0.0, None) ** 2, 0.0)
         if abs(before - sigma) <= 1e-6 * sigma:
             break
     if sigma > limits.max_scatter_px:
@@ -499,16 +513,17 @@ def _normal_equations(system: _System, readings: _Readings, sigma: float) -> tup
     """Return the normal matrix (p, p), the right-hand side (p,), and the right-hand sides (p, m) by the camera."""
     count, others = system.design.shape[1], system.by_camera.shape[1]
     total = np.zeros((count, count + 1 + others))
-    for number, line in enumerate(readings.lines):
-        inside = (readings.view == number) & (readings.weight > 0.0)
+    pose_of_reading = np.array(readings.pose)[readings.view]
+    for number, target in enumerate(readings.targets):
+        inside = (pose_of_reading == number) & (readings.weight > 0.0)
         if not inside.any():
             continue
         root = 1.0 / (sigma * np.abs(system.by_pixel[inside]))[:, None]
         design, pose = system.design[inside] * root, system.by_pose[inside] * root
-        by_camera = (system.by_camera[inside] + system.by_pose[inside] @ line.target.by_camera) * root
+        by_camera = (system.by_camera[inside] + system.by_pose[inside] @ target.by_camera) * root
         right = np.concatenate([design, system.distance[inside, None] * root, by_camera], axis=1)
         # Inverse of I + B O B' by the identity of Woodbury; O stays positive definite when it is scaled by its factor.
-        reach = pose @ np.linalg.cholesky(line.target.covariance)
+        reach = pose @ np.linalg.cholesky(target.covariance)
         inner = np.eye(6) + reach.T @ reach
         total += design.T @ right - (design.T @ reach) @ np.linalg.solve(inner, reach.T @ right)
     return total[:, :count], total[:, count], total[:, count + 1 :]
@@ -516,19 +531,28 @@ def _normal_equations(system: _System, readings: _Readings, sigma: float) -> tup
 
 def _view_ratio(system: _System, readings: _Readings, sigma: float, count: int) -> float:
     """Return the reduced chi-square of offset, direction and curvature of every view's line about the sheet."""
-    chi_square, freedom = 0.0, -count
-    for number, line in enumerate(readings.lines):
+    # Numbers, their covariance by the readings, and their derivatives by the pose, of all lines on each pose.
+    measured: list[list[Float64]] = [[] for _ in readings.targets]
+    noises: list[list[Float64]] = [[] for _ in readings.targets]
+    by_poses: list[list[Float64]] = [[] for _ in readings.targets]
+    for number, pose in enumerate(readings.pose):
         inside = (readings.view == number) & (readings.weight > 0.0)
         if np.count_nonzero(inside) <= _NUMBERS_PER_VIEW:
             continue
         root = 1.0 / (sigma * np.abs(system.by_pixel[inside]))[:, None]
         basis = _parabola(readings.along[inside]) * root * np.median(1.0 / root)
         inverse = np.linalg.inv(basis.T @ basis)
-        measured = inverse @ basis.T @ (system.distance[inside] * root[:, 0])
-        by_pose = inverse @ basis.T @ (system.by_pose[inside] * root)
-        covariance = inverse + by_pose @ line.target.covariance @ by_pose.T
-        chi_square += float(measured @ np.linalg.solve(covariance, measured))
-        freedom += _NUMBERS_PER_VIEW
+        measured[pose].append(inverse @ basis.T @ (system.distance[inside] * root[:, 0]))
+        noises[pose].append(inverse)
+        by_poses[pose].append(inverse @ basis.T @ (system.by_pose[inside] * root))
+    chi_square, freedom = 0.0, -count
+    for target, numbers, noise, by_pose in zip(readings.targets, measured, noises, by_poses, strict=True):
+        if not numbers:
+            continue
+        values, response = np.concatenate(numbers), np.concatenate(by_pose)
+        covariance = block_diag(*noise) + response @ target.covariance @ response.T
+        chi_square += float(values @ np.linalg.solve(covariance, values))
+        freedom += len(values)
     return chi_square / freedom if freedom > 0 else 1.0
 
 

@@ -33,7 +33,7 @@ from gpuvision.host.outputs import Outputs
 from gpuvision.host.recordings import Channel, image_files
 from gpuvision.plots.sensor_calibration import SensorPicture, draw_sensor_calibration
 from gpuvision.ranging.sensor_geometry import SensorGeometry
-from gpuvision.ranging.sheet_calibration import Along, LaserLine, SheetFit, fit_sheet
+from gpuvision.ranging.sheet_calibration import DEFAULT_LIMITS, Along, LaserLine, SheetFit, fit_sheet
 from gpuvision.ranging.sheet_from_points import sheet_from_points
 from gpuvision.ranging.transport_calibration import TransportFit, fit_transport
 from gpuvision.workflows.calibrating import detect_targets
@@ -471,7 +471,12 @@ def _warnings(geometry: SensorGeometry, lines: Sequence[LineImage]) -> list[str]
     warnings = [f"{each.image.name}: {each.note}" for each in lines if each.note]
     sheet, transport = geometry.sheet, geometry.transport
     for each, residual in zip(lines, sheet.residuals, strict=True):
-        if len(residual) and np.mean(np.isnan(residual)) > _MANY_OUTLIERS:
+        if 0 < len(residual) < DEFAULT_LIMITS.min_readings and np.isnan(residual).all():
+            warnings.append(
+                f"{each.image.name}: the line has {len(residual)} readings, the sheet uses lines of "
+                f"{DEFAULT_LIMITS.min_readings} or more"
+            )
+        elif len(residual) and np.mean(np.isnan(residual)) > _MANY_OUTLIERS:
             warnings.append(
                 f"{each.image.name}: the sheet rejects {np.count_nonzero(np.isnan(residual))} of {len(residual)} "
                 "readings; check that the target did not move between its two images"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -159,3 +161,58 @@ def test_lines_of_other_targets_are_refused(rng: np.random.Generator) -> None:
     mixed = [LaserLine(line.points, other.target) for line, other in zip(lines, lines[3:] + lines[:3], strict=True)]
     with pytest.raises(ValueError, match="lie on no common sheet"):
         fit_sheet(camera_of(TRUTH), mixed)
+
+
+def block_line(rng: np.random.Generator, target: PoseResponse) -> LaserLine:
+    """Return a noisy line on three steps over the true stage, with the pose of a target for the stage."""
+    rotation, translation = on_stage(TRUTH, 0.0)
+    towards = -rotation[:, 2] * np.sign(rotation[:, 2] @ translation)
+    points, heights = [], []
+    for number, height in enumerate((0.0, 0.02, 0.01)):
+        rows = TRUTH.line(rotation[:, 2], translation + height * towards)
+        columns = np.arange(120.0, 200.0) + 80.0 * number
+        points.append(np.stack([columns, rows[columns.astype(int)] + rng.normal(0.0, 0.05, 80)], axis=1))
+        heights.append(np.full(80, height))
+    return LaserLine(np.concatenate(points), target, np.concatenate(heights))
+
+
+def test_lines_on_one_pose_share_its_error(rng: np.random.Generator) -> None:
+    """Four lines on a block whose pose is in error: they do not reduce its part of the sheet's error."""
+    covariance = np.diag([1e-6] * 3 + [1e-8] * 3)
+    rotation, translation = on_stage(TRUTH, 0.0)
+    chi_squares, ratios = [], []
+    for _ in range(12):
+        turn, shift = np.split(np.sqrt(np.diag(covariance)) * rng.normal(size=6), 2)
+        pose = Pose(Rotation.from_rotvec(turn).as_matrix() @ rotation, translation + shift)
+        target = PoseResponse(pose, covariance, np.zeros((6, 0)))
+        found = fit_sheet(camera_of(TRUTH), [block_line(rng, target) for _ in range(4)])
+        error = errors_of(found, TRUTH)[:3]
+        chi_squares.append(error @ np.linalg.solve(found.covariance(np.zeros((0, 0)))[:3, :3], error))
+        ratios.append(found.view_ratio)
+    # Chi-square with 3 degrees of freedom: variance 6 per draw.
+    assert 1.0 < np.mean(chi_squares) < 3.0 + 4.0 * np.sqrt(6.0 / 12)
+    assert np.mean(ratios) < 1.5
+
+
+def test_readings_without_a_ray_are_left_out(rng: np.random.Generator) -> None:
+    """Readings past the fold of the lens, where the camera has no ray: outliers, and the same sheet."""
+    truth = replace(TRUTH, distortion=np.array([-0.15, *TRUTH.distortion[1:] * np.r_[0.0, np.ones(12)]]))
+    lines = lines_of(truth, rng)
+    clean = fit_sheet(camera_of(truth), lines)
+    past = np.full((5, 2), 1e5)
+    assert np.isnan(camera_of(truth).rays(past)).all()
+    found = fit_sheet(camera_of(truth), [lines[0]._replace(points=np.concatenate([lines[0].points, past])), *lines[1:]])
+    assert found.outliers == clean.outliers + 5
+    assert np.isnan(found.residuals[0][-5:]).all()
+    np.testing.assert_allclose(found.origin, clean.origin, rtol=1e-9)
+    np.testing.assert_allclose(found.noise_covariance, clean.noise_covariance, rtol=1e-6, atol=1e-30)
+
+
+def test_lines_with_few_readings_are_left_out(rng: np.random.Generator) -> None:
+    lines = lines_of(TRUTH, rng)
+    clean = fit_sheet(camera_of(TRUTH), lines[1:])
+    found = fit_sheet(camera_of(TRUTH), [lines[0]._replace(points=lines[0].points[:15]), *lines[1:]])
+    assert [len(each) for each in found.residuals] == [15, *(len(each) for each in clean.residuals)]
+    assert np.isnan(found.residuals[0]).all()
+    np.testing.assert_allclose(found.origin, clean.origin, rtol=1e-9)
+    np.testing.assert_allclose(found.noise_covariance, clean.noise_covariance, rtol=1e-6, atol=1e-30)

@@ -9,6 +9,7 @@ import json
 import shutil
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -19,7 +20,7 @@ import pytest
 from gpuvision.cli.main import application
 from gpuvision.host import Device
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.workflows.calibrating_sensor import TransportViews, calibrate_sensor
+from gpuvision.workflows.calibrating_sensor import TransportViews, _warnings, calibrate_sensor
 from gpuvision.workflows.laser_images import pair_images, split_steps
 from gpuvision.workflows.scanning import scan
 from laser_sensor import PITCH, PROFILES_BETWEEN, LaserSensor, sensor, up, write_images
@@ -318,3 +319,13 @@ def test_known_points_give_the_sheet(images: Path, tmp_path: Path) -> None:
     assert np.abs(np.diff(heights) - 0.006).max() < 0.02 * 0.73e-3
     with pytest.raises(ValueError, match="known points replace laser images"):
         run("calibrate", *tmp_path.glob("*.png"), *options, "--out", tmp_path / "other" / "sensor.toml")
+
+
+def test_unused_short_line_is_named() -> None:
+    """A line of few readings is not used; the few known points of a fixture are."""
+    transport = SimpleNamespace(view_ratio=1.0)
+    lines = [SimpleNamespace(image=Path("pose1_laser.png"), note="")]
+    for residual, count in ((np.full(10, np.nan), 1), (np.zeros(10), 0)):
+        sheet = SimpleNamespace(residuals=(residual,), view_ratio=1.0)
+        found = _warnings(SimpleNamespace(sheet=sheet, transport=transport), lines)  # type: ignore[arg-type]
+        assert found == ["pose1_laser.png: the line has 10 readings, the sheet uses lines of 16 or more"][:count]

@@ -91,7 +91,11 @@ class SensorGeometry:
 
     @cached_property
     def covariance(self) -> Float64:
-        """Joint covariance of camera, sheet and transport, in the order of `names`."""
+        """Joint covariance of camera, sheet and transport, in the order of `names`.
+
+        Sheet and transport correlate by the error of the camera. With a stepped block both also contain the noise of
+        the pose of the first transport view; the covariance leaves this correlation out.
+        """
         m, parts = len(self.camera_names), [np.eye(len(self.camera_names)), self.sheet.by_camera]
         noises = [np.zeros((m, m)), self.sheet.noise_covariance]
         if self.transport is not None:
@@ -154,7 +158,8 @@ class SensorGeometry:
         along : {"columns", "rows"}
             Image axis along which the laser line runs.
         pixels : array_like
-            (n, 2): measured (column, row) over the calibrated part of the image, such as readings.
+            (n, 2): measured (column, row) over the calibrated part of the image, such as readings. Pixels past the
+            fold of the lens have no viewing ray, and are left out.
 
         Notes
         -----
@@ -173,6 +178,8 @@ class SensorGeometry:
         )
         seen = np.asarray(pixels, dtype=np.float64)
         axes, slopes = np.stack([self.sheet.g_axis, self.sheet.h_axis]), self.derivatives(seen)
+        known = np.isfinite(slopes).all(axis=(1, 2))
+        seen, slopes = seen[known], slopes[known]
         errors = np.einsum("ij,njp->nip", axes, slopes).reshape(2 * len(seen), -1)
         g, h = self.in_sheet(self.points(seen)).T
         one, none = np.ones_like(g), np.zeros_like(g)

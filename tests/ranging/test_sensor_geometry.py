@@ -96,6 +96,15 @@ def test_derivatives_are_those_of_the_points(truth: LaserSensor, found: SensorGe
     np.testing.assert_allclose((ends[0] - ends[1]) / (2.0 * step), slopes[:, :, place], rtol=1e-4, atol=1e-9)
 
 
+def test_pixels_without_a_ray_do_not_enter_the_covariance(truth: LaserSensor, found: SensorGeometry) -> None:
+    """NaN stands for a pixel past the fold of the lens."""
+    pixels = truth.project(truth.surface(FLAT))
+    known = found.triangulation(SIZE, "columns", pixels)
+    other = found.triangulation(SIZE, "columns", np.concatenate([pixels, [[np.nan, np.nan]]]))
+    assert known.covariance is not None
+    assert other.covariance == known.covariance
+
+
 def _fields(found: SensorGeometry) -> dict[str, object]:
     return {name: getattr(found, name) for name in SensorGeometry.__dataclass_fields__}
 

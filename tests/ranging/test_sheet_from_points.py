@@ -46,3 +46,11 @@ def test_points_on_a_line_or_in_no_plane_are_refused(rng: np.random.Generator) -
     raised = points + rng.normal(0.0, 0.01, points.shape)
     with pytest.raises(ValueError, match="lie in no plane"):
         sheet_from_points(CAMERA, raised, pixels)
+
+
+def test_points_almost_on_a_line_are_refused() -> None:
+    """Four points 1 um off a line of 80 mm: their noise would decide on the pose."""
+    flat = np.stack([np.linspace(-0.04, 0.04, 4), [1e-6, -1e-6, -1e-6, 1e-6]], axis=1)
+    points = TRUTH.surface(flat)
+    with pytest.raises(ValueError, match="do not lie on one line"):
+        sheet_from_points(CAMERA, points, TRUTH.project(points))

@@ -25,8 +25,9 @@ from gpuvision.camera.views.camera_fit import CameraFit, Pose
 # Length of a residual [standard deviations of a coordinate] above which a point is an outlier, which a robust loss has
 # not used. Derived: one of 1e5 points at normal noise.
 _OUTLIER = 5.0
-# Points that fix a pose and leave residuals; ratio of extents below which they are collinear (above double rounding).
-_MIN_POINTS, _COLLINEAR = 4, 1e-9
+# Points that fix a pose and leave residuals; ratio of their second to their first extent below which they are collinear
+# (chosen: places of points are not known to 1e-4 of their extent).
+_MIN_POINTS, _COLLINEAR = 4, 1e-4
 # Gauss-Newton steps from the algebraic solution, and movement of the projected points that ends them [px].
 _MAX_STEPS, _CONVERGED_PX = 50, 1e-9
 # Columns of OpenCV's Jacobian of projected points: rotation 3, translation 3, fx, fy, cx, cy, coefficients.
@@ -108,7 +109,7 @@ def fit_pose(
         The points do not determine a pose.
     """
     scene, measured = np.asarray(points, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
-    if len(scene) < _MIN_POINTS or np.linalg.matrix_rank(scene - scene.mean(axis=0), _COLLINEAR) < 2:
+    if len(scene) < _MIN_POINTS or _are_collinear(scene):
         raise ValueError(f"{len(scene)} points, expected {_MIN_POINTS} at least that do not lie on one line")
     rays = camera.rays(measured)
     ideal = np.ascontiguousarray(rays[:, :2] / rays[:, 2:])
@@ -126,6 +127,11 @@ def fit_pose(
     inverse: Floats = np.linalg.inv(by_pose.T @ by_pose).astype(np.float64)
     variance = float(np.sum(errors**2)) / (errors.size - 6)
     return PoseResponse(pose, variance * inverse, -inverse @ by_pose.T @ by_camera), errors
+
+
+def _are_collinear(points: Floats) -> bool:
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(extents[1] <= _COLLINEAR * extents[0])
 
 
 def _projection_derivatives(camera: Camera, names: Sequence[str], pose: Pose, points: Floats) -> tuple[Floats, Floats]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from gpuvision.inspection.alignment import align_apertures
+from gpuvision.inspection.alignment import _fit_rigid, align_apertures
 from gpuvision.inspection.apertures import BoardPlacement
 from gpuvision.inspection.deposits import PasteSettings
 from paste_maps import Cap, board_grid, circle, paste_map, rectangle
@@ -78,3 +79,21 @@ def test_a_map_without_paste_is_refused(rng):
         )
     with pytest.raises(ValueError, match="the height map has no height"):
         align_apertures(np.full(grid.shape, np.nan), grid, apertures, SETTINGS, initial=here, search_range=(1e-4, 0.0))
+
+
+@pytest.mark.parametrize("count", [4, 12])
+def test_the_covariance_of_few_deposits_is_their_variance(rng, count):
+    """Mean covariance of 250 draws over the variance of the fitted motions: three parameters shrink the residuals."""
+    here = BoardPlacement(x=0.0, y=0.0, theta=0.0)
+    angle = 2 * math.pi * np.arange(count) / count
+    centre = 1e-3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    errors, variances = [], []
+    for _ in range(250):
+        found, covariance, _, _, middle = _fit_rigid(
+            SimpleNamespace(offset=rng.normal(0, 1e-6, (count, 2)), centre=centre), here
+        )
+        shift = found.to_map(middle) - middle
+        errors.append([*shift, found.theta])
+        variances.append(np.diag(covariance))
+    ratio = np.mean(variances, axis=0) / np.mean(np.square(errors), axis=0)
+    assert np.all(np.abs(ratio - 1) < 0.3)  # 3 standard deviations of a variance of 250 draws

@@ -20,6 +20,7 @@ from gpuvision.inspection.deposits import cells_of, complete_sigmas
 from gpuvision.inspection.top_height import top_height
 from gpuvision.matching.artwork.shapes import Float64
 from gpuvision.ranging.regrid import Grid
+from gpuvision.validation import finite
 
 _TOP_PATCH = 0.15  # half width of the patch of a top, in square roots of the area of the region. Chosen
 _TOUCHING = 1e-6  # distance from the seating plane, in ranges of the heights, of leads that touch it
@@ -64,7 +65,7 @@ class Coplanarity(NamedTuple):
     lowest
         Name of the lead with the largest gap.
     noise
-        Standard deviation of the heights [m] that the sigmas use.
+        Standard deviation of the heights [m] that the sigmas use; NaN if unknown.
     """
 
     names: tuple[str, ...]
@@ -165,9 +166,10 @@ def measure_coplanarity(
         Region of each lead in the height map, three or more.
     sigma : float or numpy.ndarray, optional
         Random standard deviation of the heights [m]: one for all, or one per cell. Default: from the third differences
-        of neighbours in the regions, which is too small if neighbours share noise.
+        of neighbours in the regions, which is too small if neighbours share noise. It is NaN (unknown) if no region
+        has four neighbours in a row or column.
     correlation_area : float
-        Number of cells whose noise is common. Default 1.
+        Number of cells whose noise is common, 1 or more. Default 1.
     centre : tuple of float, optional
         Centre of gravity in the height map [m]. Default: mean of the centroids of the regions.
 
@@ -178,7 +180,8 @@ def measure_coplanarity(
     Raises
     ------
     ValueError
-        Fewer than three tops are measured, or the centre of gravity is not between them.
+        Fewer than three tops are measured, the centre of gravity is not between them, or a standard deviation is
+        negative.
 
     Notes
     -----
@@ -188,6 +191,7 @@ def measure_coplanarity(
     heights = np.asarray(z, np.float64)
     if heights.shape != grid.shape:
         raise ValueError(f"heights have shape {heights.shape}, the grid has {grid.shape}; expected the same")
+    correlated = finite(correlation_area, "correlation_area", minimum=1.0)
     parts = [_region(heights, grid, each) for each in regions]
     noise = _noise(parts) if sigma is None else sigma
     sigmas = complete_sigmas(np.asarray(noise, np.float64), grid.shape)
@@ -196,7 +200,7 @@ def measure_coplanarity(
         if inside.any():
             half = max(round(_TOP_PATCH * math.sqrt(each.area / (grid.cell_x * grid.cell_y))), 1)
             found = top_height(part, inside, sigmas[rows, columns], half)
-            tops[index] = found.height, found.sigma * math.sqrt(correlation_area)
+            tops[index] = found.height, found.sigma * math.sqrt(correlated)
     place = np.array([each.centroid for each in regions]).reshape(-1, 2)
     known = np.flatnonzero(np.isfinite(tops[:, 0]))
     if len(known) < 3:
@@ -242,14 +246,16 @@ def _region(z: Float64, grid: Grid, region: Aperture) -> tuple[Float64, npt.NDAr
 
 
 def _noise(parts: Sequence[tuple[Float64, npt.NDArray[np.bool_], slice, slice]]) -> float:
-    """Return the standard deviation of independent noise, from third differences along rows in the regions."""
+    """Return the standard deviation of independent noise, from third differences in the regions; NaN without any."""
     found = []
     for part, inside, _, _ in parts:
-        if part.shape[1] >= 4:
-            third = part[:, 3:] - part[:, :-3] - 3 * (part[:, 2:-1] - part[:, 1:-2])
-            found.append(third[inside[:, 3:] & inside[:, :-3] & np.isfinite(third)])
+        # Along rows and along columns: narrow leads have four neighbours in one direction only.
+        for height, allowed in ((part, inside), (part.T, inside.T)):
+            if height.shape[1] >= 4:
+                third = height[:, 3:] - height[:, :-3] - 3 * (height[:, 2:-1] - height[:, 1:-2])
+                found.append(third[allowed[:, 3:] & allowed[:, :-3] & np.isfinite(third)])
     values = np.concatenate(found) if found else np.empty(0)
     if not values.size:
-        return 0.0
+        return math.nan
     # The variance of a third difference is (1 + 9 + 9 + 1) times that of a height; the median ignores edges.
     return _MAD * float(np.median(np.abs(values - np.median(values)))) / math.sqrt(20)

@@ -269,12 +269,7 @@ def measure_deposits(
 
 
 def _sigmas(sigma: float | npt.NDArray[np.floating] | None, estimated: float, grid: Grid) -> Float64:
-    given = np.asarray(estimated if sigma is None else sigma, np.float64)
-    if given.shape not in ((), grid.shape):
-        raise ValueError(f"sigma has shape {given.shape}, the grid has {grid.shape}; expected the same, or one number")
-    if np.any(given < 0):
-        raise ValueError("sigma is negative, expected standard deviations [m]")
-    return complete_sigmas(given, grid.shape)
+    return complete_sigmas(np.asarray(estimated if sigma is None else sigma, np.float64), grid.shape)
 
 
 def complete_sigmas(sigma: Float64, shape: tuple[int, int]) -> Float64:
@@ -286,7 +281,16 @@ def complete_sigmas(sigma: Float64, shape: tuple[int, int]) -> Float64:
         One standard deviation, or one per cell.
     shape : tuple of int
         Shape of the height map.
+
+    Raises
+    ------
+    ValueError
+        A standard deviation is negative, or the standard deviations have another shape.
     """
+    if sigma.shape not in ((), shape):
+        raise ValueError(f"sigma has shape {sigma.shape}, the grid has {shape}; expected the same, or one number")
+    if np.any(sigma < 0):
+        raise ValueError("sigma is negative, expected standard deviations [m]")
     known = np.isfinite(sigma)
     level = float(np.median(sigma[known])) if known.any() else math.nan
     return np.broadcast_to(np.where(known, sigma, level), shape)

@@ -154,7 +154,7 @@ def inspect_leads(
     sigma : float, optional
         Random standard deviation of all heights [m]. Default: that of the height map, or else estimated.
     correlation_area : float
-        Number of cells whose noise is common. Default 1.
+        Number of cells whose noise is common, 1 or more. Default 1.
     centre : tuple of float, optional
         Centre of gravity, in the coordinates of the regions [m]. Default: mean of the regions.
     maximum : float, optional

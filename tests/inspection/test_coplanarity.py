@@ -123,3 +123,43 @@ def test_the_top_of_a_flat_lead_has_no_bias(rng):
     assert abs(error.mean()) < 3 / math.sqrt(200)
     assert abs(error.std() - 1) < 3 / math.sqrt(400)
     assert region.area == pytest.approx(4e-8)
+
+
+def _narrow_leads(width):
+    """Regions and heights of four leads along y, a number of cells wide."""
+    places = [(x, y) for x in (0.3e-3, 0.9e-3) for y in (0.4e-3, 1.4e-3)]
+    regions = [rectangle(str(number), place, (10e-6 * width, 0.4e-3)) for number, place in enumerate(places)]
+    grid = board_grid(120, 180)
+    return regions, grid, paste_map(grid, HERE, [(Box((0.1e-3, 0.5e-3), 1e-4), place) for place in places])
+
+
+def test_the_noise_of_narrow_leads_along_y(rng):
+    """Leads two cells wide have four neighbours along columns only."""
+    regions, grid, clean = _narrow_leads(2)
+    found = measure_coplanarity(clean + rng.normal(0, 2e-6, clean.shape), grid, regions)
+    assert found.noise == pytest.approx(2e-6, rel=0.25)  # 3 sigma of the median of about 300 differences
+    assert (found.top_sigma > 0).all()
+
+
+def test_the_noise_of_tiny_regions_is_unknown(rng):
+    regions, grid, z = _narrow_leads(2)
+    tiny = [rectangle(each.name, tuple(each.centroid), (20e-6, 20e-6)) for each in regions]
+    found = measure_coplanarity(z, grid, tiny)
+    assert math.isnan(found.noise)
+    assert math.isnan(found.coplanarity_sigma)
+    assert np.isnan(found.gap_sigma).all()
+    assert np.isfinite(found.gap).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"sigma": -1e-6}, "sigma is negative, expected standard deviations"),
+        ({"sigma": np.ones((2, 2))}, r"sigma has shape \(2, 2\), the grid has"),
+        ({"correlation_area": 0.5}, "correlation_area is 0.5, expected .*1"),
+    ],
+)
+def test_noise_that_cannot_be_is_refused(given, message):
+    regions, grid, z = _narrow_leads(4)
+    with pytest.raises(ValueError, match=message):
+        measure_coplanarity(z, grid, regions, **given)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import io
 import math
 import os
 from collections import deque
@@ -19,12 +20,14 @@ from av.video.reformatter import VideoReformatter
 from gpuvision.host.arrays import HostArray
 from gpuvision.host.damage import is_damaged_jpeg
 from gpuvision.host.errors import RecordingError
-from gpuvision.host.reading import check_pixels
+from gpuvision.host.image_header import image_size
+from gpuvision.host.reading import MAX_PIXELS, check_pixels
 
 # Bytes of a JPEG image without its data, in which a table of Huffman codes lies.
 _JPEG_HEADER = 4096
 _HUFFMAN_TABLE = b"\xff\xc4"
 _MAX_THREADS = 16  # each holds a picture
+_LARGEST_OPTION = (1 << 31) - 1  # of FFmpeg's option max_pixels
 # Clockwise rotation of the picture [degrees].
 _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
@@ -86,12 +89,18 @@ class VideoDecoder:
         self._context.thread_type = "FRAME"
         self._context.thread_count = min(max(os.cpu_count() or 2, 2), _MAX_THREADS)
         self._intra_only = self._context.codec.intra_only
-        self._context.options = {"err_detect": "crccheck+bitstream+buffer+explode"}
+        # The header gives the size of the first picture only.
+        max_pixels = int(min(MAX_PIXELS.value, _LARGEST_OPTION))
+        self._context.options = {"err_detect": "crccheck+bitstream+buffer+explode", "max_pixels": str(max_pixels)}
         self._is_jpeg = self._context.name == "mjpeg"
         # Cameras leave out the tables of Huffman codes, which are the same in all images.
         self._completed = av.bitstream.BitStreamFilterContext("mjpeg2jpeg", stream) if self._is_jpeg else None
         self._reformatter = VideoReformatter()
+        # An AVI file has no times of display: for some codecs FFmpeg numbers the packets in decoding order.
+        self._is_numbered = self._container.format.name == "avi" and not self._intra_only
+        self._packets = 0
         self._expected: list[int] = []  # times of the packets whose pictures have not come yet
+        self._lost: set[int] = set()  # times of lost pictures
         self._broken_jpegs: set[int] = set()  # numbers of pictures
         self._jpeg_times: set[int] = set()
         self._failed: set[int] = set()  # times of packets that the decoder refused
@@ -103,7 +112,7 @@ class VideoDecoder:
         self._last: HostArray | None = None
         self._pictures = self._decode()
         self.rate = float(stream.average_rate) if stream.average_rate else None
-        self.length = stream.frames or self._announced(stream) or None
+        self.length = self._displayed(stream) or self._announced(stream) or None
         if not self.wait():
             raise self._unreadable()
         assert self._last is not None  # there is a picture
@@ -111,6 +120,14 @@ class VideoDecoder:
 
     def _unreadable(self) -> RecordingError:
         return RecordingError(f"{self._path}: no frame of this video can be decoded: damaged, or of an unknown codec")
+
+    def _displayed(self, stream: Any) -> int:
+        """Return the number of pictures in the header, without those that the edit list of an MP4 file cuts off."""
+        frames = int(stream.frames)
+        if not frames or "mp4" not in self._container.format.name.split(","):
+            return frames
+        # The index of an MP4 file leaves out packets outside the edit list, or marks them.
+        return sum(not entry.is_discard for entry in stream.index_entries)
 
     def _announced(self, stream: Any) -> int:
         """Return the number of pictures from duration and rate."""
@@ -181,8 +198,13 @@ class VideoDecoder:
     def _decode_packet(self, packet: Any) -> Iterator[tuple[HostArray | None, bool]]:
         if not packet.size:  # the end of the stream
             return
+        self._is_numbered |= self._packets == 0 and packet.pts is None and packet.dts is not None
+        if self._is_numbered:
+            packet.pts = self._packets  # the decoder gives it to the picture
+        self._packets += 1
         time = _time(packet)
-        if time is not None:
+        # The decoder drops the pictures of discarded packets, which lie outside the edit list of an MP4 file.
+        if time is not None and not packet.is_discard:
             heapq.heappush(self._expected, time)
             if self._is_jpeg and self._is_broken_jpeg(packet):
                 self._jpeg_times.add(time)
@@ -198,6 +220,12 @@ class VideoDecoder:
                 content = b"".join(bytes(each) for each in self._completed.filter(av.Packet(content)))
             except av.error.FFmpegError:
                 return True
+        try:
+            size = image_size(io.BytesIO(content))
+        except ValueError:  # the image ends early
+            return True
+        if size is None or size[0] * size[1] > MAX_PIXELS.value:
+            return True
         return is_damaged_jpeg(content)
 
     def _frames(self, packet: Any) -> Iterator[tuple[HostArray | None, bool]]:
@@ -214,12 +242,21 @@ class VideoDecoder:
             return
         for frame in frames:
             time = _time(frame)
-            while time is not None and self._expected and self._expected[0] < time:
-                heapq.heappop(self._expected)
+            is_bidirectional = frame.pict_type == av.video.frame.PictureType.B
+            # Numbered packets are in decoding order: a bidirectional picture is displayed before a picture with a
+            # smaller number. Pictures of other kinds are displayed after all that are decoded before them.
+            is_after_all = not (self._is_numbered and is_bidirectional)
+            while is_after_all and time is not None and self._expected and self._expected[0] < time:
+                self._lost.add(heapq.heappop(self._expected))
                 self._broken_since_key = True
                 yield None, True
-            if self._expected and (time is None or self._expected[0] == time):
+            if time in self._lost:  # the picture comes too late: the previous one has taken its place
+                continue
+            if self._expected and time is None:
                 heapq.heappop(self._expected)
+            elif time in self._expected:
+                self._expected.remove(time)
+                heapq.heapify(self._expected)
             if frame.key_frame or self._intra_only:
                 self._broken_since_key = False
             self._broken_since_key |= frame.is_corrupt or time in self._failed
@@ -227,8 +264,7 @@ class VideoDecoder:
                 self._broken_jpegs.add(self._number)
             yield self._picture(frame), self._broken_since_key
             # `_counted` has counted this picture.
-            kind = frame.pict_type == av.video.frame.PictureType.B
-            self._bidirectional = [*self._bidirectional, self._number - 1] if kind else []
+            self._bidirectional = [*self._bidirectional, self._number - 1] if is_bidirectional else []
 
     def _picture(self, frame: Any) -> HostArray:
         turned = self._reformatter.reformat(frame, format="bgr24")

@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from gpuvision.host import RecordingError, open_recording
+from gpuvision.host import RecordingError, open_recording, video
 from gpuvision.host.sources import ArraySource, PacedSource
 from gpuvision.ranging.background import ImageSubtracted, PairsSubtracted, PreviousSubtracted
 
 COUNT, ROWS, COLUMNS = 36, 64, 160
+ENCODER = {"g": "12", "threads": "1"}  # with more threads the file depends on their timing
 CODECS = {"mp4": "libx264", "avi": "mjpeg", "mov": "mpeg4"}
 
 
@@ -27,14 +28,14 @@ def frames_of_a_line() -> Any:
     return np.repeat(np.clip(frames, 0, 255).astype(np.uint8)[..., None], 3, axis=3)
 
 
-def written(path: Path, codec: str | None = None, frames: Any = None) -> Path:
-    """Write a video with a key frame in every 12 frames."""
+def written(path: Path, codec: str | None = None, frames: Any = None, **options: str) -> Path:
+    """Write a video with a key frame in every 12 frames. The options are those of the codec."""
     frames = frames_of_a_line() if frames is None else frames
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(codec or CODECS[path.suffix[1:]], rate=25)
         stream.height, stream.width = frames.shape[1:3]
-        stream.pix_fmt = "yuvj420p" if path.suffix == ".avi" else "yuv420p"
-        stream.options = {"huffman": "default"} if path.suffix == ".avi" else {"g": "12"}
+        stream.pix_fmt = "yuvj420p" if stream.name == "mjpeg" else "yuv420p"
+        stream.options = {"huffman": "default"} if stream.name == "mjpeg" else ENCODER | options
         for frame in frames:
             for packet in stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")):
                 container.mux(packet)
@@ -82,26 +83,110 @@ def positions(frames: Any) -> Any:
         return (light * np.arange(ROWS)[:, None]).sum(axis=1) / light.sum(axis=1)
 
 
+def read_by_opencv(path: Path) -> Any:
+    """Return the grey frames as OpenCV decodes them, (frames, rows, columns)."""
+    capture, frames = cv2.VideoCapture(str(path)), []
+    while True:
+        decoded, picture = capture.read()
+        if not decoded:
+            return np.array(frames)
+        frames.append(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+
+
 @pytest.mark.parametrize("suffix", CODECS)
 def test_pictures_are_those_of_opencv(tmp_path: Path, suffix: str) -> None:
     path = written(tmp_path / f"video.{suffix}")
     frames, damaged = read(path)
-    capture, expected = cv2.VideoCapture(str(path)), []
-    while True:
-        decoded, picture = capture.read()
-        if not decoded:
-            break
-        expected.append(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
-    np.testing.assert_array_equal(frames, expected)
+    np.testing.assert_array_equal(frames, read_by_opencv(path))
     assert len(frames) == COUNT == open_recording(path).length
     assert open_recording(path).rate == 25.0
     assert damaged == frozenset()
 
 
-@pytest.mark.parametrize("suffix", CODECS)
-def test_samples_of_damaged_frames_are_known(tmp_path: Path, suffix: str) -> None:
+@pytest.mark.parametrize("codec", ["libx264", "mpeg4"])
+def test_bidirectional_pictures_in_an_avi_file(tmp_path: Path, codec: str) -> None:
+    """An AVI file has no times of display; a lost packet damages the pictures of its group."""
+    path = written(tmp_path / "video.avi", codec, bf="3")
+    frames, damaged = read(path)
+    np.testing.assert_array_equal(frames, read_by_opencv(path))
+    assert len(frames) == COUNT
+    assert damaged == frozenset()
+    _clear_packet(path, 17)
+    lost, damaged = read(path)
+    assert len(lost) == COUNT
+    wrong = np.any(lost != frames, axis=(1, 2))
+    assert np.any(wrong)
+    assert set(np.flatnonzero(wrong)) <= damaged <= set(range(9, 24))
+
+
+def test_packets_without_a_time_of_display(tmp_path: Path) -> None:
+    """Some Matroska files give the time of decoding only."""
+    path = written(tmp_path / "video.mp4", bf="3")
+
+    class WithoutDisplay(video.VideoDecoder):
+        def _decode_packet(self, packet: Any) -> Any:
+            packet.pts = None
+            return super()._decode_packet(packet)
+
+    decoder, frames = WithoutDisplay(path), []
+    while decoder.wait():
+        frames.append(cv2.cvtColor(decoder.read(), cv2.COLOR_BGR2GRAY))
+    decoder.close()
+    np.testing.assert_array_equal(frames, read_by_opencv(path))
+    assert decoder.damaged() == frozenset()
+
+
+# The index of FFmpeg marks packets near the edit, and leaves out those far from it.
+@pytest.mark.parametrize(("first", "count"), [(10, 26), (0, 20), (13, 2)])
+def test_an_edit_list_cuts_pictures_off(tmp_path: Path, first: int, count: int) -> None:
+    path = written(tmp_path / "video.mp4")
+    whole = read(path)[0]
+    content = bytearray(path.read_bytes())
+    place = content.index(b"elst") + 4 + 8  # behind version and number of edits
+    start = int.from_bytes(content[place + 4 : place + 8], "big")
+    # Duration in 1/1000 s of the film; start in 1/12800 s of the stream, 512 for a frame.
+    content[place : place + 8] = (40 * count).to_bytes(4, "big") + (start + 512 * first).to_bytes(4, "big")
+    path.write_bytes(content)
+    frames, damaged = read(path)
+    np.testing.assert_array_equal(frames, whole[first : first + count])
+    np.testing.assert_array_equal(frames, read_by_opencv(path))
+    assert damaged == frozenset()
+    source = open_recording(path)
+    assert source.length == count
+    source.close()
+
+
+def test_a_picture_that_is_larger_than_the_header_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A JPEG image beyond the limit is not decoded; it counts as damaged."""
+    path = tmp_path / "video.avi"
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream("mjpeg", rate=25)
+        stream.height, stream.width, stream.pix_fmt = ROWS, COLUMNS, "yuvj420p"
+        for number, frame in enumerate(frames_of_a_line()[:8]):
+            large = np.zeros((8 * ROWS, 8 * COLUMNS), np.uint8)
+            packet = av.Packet(cv2.imencode(".jpg", large if number == 5 else frame)[1].tobytes())
+            packet.stream, packet.pts, packet.dts, packet.is_keyframe = stream, number, number, True
+            container.mux(packet)
+    decoded = []
+
+    def is_damaged_jpeg(content: bytes) -> bool:
+        decoded.append(len(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)))
+        return False
+
+    monkeypatch.setattr(video, "is_damaged_jpeg", is_damaged_jpeg)
+    monkeypatch.setenv("GPUVISION_MAX_PIXELS", str(2 * ROWS * COLUMNS))
+    frames, damaged = read(path)
+    assert decoded == [ROWS] * 7
+    assert len(frames) == 8
+    np.testing.assert_array_equal(frames[5], frames[4])
+    assert damaged == frozenset({5})
+
+
+@pytest.mark.parametrize("case", [*CODECS, "avi-libx264"])
+def test_samples_of_damaged_frames_are_known(tmp_path: Path, case: str) -> None:
     """Of the samples that changed bytes move, few lie in frames that count as good."""
-    path = written(tmp_path / f"video.{suffix}")
+    suffix, _, codec = case.partition("-")
+    path = written(tmp_path / f"video.{suffix}", codec or None)
     clean = positions(read(path)[0])
     moved = unseen = 0
     for seed in range(12):
@@ -112,6 +197,7 @@ def test_samples_of_damaged_frames_are_known(tmp_path: Path, suffix: str) -> Non
         wrong = ~(np.abs(positions(frames) - clean) < 0.05)
         moved += np.count_nonzero(wrong)
         unseen += np.count_nonzero(np.delete(wrong, sorted(damaged), axis=0))
+        assert len(frames) == COUNT
         assert max(damaged, default=0) < COUNT
     assert moved > 0.02 * 12 * clean.size
     # Measured: 0.2 to 4.4 % of the moved samples (H.264, by the timing of the threads), 0.6 % (JPEG), 2.6 % (MPEG-4).
@@ -119,15 +205,54 @@ def test_samples_of_damaged_frames_are_known(tmp_path: Path, suffix: str) -> Non
     assert unseen < 0.08 * moved
 
 
-def test_only_frames_since_the_last_key_frame_are_damaged(tmp_path: Path) -> None:
+class Exchanging:
+    """Decoder that gives its fifth picture after the sixth one."""
+
+    def __init__(self, context: Any) -> None:
+        self._context, self._count, self._held = context, 0, []
+
+    def decode(self, packet: Any) -> list[Any]:
+        given = []
+        for picture in self._context.decode(packet):
+            self._count += 1
+            if self._count == 5:
+                self._held = [picture]
+            else:
+                given += [picture, *self._held]
+                self._held = []
+        return given
+
+
+def test_a_picture_that_comes_too_late_shifts_no_other(tmp_path: Path) -> None:
+    """Decoders of damaged H.264 can give pictures out of order. A frame has its transport by its number."""
     path = written(tmp_path / "video.mov")
+    clean = read(path)[0]
+    decoder, frames = video.VideoDecoder(path), []
+    decoder._context = Exchanging(decoder._context)
+    while decoder.wait():
+        frames.append(cv2.cvtColor(decoder.read(), cv2.COLOR_BGR2GRAY))
+    decoder.close()
+    assert len(frames) == COUNT
+    # The constructor has decoded picture 0.
+    assert decoder.damaged() == frozenset(range(5, 12))
+    good = np.delete(np.arange(COUNT), 5)
+    np.testing.assert_array_equal(np.array(frames)[good], clean[good])
+
+
+def _clear_packet(path: Path, number: int) -> None:
+    """Fill a packet of a video with zeros."""
     with av.open(str(path)) as container:
-        packet = next(each for n, each in enumerate(container.demux(video=0)) if n == 17)
+        packet = next(each for n, each in enumerate(container.demux(video=0)) if n == number)
         assert packet.pos is not None
         place, size = packet.pos, packet.size
     content = bytearray(path.read_bytes())
     content[place : place + size] = bytes(size)
     path.write_bytes(content)
+
+
+def test_only_frames_since_the_last_key_frame_are_damaged(tmp_path: Path) -> None:
+    path = written(tmp_path / "video.mov")
+    _clear_packet(path, 17)
     frames, damaged = read(path)
     assert len(frames) == COUNT
     assert damaged == frozenset(range(17, 24))

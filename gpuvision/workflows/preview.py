@@ -35,11 +35,14 @@ class Preview:
         Sensor, with the estimated threshold if its file asks for one.
     frames : tuple of LineFrame
         Frames less their background, with positions and flags.
+    damaged_frames : tuple of int
+        Numbers of the damaged frames of the whole recording.
     """
 
     name: str
     sensor: Sensor
     frames: tuple[LineFrame, ...]
+    damaged_frames: tuple[int, ...] = ()
 
     @property
     def found_fraction(self) -> float:
@@ -47,10 +50,15 @@ class Preview:
         return float(np.mean([frame.found_fraction for frame in self.frames]))
 
     def summary(self) -> str:
-        """Return one line: number of frames, threshold, background, fraction of the samples with a line."""
+        """Return one line: number of frames, threshold, background, fraction of the samples with a line.
+
+        Of a damaged recording the line gives the number of damaged frames.
+        """
+        count = len(self.damaged_frames)
+        damaged = f"; {count} damaged frame{'s' * (count > 1)}" if count else ""
         return (
             f"preview of {len(self.frames)} frames at {self._settings()}: "
-            f"a line in {100 * self.found_fraction:.1f} % of the samples"
+            f"a line in {100 * self.found_fraction:.1f} % of the samples{damaged}"
         )
 
     def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
@@ -117,6 +125,7 @@ def preview_scan(
     opened = open_for_scan(recording, sensor)
     try:
         sample = sample_frames(opened.source, max(count, 1))
+        damaged = opened.source.damaged_frames()
     finally:
         opened.source.close()
     chosen = np.unique(np.rint(np.linspace(0, len(sample.numbers) - 1, min(count, len(sample.numbers)))).astype(int))
@@ -130,6 +139,7 @@ def preview_scan(
         name=opened.name,
         sensor=opened.sensor,
         frames=tuple(LineFrame(number=n, image=i, position=p, status=s) for n, i, p, s in found),
+        damaged_frames=tuple(sorted(damaged)),
     )
 
 

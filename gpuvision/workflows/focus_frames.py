@@ -39,11 +39,11 @@ def read_focus_peak(
     ValueError
         The stack has too few frames.
     """
-    search, statistics = FocusSearch(stack, source.dtype), StreamStatistics(0)
-    batch = default_batch(source, 1)
-    frames, arrived = np.empty((batch, *source.shape), source.dtype), np.zeros(batch, np.int64)
-    statistics.started = time.perf_counter_ns()
     try:
+        search, statistics = FocusSearch(stack, source.dtype), StreamStatistics(0)
+        batch = default_batch(source, 1)
+        frames, arrived = np.empty((batch, *source.shape), source.dtype), np.zeros(batch, np.int64)
+        statistics.started = time.perf_counter_ns()
         while source.wait() and (count := source.read_into(frames, arrived)):
             for frame in frames[:count]:
                 search.add(frame)

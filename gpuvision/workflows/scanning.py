@@ -100,9 +100,13 @@ def scan(
     timeline = None if trace is None else _DeferredTrace(trace, overwrite)
     opened = open_for_scan(recording, sensor)
     source, name, sensor = opened.source, opened.name, opened.sensor
-    readout = _with_range_outputs(sensor, precision)
-    device = Device.best() if device is None else device
-    paced, stream = _pipeline(source, readout, device, rate, policy, timeline)
+    try:
+        readout = _with_range_outputs(sensor, precision)
+        device = Device.best() if device is None else device
+        paced, stream = _pipeline(source, readout, device, rate, policy, timeline)
+    except BaseException:
+        source.close()
+        raise
     fields, frame_numbers = _read_frames(stream, readout.outputs or (), source.length, progress)
     if sensor.recording.damaged == "drop":
         damaged = np.isin(frame_numbers, sorted(paced.damaged_frames()))
@@ -146,6 +150,7 @@ def _scan_stack(
     limits: ScanLimits,
 ) -> Scan:
     """Compute the range image and the height map of a focus stack: one frame for each focus distance."""
+    device = Device.best() if device is None else device  # before the stack is read
     opened = open_for_scan(recording, sensor)
     peak, stream = read_focus_peak(opened.source, stack, progress)
     assert isinstance(sensor.transport, StraightTransport)  # the reader of [focus] gives no other
@@ -153,6 +158,7 @@ def _scan_stack(
     if sensor.recording.damaged == "drop":
         near = np.arange(-stack.neighbours, stack.neighbours + 1)
         damaged = np.isin(sharpest, np.add.outer(sorted(opened.source.damaged_frames()), near))
+        damaged &= sharpest >= 0  # -1 is no frame number
         peak.status[damaged] |= np.uint8(Status.NO_DATA)
         peak.frame[damaged] = np.nan
     start = time.perf_counter()
@@ -162,7 +168,6 @@ def _scan_stack(
     _drop_ambiguous(sensor, points)
     intensity = peak.strength.astype(points.z.dtype)
     middle = time.perf_counter()
-    device = Device.best() if device is None else device
     heights, grid = resample_heights(sensor, points, intensity, device, max_cells=limits.max_cells)
     return Scan(
         sensor=sensor,

@@ -16,7 +16,7 @@ from gpuvision.host.recordings import read_array
 Float64 = npt.NDArray[np.float64]
 
 MAX_ENCODER_BYTES = FileLimit("GPUVISION_MAX_ENCODER_BYTES", 1 << 24)
-"""Bytes of an encoder file. Chosen: 16 MiB, two million positions."""
+"""Bytes of an encoder file, unpacked. Chosen: 16 MiB, two million positions."""
 
 _DELIMITERS = ",;\t"
 _LONGEST_SHOWN = 40  # characters of a value in a message
@@ -33,6 +33,7 @@ def read_encoder(path: Path, key: str | None = None) -> Float64:
         the columns.
     key : str, optional
         Name of the array in an NPZ file that holds more than one, or of the column in a text file of several columns.
+        An NPY file has no names.
 
     Returns
     -------
@@ -44,7 +45,8 @@ def read_encoder(path: Path, key: str | None = None) -> Float64:
     OSError
         The file is missing, or cannot be read.
     RecordingError
-        The file is damaged, has no such array or column, or holds a value that is not a finite number.
+        The file is damaged, has no such array or column, holds a value that is not a finite number, or is larger than
+        `MAX_ENCODER_BYTES`, unpacked.
     """
     with reading(path, "encoder file", RecordingError):
         size = path.stat().st_size
@@ -53,6 +55,8 @@ def read_encoder(path: Path, key: str | None = None) -> Float64:
         if suffix == ".npz":
             values = _from_archive(path, key)
         elif suffix == ".npy":
+            if key is not None:
+                raise RecordingError(f"{path}: an NPY file holds one array, without a name; leave out encoder_key")
             values = read_array(path)
         else:
             return _from_text(path, key)
@@ -75,12 +79,17 @@ def _from_archive(path: Path, key: str | None) -> npt.NDArray[np.generic]:
             (key,) = names
         if key not in names:
             raise RecordingError(f"{path}: {_no_such('array', key, names)}")
+        size = max(each.file_size for each in archive.zip.infolist() if each.filename in (key, f"{key}.npy"))
+        MAX_ENCODER_BYTES.check(size, f"{path}: an array of {size} bytes", RecordingError)
         values: npt.NDArray[np.generic] = archive[key]
         return values
 
 
 def _from_text(path: Path, key: str | None) -> Float64:
-    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    with path.open("rb") as file:  # a pipe or a device has no size before it is read
+        content = file.read(int(MAX_ENCODER_BYTES.value) + 1)
+    MAX_ENCODER_BYTES.check(len(content), f"{path}: {len(content)} bytes or more", RecordingError)
+    lines = content.decode("utf-8-sig").splitlines()
     numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
     if not numbered:
         raise RecordingError(f"{path}: holds no value, expected one for each profile")

@@ -57,6 +57,7 @@ def test_arrays(tmp_path: Path) -> None:
         ("e.npy", np.zeros(0), None, r"shape \(0,\)"),
         ("e.npy", np.array([True]), None, r"holds bool"),
         ("e.npy", np.array([1.0, np.inf]), None, r"value 1 is inf, expected a finite number"),
+        ("e.npy", np.zeros(3), "count", r"e.npy: an NPY file holds one array, without a name; leave out encoder_key"),
         ("e.npy", b"no array", None, r"e.npy: not a readable"),
         ("e.npz", b"no archive", None, r"e.npz: not a readable encoder file"),
         ("e.npz", {"a": np.zeros(2), "b": np.zeros(2)}, None, r"several arrays; name one of them .* \(a, b\)"),
@@ -80,6 +81,21 @@ def test_large_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("GPUVISION_MAX_ENCODER_BYTES", "5")
     (tmp_path / "e.csv").write_text("1\n2\n3\n")
     with pytest.raises(RecordingError, match=r"6 bytes, expected at most 5; set GPUVISION_MAX_ENCODER_BYTES"):
+        read_encoder(tmp_path / "e.csv")
+
+
+def test_packed_arrays_that_are_large_are_refused(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "e.npz", count=np.zeros(20_000_000))
+    with pytest.raises(RecordingError, match=r"e\.npz: an array of 160000128 bytes, expected at most 16777216; set"):
+        read_encoder(tmp_path / "e.npz")
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="a device without an end")
+def test_a_device_is_read_to_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GPUVISION_MAX_ENCODER_BYTES", "1000")
+    monkeypatch.setattr(Path, "read_text", lambda *_, **__: pytest.fail("reads without a bound"))
+    (tmp_path / "e.csv").symlink_to("/dev/zero")
+    with pytest.raises(RecordingError, match=r"e\.csv: 1001 bytes or more, expected at most 1000; set"):
         read_encoder(tmp_path / "e.csv")
 
 

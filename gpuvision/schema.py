@@ -63,6 +63,7 @@ class Section:
     def __init__(self, table: Mapping[str, Any], source: str, name: str = "", *, folder: Path | None = None) -> None:
         self._table, self._source, self._name, self._folder = table, source, name, folder or Path()
         self._queried: list[str] = []
+        self._files: list[Path] = []  # shared with the sub-tables
 
     def __contains__(self, key: str) -> bool:
         return key in self._table
@@ -71,6 +72,11 @@ class Section:
     def name(self) -> str:
         """Dotted name of this table."""
         return self._name
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that this table, or another table of the same description, names: all results of `file` so far."""
+        return tuple(self._files)
 
     def dotted(self, key: str) -> str:
         """Return the full, dotted name of a key."""
@@ -101,7 +107,7 @@ class Section:
         value = self._value(key, "a table", _REQUIRED)
         if not isinstance(value, dict):
             raise self._value_error(key, value, "", f"a table [{self.dotted(key)}]")
-        return Section(value, self._source, self.dotted(key), folder=self._folder)
+        return self._below(value, self.dotted(key))
 
     def optional_section(self, key: str) -> Section | None:
         """Return a sub-table, or None if the key is missing."""
@@ -121,10 +127,7 @@ class Section:
         tables = self._value(key, "tables", [])
         if not isinstance(tables, list) or not all(isinstance(each, dict) for each in tables):
             raise self._value_error(key, tables, "", f"tables [[{self.dotted(key)}]]")
-        return tuple(
-            Section(each, self._source, f"{self.dotted(key)}[{n}]", folder=self._folder)
-            for n, each in enumerate(tables)
-        )
+        return tuple(self._below(each, f"{self.dotted(key)}[{n}]") for n, each in enumerate(tables))
 
     @overload
     def number(self, key: str, unit: str, default: float = ..., **limits: float) -> float: ...
@@ -234,7 +237,8 @@ class Section:
         name = self.text(key)
         if not name or "\0" in name:
             raise self._value_error(key, name, "", "the name of a file")
-        return self._folder / name
+        self._files.append(self._folder / name)
+        return self._files[-1]
 
     def finish(self) -> None:
         """Check that every key of the table was queried.
@@ -250,6 +254,12 @@ class Section:
                 known = ", ".join(dict.fromkeys(self._queried)) or "none"
                 hint = f"did you mean '{self.dotted(close[0])}'?" if close else f"known: {known}"
                 raise self.error(f"unknown key '{_shown(self.dotted(key))}'; {hint}")
+
+    def _below(self, table: Mapping[str, Any], name: str) -> Section:
+        """Return a sub-table, which adds the files that it names to those of this table."""
+        below = Section(table, self._source, name, folder=self._folder)
+        below._files = self._files
+        return below
 
     def _value(self, key: str, expected: str, default: Any) -> Any:
         self._queried.append(key)

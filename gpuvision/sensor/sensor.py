@@ -38,7 +38,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Literal, cast, get_args
@@ -156,6 +156,8 @@ class Sensor:
     noise_known
         Whether the file gives the noise of the readout, so that a scan predicts its errors: ``read_noise``, ``gain`` or
         ``speckle`` of a camera, ``[psd.noise]`` of a PSD.
+    files
+        Files that the sensor file names: background image, camera or lens, encoder. No command replaces one of them.
     """
 
     name: str
@@ -169,6 +171,7 @@ class Sensor:
     encoder: Encoder | None = None
     polygon: PolygonScan | None = None
     noise_known: bool = False
+    files: tuple[Path, ...] = field(default=(), compare=False)
 
     @classmethod
     def load(cls, path: str | Path) -> Sensor:
@@ -255,6 +258,7 @@ class Sensor:
             encoder=encoder,
             polygon=polygon,
             noise_known=noise_known,
+            files=top.files,
         )
 
     @classmethod
@@ -263,7 +267,15 @@ class Sensor:
         frame = _frame(top)
         output = _output(top.section("output"))
         top.finish()
-        return cls(name=name, readout=stack, transport=FOCUS_PLACE, output=output, recording=recording, frame=frame)
+        return cls(
+            name=name,
+            readout=stack,
+            transport=FOCUS_PLACE,
+            output=output,
+            recording=recording,
+            frame=frame,
+            files=top.files,
+        )
 
     @property
     def kind(self) -> Literal["camera", "psd", "focus"]:
@@ -415,10 +427,11 @@ def _light(top: Section, transport: Transport) -> Light | None:
     if table is None:
         return None
     light = read_light(table)
-    setup = top.optional_section("triangulation")
-    if light.lens is not None or setup is None or "baseline" not in setup:
+    if light.lens is not None or not isinstance(transport, StraightTransport):
         return light
-    assert isinstance(transport, StraightTransport)  # the others have no triangulation
+    setup = top.section("triangulation")
+    if "baseline" not in setup:
+        return light
     up = np.array(transport.h_axis) / np.linalg.norm(transport.h_axis)
     sheet_normal = np.cross(transport.g_axis, transport.h_axis)
     sheet_normal *= np.sign(sheet_normal @ np.array(transport.direction)) / np.linalg.norm(sheet_normal)

@@ -18,7 +18,7 @@ from gpuvision.sensor.light_source import Light
 from gpuvision.sensor.sensor import Sensor
 
 NOT_OPTICAL: dict[type, frozenset[str]] = {
-    Sensor: frozenset({"name", "recording", "output", "auto_threshold"}),
+    Sensor: frozenset({"name", "recording", "output", "auto_threshold", "files"}),
     Light: frozenset({"responsivity", "ambient", "modulated", "exposure", "full_well", "read_noise"}),
     PsdReadout: frozenset(
         {

@@ -371,6 +371,14 @@ def test_what_a_light_cannot_be(tmp_path, text, words):
         Sensor.load(path)
 
 
+@pytest.mark.parametrize("key", ["baseline", "foo"])
+def test_a_rotating_sheet_with_a_light_has_no_triangulation(key: str) -> None:
+    light = {"aperture": 1e-3, "power": 1.0}
+    with pytest.raises(DescriptionError, match=r"sensor\.toml: unknown key 'triangulation'"):
+        sensor_of({**changed("corner_scene"), "light": light, "triangulation": {key: 0.1}})
+    assert sensor_of({**changed("corner_scene"), "light": light}).light is not None
+
+
 @pytest.mark.parametrize("background", ["none", "median", "previous", "dark_after", "dark_before"])
 def test_backgrounds_by_name(background: str) -> None:
     sensor = sensor_of(changed("camera_line", recording__background=background))
@@ -381,6 +389,7 @@ def test_a_background_image_lies_beside_the_sensor_file(tmp_path: Path) -> None:
     table = changed("camera_line", recording__background="dark/scene.png")
     sensor = Sensor.from_section(Section(table, "sensor.toml", folder=tmp_path))
     assert sensor.recording.background == tmp_path / "dark" / "scene.png"
+    assert sensor.files == (tmp_path / "dark" / "scene.png",)
 
 
 @pytest.mark.parametrize("background", [3, "", True, ["median"]])

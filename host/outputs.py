@@ -123,8 +123,16 @@ class Outputs:
             )
 
     @contextlib.contextmanager
-    def folder(self, folder: str | Path) -> Iterator[Path]:
+    def folder(self, folder: str | Path, *, optional: Iterable[str] = ()) -> Iterator[Path]:
         """Open a temporary folder whose files move to `folder` when the block succeeds; see `atomic_folder`.
+
+        Parameters
+        ----------
+        folder : path
+            Output folder.
+        optional : iterable of str
+            Names of files that the job does not always write. Where the block does not write one of them, the unchanged
+            output of an earlier run of the job is removed: it would seem to belong to the new files.
 
         Yields
         ------
@@ -136,12 +144,15 @@ class Outputs:
         FileExistsError
             A file is an input, or exists and is not an output of the job. No file is written.
         """
-        with contextlib.ExitStack() as stack:
-            lock = stack.enter_context(contextlib.ExitStack())  # released after the files have moved
-            inside = stack.enter_context(atomic_folder(folder))
-            yield inside
-            lock.enter_context(locked_folder(Path(folder)))
-            self._seal(inside, Path(folder))
+        with contextlib.ExitStack() as lock:  # released after the files have moved
+            with atomic_folder(folder) as inside:
+                yield inside
+                lock.enter_context(locked_folder(Path(folder)))
+                self._seal(inside, Path(folder))
+                missing = [Path(folder) / name for name in optional if not (inside / name).exists()]
+                stale = [each for each in missing if self._is_earlier_output(each)]
+            for each in stale:
+                each.unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def file(self, path: str | Path) -> Iterator[BinaryIO]:
@@ -179,6 +190,12 @@ class Outputs:
             if files:
                 known = self._manifest(target) | {each.name: _entry(each, self.job) for each in files}
                 (place / MANIFEST).write_text(json.dumps({"files": known}, indent=1) + "\n")
+
+    def _is_earlier_output(self, path: Path) -> bool:
+        """Return whether a file is an unchanged output of the job, neither a link nor an input."""
+        if not path.is_file() or path.is_symlink() or _identity(path) in self._inputs:
+            return False
+        return bool(self._manifest(path.parent).get(path.name) == _entry(path, self.job))
 
     def _manifest(self, folder: Path) -> dict[str, Any]:
         if folder not in self._manifests:

@@ -109,6 +109,25 @@ def test_a_link_to_an_own_output_stays(tmp_path: Path) -> None:
         Outputs("devices").claim(tmp_path / "link.json")
 
 
+def test_an_optional_output_stays_where_the_run_fails_or_reads_it(tmp_path: Path) -> None:
+    def write_sigma(outputs: Outputs, *names: str) -> None:
+        with outputs.folder(tmp_path / "out", optional=["sigma"]) as inside:
+            for name in names:
+                (inside / name).write_text("ours")
+
+    sigma = tmp_path / "out" / "sigma"
+    write_sigma(Outputs("scan"), "heights", "sigma")
+    (tmp_path / "out" / "folder").mkdir()
+    with pytest.raises(IsADirectoryError):
+        write_sigma(Outputs("scan"), "folder")
+    write_sigma(Outputs("scan", inputs=[sigma]), "heights")
+    write_sigma(Outputs("merge"), "other")
+    assert sigma.exists()
+    write_sigma(Outputs("scan"), "heights")
+    assert {each.name for each in (tmp_path / "out").iterdir()} == {MANIFEST, "heights", "other", "folder"}
+    write_sigma(Outputs("scan"), "heights", "sigma")
+
+
 def test_two_outputs_of_one_name(tmp_path: Path) -> None:
     outputs = Outputs("scan")
     outputs.claim_folder(tmp_path, ["report.json"])

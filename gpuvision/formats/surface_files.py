@@ -164,6 +164,16 @@ def _clock(now: datetime.datetime) -> tuple[int, ...]:
     return now.second, now.minute, now.hour, now.day, now.month, now.year, now.isoweekday() % 7
 
 
+def surface_problem(surface_format: SurfaceFormat, grid: Grid) -> str | None:
+    """Return the reason why a format cannot hold a height map over a grid; None if it can."""
+    if surface_format in ("sdf", "sdf-ascii") and max(grid.shape) > _MAX_SDF_POINTS:
+        return (
+            f"the height map has {grid.columns} columns and {grid.rows} rows, an SDF file holds at most "
+            f"{_MAX_SDF_POINTS} a side"
+        )
+    return None
+
+
 def write_sdf(
     path: str | os.PathLike[str], z: Values, grid: Grid, *, ascii: bool = False, overwrite: bool = False
 ) -> None:
@@ -186,8 +196,8 @@ def write_sdf(
     The format has no place for the position of the grid.
     """
     heights = _floats(z, grid)[::-1]
-    if max(heights.shape) > _MAX_SDF_POINTS:
-        raise ValueError(f"heights have shape {heights.shape}, an SDF file holds at most {_MAX_SDF_POINTS} a side")
+    if problem := surface_problem("sdf", grid):
+        raise ValueError(f"{path}: {problem}")
     now = datetime.datetime.now(datetime.UTC).strftime("%d%m%Y%H%M")
     kind = _SDF_TYPES[heights.dtype.name]
     with atomic_write(path, overwrite=overwrite) as file:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from gpuvision.host import (
     Device,
@@ -26,7 +27,7 @@ from gpuvision.host import (
     type_defines,
 )
 from gpuvision.operation import VisionOperation
-from gpuvision.ranging.regrid import Grid, HeightMap
+from gpuvision.ranging.regrid import MAX_MAP_CELLS, Grid, HeightMap
 from gpuvision.status import Status
 from gpuvision.validation import finite
 
@@ -178,6 +179,7 @@ def merge_height_maps(
     tolerance: float = 0.0,
     disagreement: Disagreement = "drop",
     device: Device | None = None,
+    max_cells: int = MAX_MAP_CELLS,
 ) -> tuple[MergedHeights, Grid]:
     """Merge two height maps whose cells lie on one lattice.
 
@@ -190,6 +192,8 @@ def merge_height_maps(
         As for `MergeHeights`.
     device : Device, optional
         Default `Device.best`.
+    max_cells : int
+        Largest number of cells of the merged map, default 2^26.
 
     Returns
     -------
@@ -199,24 +203,51 @@ def merge_height_maps(
     Raises
     ------
     ValueError
-        The cells have different sizes, or the grids do not lie on one lattice.
+        The cells have different sizes, the grids do not lie on one lattice, or both maps together span more than
+        ``max_cells`` cells.
     """
-    grid, corners = _common_grid(first[1], second[1])
+    grid = _common_grid(first[1], second[1], max_cells)
     with_sigma = first[0].sigma is not None and second[0].sigma is not None
     operation = MergeHeights(max_sigmas=max_sigmas, tolerance=tolerance, disagreement=disagreement, sigma=with_sigma)
     dtype = np.result_type(*(to_numpy(each.z).dtype for each, _ in (first, second)))
     frames, sigmas = [], []
-    for (heights, _), corner in zip((first, second), corners, strict=True):
+    for heights, own in (first, second):
         for values, empty in ((heights.z, math.nan), (heights.intensity, math.nan), (heights.status, Status.NO_DATA)):
             kind = np.dtype(np.uint8) if values is heights.status else dtype
-            frames.append(_placed(to_numpy(values), grid, corner, empty, kind))
+            frames.append(_placed(to_numpy(values), own, grid, empty, kind))
         if with_sigma and heights.sigma is not None:
-            sigmas.append(_placed(to_numpy(heights.sigma), grid, corner, math.nan, dtype))
+            sigmas.append(_placed(to_numpy(heights.sigma), own, grid, math.nan, dtype))
     return operation(*frames, *sigmas, device=device), grid
 
 
-def _common_grid(first: Grid, second: Grid) -> tuple[Grid, tuple[tuple[int, int], tuple[int, int]]]:
-    """Return the grid that covers two grids, and the cell (row, column) in it of each grid's first cell."""
+def common_differences(
+    first: tuple[HeightMap, Grid], second: tuple[HeightMap, Grid], merged: MergedHeights, grid: Grid
+) -> npt.NDArray[np.float64]:
+    """Return the differences of two merged height maps in the cells in which both have a height.
+
+    Parameters
+    ----------
+    first, second : (HeightMap, Grid)
+        Maps with their grids.
+    merged, grid
+        Result of `merge_height_maps` for them.
+
+    Returns
+    -------
+    numpy.ndarray
+        Second minus first height [m], (cells,).
+    """
+    source = to_numpy(merged.source)
+    common = (source & (FIRST | SECOND) == FIRST | SECOND) | (source & DISAGREES != 0)
+    one, two = (
+        _placed(to_numpy(heights.z), own, grid, math.nan, np.dtype(np.float64))[common]
+        for heights, own in (first, second)
+    )
+    return np.asarray(two - one)
+
+
+def _common_grid(first: Grid, second: Grid, max_cells: int) -> Grid:
+    """Return the grid that covers two grids."""
     for name in ("cell_x", "cell_y"):
         sizes = getattr(first, name), getattr(second, name)
         if not math.isclose(*sizes, rel_tol=_SAME_LATTICE / max(first.columns, first.rows)):
@@ -232,19 +263,26 @@ def _common_grid(first: Grid, second: Grid) -> tuple[Grid, tuple[tuple[int, int]
         )
     column, row = int(whole[0]), int(whole[1])
     left, top = min(column, 0), min(row, 0)
-    grid = Grid(
+    columns = max(first.columns, column + second.columns) - left
+    rows = max(first.rows, row + second.rows) - top
+    if rows * columns > max_cells:
+        raise ValueError(
+            f"the two height maps together span {columns} x {rows} cells of {first.cell_x:g} m, expected at most "
+            f"{max_cells} cells; are both scans in one frame?"
+        )
+    return Grid(
         left=first.left + left * first.cell_x,
         top=first.top - top * first.cell_y,
         cell_x=first.cell_x,
         cell_y=first.cell_y,
-        columns=max(first.columns, column + second.columns) - left,
-        rows=max(first.rows, row + second.rows) - top,
+        columns=columns,
+        rows=rows,
     )
-    return grid, ((-top, -left), (row - top, column - left))
 
 
-def _placed(values: Any, grid: Grid, corner: tuple[int, int], empty: float, dtype: np.dtype[Any]) -> Any:
-    """Return an array over a larger grid, with ``empty`` in the other cells."""
+def _placed(values: Any, own: Grid, grid: Grid, empty: float, dtype: np.dtype[Any]) -> Any:
+    """Return an array over a larger grid on the same lattice, with ``empty`` in the other cells."""
     made = np.full(grid.shape, empty, dtype)
-    made[corner[0] : corner[0] + values.shape[0], corner[1] : corner[1] + values.shape[1]] = values
+    row, column = round((grid.top - own.top) / grid.cell_y), round((own.left - grid.left) / grid.cell_x)
+    made[row : row + own.rows, column : column + own.columns] = values
     return made

@@ -34,6 +34,8 @@ from gpuvision.validation import finite, integer
 R = TypeVar("R", bound=tuple[Any, ...])
 Direction = Literal["x", "-x", "y", "-y"]
 _DIRECTIONS = ("x", "-x", "y", "-y")
+MAX_MAP_CELLS = 1 << 26
+"""Largest number of cells of a height map. Chosen: bounds the memory, 256 MiB of float32 heights."""
 
 
 class HeightMap(NamedTuple):

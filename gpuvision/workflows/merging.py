@@ -26,6 +26,7 @@ from gpuvision.ranging.merge_heights import (
     SECOND,
     Disagreement,
     MergedHeights,
+    common_differences,
     merge_height_maps,
 )
 from gpuvision.ranging.regrid import Grid, HeightMap
@@ -56,7 +57,7 @@ class HeightMapMerge:
     grid : Grid
         Cells of the map.
     differences : numpy.ndarray
-        Second minus first height of the cells that both maps have [m].
+        Second minus first height [m] in the cells in which both maps have a height, see `common_differences`.
     settings : dict
         Parameters of the merge.
     """
@@ -138,6 +139,8 @@ class HeightMapMerge:
     def write(self, folder: str | Path, *, inputs: tuple[Path, ...] = (), overwrite: bool = False) -> None:
         """Write the merged map as TIFF, 16-bit PNG and NPZ, a picture and a report; after an error no file remains.
 
+        Without standard deviations ``range_image_sigma.tiff`` of an earlier merge is removed from the folder.
+
         Parameters
         ----------
         folder : str or Path
@@ -155,7 +158,7 @@ class HeightMapMerge:
             The folder cannot be written.
         """
         heights, grid = self.heights, self.grid
-        with Outputs("merge", inputs=inputs, overwrite=overwrite).folder(folder) as inside:
+        with Outputs("merge", inputs=inputs, overwrite=overwrite).folder(folder, optional=[SIGMA_FILE]) as inside:
             write_tiff(inside / "range_image.tiff", heights.z, grid)
             write_png16(inside / "range_image.png", heights.z, grid)
             held: dict[str, tuple[Any, str]] = {
@@ -249,18 +252,6 @@ def merge_scans(
         names=(str(first), str(second)),
         heights=merged,
         grid=grid,
-        differences=_differences(maps, grid),
+        differences=common_differences(*maps, merged, grid),
         settings={"max_sigmas": max_sigmas, "tolerance": tolerance, "disagreement": disagreement},
     )
-
-
-def _differences(maps: tuple[tuple[HeightMap, Grid], tuple[HeightMap, Grid]], grid: Grid) -> npt.NDArray[np.float64]:
-    """Return second minus first height of the cells that both maps have."""
-    placed = []
-    for heights, own in maps:
-        z = np.full(grid.shape, np.nan)
-        row, column = round((grid.top - own.top) / grid.cell_y), round((own.left - grid.left) / grid.cell_x)
-        z[row : row + own.rows, column : column + own.columns] = to_numpy(heights.z)
-        placed.append(z)
-    difference = placed[1] - placed[0]
-    return np.asarray(difference[np.isfinite(difference)])

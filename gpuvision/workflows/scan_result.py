@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
-from gpuvision.formats.surface_files import SURFACE_WRITERS, SurfaceFormat
+from gpuvision.formats.surface_files import SURFACE_WRITERS, SurfaceFormat, surface_problem
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
@@ -23,7 +23,7 @@ from gpuvision.host.report import StreamReport
 from gpuvision.plots.range_image import draw_height_map, draw_scan, height_span
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.range_image import RangePoints, RotatingSheet
-from gpuvision.ranging.regrid import Grid, HeightMap
+from gpuvision.ranging.regrid import MAX_MAP_CELLS, Grid, HeightMap
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.workflows.scan_errors import ScanErrors, error_budget
@@ -71,6 +71,9 @@ def surface_files(formats: Iterable[str]) -> dict[SurfaceFormat, str]:
     return names
 
 
+_OPTIONAL_FILES = (*SIGMA_FILES, *(f"range_image.{extension}" for extension, _ in SURFACE_WRITERS.values()))
+
+
 @dataclass(frozen=True, kw_only=True)
 class ScanLimits:
     """Limits of a scan.
@@ -80,11 +83,11 @@ class ScanLimits:
     max_delay : float
         Delay of a frame [s] from which on the summary says that the replay did not hold the requested rate. Chosen.
     max_cells : int
-        Largest number of cells of a height map. Chosen: bounds the memory, 256 MiB of float32 heights.
+        Largest number of cells of a height map, default `gpuvision.ranging.regrid.MAX_MAP_CELLS`, 2^26.
     """
 
     max_delay: float = 0.01
-    max_cells: int = 1 << 26
+    max_cells: int = MAX_MAP_CELLS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,6 +213,15 @@ class Scan:
             "error_budget": self.error_budget(),
         }
 
+    def surface_problems(self, folder: str | Path, formats: Iterable[str]) -> dict[SurfaceFormat, str]:
+        """Return a message for each format that cannot hold the height map; parameters as for `write`."""
+        problems = {each: (name, surface_problem(each, self.grid)) for each, name in surface_files(formats).items()}
+        return {
+            each: f"cannot write {Path(folder) / name}: {problem}; leave out --format {each} (Python: formats)"
+            for each, (name, problem) in problems.items()
+            if problem is not None
+        }
+
     def write(
         self,
         folder: str | Path,
@@ -226,6 +238,9 @@ class Scan:
         covariance of a calibration ``range_image_systematic.tiff`` holds the systematic one. The PLY and NPZ files have
         those of the points, ``sigma_x`` and ``systematic_x`` and so on.
 
+        Files of an earlier scan for a standard deviation or a format that this scan does not have are removed, if they
+        were not changed since.
+
         Parameters
         ----------
         folder : str or Path
@@ -240,11 +255,18 @@ class Scan:
         Raises
         ------
         FileExistsError
-            A file exists, and is not an unchanged output of an earlier scan; see `gpuvision.host.outputs`.
+            A file exists, and is not an unchanged output of an earlier scan, or is a file that the sensor file names;
+            see `gpuvision.host.outputs`.
         OSError
             The folder cannot be written.
+        ValueError
+            A format cannot hold the height map, see `surface_problems`; no file is written.
         """
-        with Outputs("scan", overwrite=overwrite).folder(folder) as inside:
+        names = surface_files(formats)
+        if problems := self.surface_problems(folder, names):
+            raise ValueError("; ".join(problems.values()))
+        outputs = Outputs("scan", inputs=self.sensor.files, overwrite=overwrite)
+        with outputs.folder(folder, optional=_OPTIONAL_FILES) as inside:
             start = time.perf_counter()
             z, points = self.heights.z, self.points
             write_tiff(inside / "range_image.tiff", z, self.grid)
@@ -267,7 +289,7 @@ class Scan:
                     self.grid,
                     quantity="systematic sigma of height",
                 )
-            for each, name in surface_files(formats).items():
+            for each, name in names.items():
                 SURFACE_WRITERS[each][1](inside / name, z, self.grid)
             write_npz(inside / "range_image.npz", *self._arrays())
             # One colour scale: the two pictures show the same heights.

@@ -172,6 +172,17 @@ def test_maps_over_different_grids(device: Device) -> None:
     assert without.sigma is None
 
 
+def test_maps_of_two_frames_are_refused_before_they_are_allocated() -> None:
+    grid = Grid(left=0.0, top=0.0, cell_x=1e-5, cell_y=1e-5, columns=3, rows=3)
+    far = Grid(left=1.0, top=1.0, cell_x=1e-5, cell_y=1e-5, columns=3, rows=3)
+    z = np.zeros((3, 3))
+    message = r"span 100003 x 100003 cells of 1e-05 m, expected at most 67108864 cells; are both scans in one frame\?$"
+    with pytest.raises(ValueError, match=message):
+        merge_height_maps((height_map(z), grid), (height_map(z), far))
+    with pytest.raises(ValueError, match="span 3 x 3 cells"):
+        merge_height_maps((height_map(z), grid), (height_map(z), grid), max_cells=8)
+
+
 def test_grids_off_the_lattice_are_refused() -> None:
     grid = Grid(left=0.0, top=0.0, cell_x=1e-3, cell_y=1e-3, columns=3, rows=3)
     wider = Grid(left=0.0, top=0.0, cell_x=2e-3, cell_y=1e-3, columns=3, rows=3)

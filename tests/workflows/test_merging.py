@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -113,6 +114,28 @@ def test_an_offset_of_the_frames_is_said(rng: np.random.Generator, tmp_path: Pat
     assert "disagree in 100 % of their common cells" in " ".join(err.split())
     found = merge_scans(tmp_path / "first", tmp_path / "second", tolerance=5e-5)
     assert found.counts()["disagrees"] == 0
+
+
+def test_common_cells_are_those_of_the_merge(rng: np.random.Generator, tmp_path: Path) -> None:
+    """A finite height with a flag that no height has, or without a valid sigma, is not common to both maps."""
+    z = step(rng, slice(0, 0))
+    first, second = write_scan(tmp_path / "first", z), write_scan(tmp_path / "second", z[:, 10:], left=10 * CELL)
+    arrays, units = read_npz(second / "range_image.npz")
+    arrays["map_z"][3:5] += np.float32(1.0)
+    arrays["map_status"][3] = Status.OUT_OF_RANGE
+    arrays["map_sigma"][4] = 0.0
+    write_npz(second / "range_image.npz", arrays, units, overwrite=True)
+    found = merge_scans(first, second)
+    assert found.counts()["common"] == found.counts()["both"] == 38 * 50
+    np.testing.assert_array_equal(found.differences, 0.0)
+
+
+def test_files_of_sigma_do_not_outlive_their_merge(scans: tuple[Path, Path], tmp_path: Path) -> None:
+    merged = merge_scans(*scans)
+    merged.write(tmp_path / "out")
+    assert (tmp_path / "out" / SIGMA_FILE).exists()
+    dataclasses.replace(merged, heights=merged.heights._replace(sigma=None)).write(tmp_path / "out")
+    assert not (tmp_path / "out" / SIGMA_FILE).exists()
 
 
 def test_heights_without_sigma_need_a_tolerance(rng: np.random.Generator, tmp_path: Path) -> None:

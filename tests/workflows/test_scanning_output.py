@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,10 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gpuvision.formats import surface_files as surfaces
 from gpuvision.formats.range_image import read_ply, read_tiff
 from gpuvision.host.files import atomic_folder, check_writable_file, check_writable_folder
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.workflows.scan_result import surface_files
+from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES, surface_files
 from gpuvision.workflows.scanning import scan
 from scanning import Ran, check_refused, currents
 
@@ -43,6 +46,10 @@ def shut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
     monkeypatch.setattr(Path, "mkdir", refuse)
     return folder
+
+
+def visible(folder: Path) -> list[Path]:
+    return [each for each in folder.iterdir() if not each.name.startswith(".")]
 
 
 def all_of(folder: Path) -> dict[str, str | None]:
@@ -124,6 +131,38 @@ def test_a_scan_also_writes_surface_files_and_a_ply_of_valid_points(plane: Path,
         assert shape == heights.z.shape[::-1]
     assert all(np.isfinite(read_ply(out / "range_image.ply")["z"]))
     assert run("scan", plane, "--sensor", "psd_line", "--out", out, *formats).code == 0  # its own files, replaced
+
+
+def test_a_format_that_cannot_hold_the_map_costs_no_other_file(
+    plane: Path, tmp_path: Path, run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The number of rows is known only after the scan."""
+    monkeypatch.setattr(surfaces, "_MAX_SDF_POINTS", 5)
+    out, report = tmp_path / "out", tmp_path / "report.json"
+    formats = ("--format", "sdf", "--format", "x3p", "--json", report)
+    ran = run("scan", plane, "--sensor", "psd_line", "--out", out, *formats)
+    assert ran.code == 1
+    said = rf"gpuvision: cannot write {out}/range_image\.sdf: the height map has \d+ columns and \d+ rows, an SDF file"
+    assert re.fullmatch(rf"{said} holds at most 5 a side; leave out --format sdf .*all other files.*\n", ran.err)
+    assert {*SCAN_FILES, *SIGMA_FILES[:1], "range_image.x3p"} == {each.name for each in visible(out)}
+    assert report.exists()
+    with pytest.raises(ValueError, match=r"range_image\.sdf: the height map has .*leave out --format sdf-ascii"):
+        scan(currents(4), Sensor.load("psd_line")).write(tmp_path / "other", formats=["sdf-ascii"])
+    assert not (tmp_path / "other").exists()
+
+
+def test_optional_files_do_not_outlive_their_scan(tmp_path: Path) -> None:
+    """A scan with other formats and without noise removes its earlier files alone, if they are unchanged."""
+    done = scan(currents(4), Sensor.load("psd_line"))
+    bare = dataclasses.replace(done, errors=None, heights=done.heights._replace(sigma=None))
+    for out in (tmp_path / "out", tmp_path / "edited"):
+        done.write(out, formats=["x3p", "sur"])
+    (tmp_path / "edited" / "range_image.x3p").write_text("a user's")
+    (tmp_path / "out" / "range_image.sdf").write_text("a user's")
+    bare.write(tmp_path / "out", formats=["sur"])
+    assert {each.name for each in visible(tmp_path / "out")} == {*SCAN_FILES, "range_image.sur", "range_image.sdf"}
+    bare.write(tmp_path / "edited")
+    assert {each.name for each in visible(tmp_path / "edited")} == {*SCAN_FILES, "range_image.x3p"}
 
 
 def test_two_formats_of_one_file_are_refused(plane: Path, tmp_path: Path, run: Any) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -91,6 +92,22 @@ def write_report(path: Path | None, report: object, outputs: Outputs) -> None:
         typer.echo(text, nl=False)
     else:
         outputs.write_text(path, text)
+
+
+@contextlib.contextmanager
+def progress_bar(description: str) -> Iterator[Callable[[int, int | None], object]]:
+    """Show a progress bar on stderr if it is a terminal; yield a function (done, total) that updates it."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from gpuvision.host.text import printable
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(escape(printable(description)), total=None)
+        yield lambda done, of: bar.update(task, completed=done, total=of)
 
 
 def reject_unused(reason: str, **given: object) -> None:

@@ -19,6 +19,7 @@ from gpuvision.cli.arguments import (
     echo,
     named_path,
     prints_report,
+    progress_bar,
     reject_unused,
     write_report,
 )
@@ -37,7 +38,6 @@ from gpuvision.cli.calibrate_sensor import (
     TransportFolder,
     calibrate_sensor,
 )
-from gpuvision.cli.scan import progress_bar
 
 if TYPE_CHECKING:
     from gpuvision.camera.calibration import Calibration

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from gpuvision.cli.arguments import echo, named_path, prints_report, quantities, write_report
-from gpuvision.cli.scan import progress_bar
+from gpuvision.cli.arguments import echo, named_path, prints_report, progress_bar, quantities, write_report
 
 if TYPE_CHECKING:
     from gpuvision.camera.calibration import Calibration

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, Overwrite, echo, named_path
+from gpuvision.cli.arguments import DeviceLabel, Overwrite, echo, named_path, progress_bar
 
 
 def demo(
@@ -28,7 +28,6 @@ def demo(
     import numpy as np
     from trimesh.exchange.ply import export_ply
 
-    from gpuvision.cli.scan import progress_bar
     from gpuvision.host import Device
     from gpuvision.host.files import atomic_write, write_text_atomic
     from gpuvision.host.outputs import Outputs

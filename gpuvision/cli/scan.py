@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,6 +17,7 @@ from gpuvision.cli.arguments import (
     echo,
     named_path,
     prints_report,
+    progress_bar,
     reject_unused,
     write_report,
 )
@@ -150,11 +150,7 @@ def scan(
     from gpuvision.workflows.scanning import scan as run
 
     described = Sensor.load(sensor)
-    inputs: list[str | Path] = [recording, sensor]
-    if isinstance(described.recording.background, Path):
-        inputs.append(described.recording.background)
-    if described.encoder is not None:
-        inputs.append(described.encoder.file)
+    inputs: list[str | Path] = [recording, sensor, *described.files]
     if preview:
         reject_unused(
             "with --preview",
@@ -189,13 +185,18 @@ def scan(
             overwrite=overwrite,
             progress=progress,
         )
-    done.write(out, formats=chosen_formats, ply_points=ply.value, overwrite=overwrite)
+    # The size of the height map is known only now: write the other files before the error.
+    problems = done.surface_problems(out, chosen_formats)
+    possible = [each for each in chosen_formats if each not in problems]
+    done.write(out, formats=possible, ply_points=ply.value, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
     for advice in done.advice():
         echo(f"warning: {advice}", err=True)
     lines = (done.summary(), budget_line(done.error_budget()))
     look = f"look at {out / 'picture.png'} and {out / 'report.json'}"
     echo("\n".join([*filter(None, lines), look]), err=prints_report(as_json))
+    if problems:
+        raise ValueError(f"{'; '.join(problems.values())}; all other files are written")
 
 
 def _write_preview(
@@ -210,19 +211,3 @@ def _write_preview(
     found = preview_scan(recording, sensor, device=None if device is None else Device.named(device))
     found.write(out, overwrite=overwrite)
     echo(f"{found.summary()}\nlook at {out / PREVIEW_FILE}")
-
-
-@contextlib.contextmanager
-def progress_bar(description: str) -> Iterator[Callable[[int, int | None], object]]:
-    """Show a progress bar on stderr if it is a terminal; yield a function (done, total) that updates it."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from gpuvision.host.text import printable
-
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(escape(printable(description)), total=None)
-        yield lambda done, of: bar.update(task, completed=done, total=of)

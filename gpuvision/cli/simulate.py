@@ -15,10 +15,10 @@ from gpuvision.cli.arguments import (
     echo,
     named_path,
     prints_report,
+    progress_bar,
     reject_unused,
     write_report,
 )
-from gpuvision.cli.scan import progress_bar
 
 if TYPE_CHECKING:
     from gpuvision.sensor.sensor import Sensor
@@ -169,6 +169,7 @@ def simulate(
     described = Sensor.load(sensor)
     second_sensor = None if second is None else Sensor.load(second)
     read = [each for each in (part, sensor, second, materials, mask) if each is not None]
+    read += [*described.files, *(() if second_sensor is None else second_sensor.files)]
     outputs = Outputs("simulate", inputs=read, overwrite=overwrite)
     has_mask = mask == "best"
     names_out = simulation_files(has_mask=has_mask) + (() if second is None else pair_files(has_mask=has_mask))

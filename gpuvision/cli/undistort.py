@@ -9,8 +9,7 @@ from typing import Annotated
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, Overwrite, echo, named_path, reject_unused
-from gpuvision.cli.scan import progress_bar
+from gpuvision.cli.arguments import DeviceLabel, Overwrite, echo, named_path, progress_bar, reject_unused
 
 
 class Interpolation(StrEnum):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -208,6 +209,48 @@ def test_a_report_does_not_replace_an_input(
     np.save("in.npy", np.zeros((9, 2), np.float32))
     before = contents(tmp_path)
     with pytest.raises(FileExistsError, match=r"cannot write in.npy: it is the input in.npy"):
+        run(*arguments, "--overwrite")
+    assert contents(tmp_path) == before
+
+
+def sensor_with_files(folder: Path, lens_file: str) -> None:
+    """Write the sensor file s.toml, which names a lens file, an encoder file and a background image."""
+    text = resources.files("gpuvision").joinpath("presets", "sensors", "camera_line.toml").read_text(encoding="utf-8")
+    head, tail = text.split("[lens]")
+    tail = tail[tail.index("[triangulation]") :].replace(
+        "step = 0.25e-3 ", 'encoder = "e.csv"\nmetres_per_count = 1e-6'
+    )
+    head = head.replace("[recording]", '[recording]\nbackground = "dark.png"').replace("pitch = -1.0", "pitch = 1.0")
+    (folder / "s.toml").write_text(f'{head}[lens]\nfile = "{lens_file}"\n{tail}')
+    (folder / "e.csv").write_text("1\n2\n")
+    (folder / "dark.png").write_text("dark")
+    (folder / lens_file).parent.mkdir(exist_ok=True)
+    write_lens(folder / lens_file, LENS, {})
+
+
+FROM_FILE = ("--sensor", "s.toml", "--out", "o1")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "lens_file", "named"),
+    [
+        (("scan", "in.npy", *FROM_FILE, "--json", "cam.toml"), "cam.toml", "cam.toml"),
+        (("scan", "in.npy", *FROM_FILE, "--trace", "cam.toml"), "cam.toml", "cam.toml"),
+        (("scan", "in.npy", *FROM_FILE, "--json", "e.csv"), "cam.toml", "e.csv"),
+        (("scan", "in.npy", *FROM_FILE, "--json", "dark.png"), "cam.toml", "dark.png"),
+        (("scan", "in.npy", *FROM_FILE, "--preview"), "o1/preview.png", "o1/preview.png"),
+        (("simulate", "in.npy", *FROM_FILE, "--json", "cam.toml"), "cam.toml", "cam.toml"),
+        ((*SIMULATE, "--second", "s.toml", "--json", "cam.toml"), "cam.toml", "cam.toml"),
+    ],
+)
+def test_files_that_a_sensor_file_names_are_inputs(
+    arguments: tuple[str, ...], lens_file: str, named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("in.npy", np.zeros((2, 64, 480), np.uint8))
+    sensor_with_files(tmp_path, lens_file)
+    before = contents(tmp_path)
+    with pytest.raises(FileExistsError, match=rf"cannot write {named}: it is the input {named}"):
         run(*arguments, "--overwrite")
     assert contents(tmp_path) == before
 

@@ -17,6 +17,7 @@ from gpuvision.inspection.coverage import covered
 from gpuvision.inspection.deposits import Deposits, PasteSettings, measure_deposits
 from gpuvision.matching.artwork.shapes import Float64
 from gpuvision.ranging.regrid import Grid
+from gpuvision.validation import finite
 
 _CELLS_ACROSS = 4.0  # coarse cells across the median aperture. Chosen
 _MOST_COARSE = 1024  # coarse cells along a side. Chosen: a correlation takes 0.1 s
@@ -88,7 +89,7 @@ def align_apertures(
     initial : BoardPlacement
         Place where the search begins.
     search_range : tuple of float
-        Largest shift [m] of the centre of the apertures, and largest rotation [rad].
+        Largest shift [m] of the centre of the apertures, and largest rotation [rad]; a rotation above pi is pi.
 
     Returns
     -------
@@ -97,16 +98,21 @@ def align_apertures(
     Raises
     ------
     ValueError
-        Fewer than two deposits are found, or the height map shows no part of the pattern.
+        Fewer than two deposits are found, the height map shows no part of the pattern, or a number of the search range
+        is negative or not finite.
 
     Notes
     -----
     The common shift and rotation of all deposits is taken for the place of the board: a stencil that is misaligned as a
     whole is not visible in offsets about this fit.
     """
+    shift, turn = (
+        finite(each, f"the {name} of the search range", minimum=0.0)
+        for each, name in zip(search_range, ("shift", "rotation"), strict=True)
+    )
     middle = np.mean([each.centroid for each in apertures], axis=0)
     coarse, heights = _coarse_heights(np.asarray(z, np.float64), grid, apertures)
-    placement, best, second = _correlate(coarse, heights, apertures, middle, initial, search_range)
+    placement, best, second = _correlate(coarse, heights, apertures, middle, initial, (shift, min(turn, math.pi)))
     step = max(len(apertures) // _MOST_FITTED, 1)
     fitted = list(apertures)[::step]
     fit = None
@@ -187,34 +193,28 @@ def _correlate(
     columns = np.rint(fft.fftfreq(pad[1], 1 / pad[1])).astype(int)[None, :]
     allowed = np.hypot(rows * grid.cell_y, columns * grid.cell_x) <= shift + min(grid.cell_x, grid.cell_y) / 2
     allowed &= (np.abs(rows) < heights.shape[0]) & (np.abs(columns) < heights.shape[1])
-    maps: list[Float64] = []
-    places = []
+    # A map takes up to 34 MB: of all rotations only the map with the highest peak is kept.
+    score, best, place = -math.inf, np.empty(0), initial
     for each in turns:
         placement = _turned(initial, middle, float(each))
         pattern = _pattern(grid, apertures, placement)
         spread = float(np.sqrt(np.sum((pattern - pattern.mean()) ** 2)))
-        if not (spread > 0 and norm > 0):
-            maps.append(np.full(pad, -np.inf))
-        else:
+        if spread > 0 and norm > 0:
             found = fft.irfft2(spectrum * np.conj(fft.rfft2(pattern - pattern.mean(), pad)), pad)
-            maps.append(np.where(allowed, found / (spread * norm), -np.inf))
-        places.append(placement)
-    peaks = [int(np.argmax(each)) for each in maps]
-    scores = [each.flat[peak] for each, peak in zip(maps, peaks, strict=True)]
-    best = int(np.argmax(scores))
-    if not np.isfinite(scores[best]):
+            found = np.where(allowed, found / (spread * norm), -np.inf)
+            if (peak := float(found.max())) > score:
+                score, best, place = peak, found, placement
+    if not math.isfinite(score):
         raise ValueError("the height map shows no part of the paste pattern; give another initial pose")
-    row, column = np.unravel_index(peaks[best], pad)
+    row, column = np.unravel_index(int(np.argmax(best)), pad)
     row_shift, column_shift = int(rows[row, 0]), int(columns[0, column])
     away = math.sqrt(float(np.median([each.area for each in apertures]))) / 2
     near = np.hypot((rows - row_shift) * grid.cell_y, (columns - column_shift) * grid.cell_x) <= max(
         away, 2 * max(grid.cell_x, grid.cell_y)
     )
-    second = float(np.max(np.where(near, -np.inf, maps[best])))
-    placement = dataclasses.replace(
-        places[best], x=places[best].x + column_shift * grid.cell_x, y=places[best].y - row_shift * grid.cell_y
-    )
-    return placement, float(scores[best]), max(second, 0.0)
+    second = float(np.max(np.where(near, -np.inf, best)))
+    placement = dataclasses.replace(place, x=place.x + column_shift * grid.cell_x, y=place.y - row_shift * grid.cell_y)
+    return placement, score, max(second, 0.0)
 
 
 def _turned(placement: BoardPlacement, middle: Float64, turn: float) -> BoardPlacement:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from types import SimpleNamespace
 
 import numpy as np
@@ -97,3 +98,34 @@ def test_the_covariance_of_few_deposits_is_their_variance(rng, count):
         variances.append(np.diag(covariance))
     ratio = np.mean(variances, axis=0) / np.mean(np.square(errors), axis=0)
     assert np.all(np.abs(ratio - 1) < 0.3)  # 3 standard deviations of a variance of 250 draws
+
+
+def test_memory_does_not_grow_with_the_search_range(rng):
+    """A correlation map for each rotation would take 11 MB."""
+    grid = board_grid(200, 190, cell=15e-6)
+    apertures = [circle(str(k), (0.3e-3 + 0.5e-3 * k, 0.4e-3 * (k % 3 + 1)), 150e-6) for k in range(5)]
+    here = BoardPlacement(x=0.1e-3, y=0.1e-3, theta=0.0)
+    z = paste_map(grid, here, [(Cap(150e-6, 120e-6), tuple(each.centroid)) for each in apertures])
+    peaks = []
+    for turn in (0.0, 3.0):
+        tracemalloc.start()
+        found = align_apertures(z, grid, apertures, SETTINGS, initial=here, search_range=(0.1e-3, turn))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert abs(found.placement.theta) < 1e-3
+    assert peaks[1] < peaks[0] + 5e6
+
+
+def test_a_rotation_beyond_pi_is_pi(monkeypatch):
+    grid = board_grid(40, 40, cell=50e-6)
+    apertures = [circle(str(k), (0.4e-3 + 0.5e-3 * k, 0.4e-3 * (k % 3 + 1)), 150e-6) for k in range(3)]
+    here = BoardPlacement(x=0.1e-3, y=0.1e-3, theta=0.0)
+    z = paste_map(grid, here, [(Cap(150e-6, 120e-6), tuple(each.centroid)) for each in apertures])
+    ranges = []
+    spread = np.linspace
+    monkeypatch.setattr(np, "linspace", lambda *args: ranges.append(args[:2]) or spread(*args[:2], min(args[2], 999)))
+    align_apertures(z, grid, apertures, SETTINGS, initial=here, search_range=(0.1e-3, 1e6))
+    assert (-math.pi, math.pi) in ranges
+    for search_range in ((-1e-3, 0.1), (1e-3, -0.1), (math.inf, 0.1), (1e-3, math.nan)):
+        with pytest.raises(ValueError, match="of the search range"):
+            align_apertures(z, grid, apertures, SETTINGS, initial=here, search_range=search_range)

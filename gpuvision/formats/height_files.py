@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.formats.range_image import HeightFile, read_npz, read_png16, read_tiff
+from gpuvision.formats.range_image import HeightFile, read_npz, read_png16, read_tiff, states_grid
 from gpuvision.host.errors import ReadError
 from gpuvision.host.reading import check_pixels, reading
 from gpuvision.host.recordings import read_image
@@ -108,24 +108,45 @@ def read_heights(path: str | os.PathLike[str], scale: ImageScale | None = None) 
     if path.is_dir():
         raise ReadError(f"{path}: a folder, expected a file of heights")
     if scale is not None:
-        if ending in (".npz", ".csv"):
+        if ending in (".npz", ".csv") or states_grid(path):
             raise ValueError(f"{path}: the file states its scale; leave out the scale of images")
         return read_scaled_image(path, scale)
     if ending == ".npz":
-        return _scanned_map(path)
+        return scanned_map(read_npz(path)[0], path)
     found = {".csv": read_gocator, ".png": read_png16}.get(ending, read_tiff)(path)
     if found.grid is None:
         raise ReadError(f"{path}: states no grid; expected a height map with the size of its cells")
     return HeightMapFile(found.z, found.grid)
 
 
-def _scanned_map(path: Path) -> HeightMapFile:
-    """Return the height map of the NPZ file of a scan."""
-    arrays, _ = read_npz(path)
+def scanned_map(arrays: Mapping[str, npt.NDArray[Any]], path: Path) -> HeightMapFile:
+    """Return the height map of the arrays in the NPZ file of a scan.
+
+    Parameters
+    ----------
+    arrays : mapping of str to numpy.ndarray
+        Arrays of `read_npz`.
+    path : Path
+        File of the arrays, for messages.
+
+    Raises
+    ------
+    ReadError
+        An array of the map is missing, has another shape or no numbers, or the positions are not evenly spaced.
+    """
     with reading(path, "NPZ file of a scan"):
         x, y, z = (arrays[name] for name in ("map_x", "map_y", "map_z"))
         sigma = arrays.get("map_sigma")
-        if z.ndim != 2 or z.shape != (len(y), len(x)) or (sigma is not None and sigma.shape != z.shape):
+        for name in ("map_x", "map_y", "map_z", "map_sigma"):
+            if name in arrays and arrays[name].dtype.kind not in "iuf":
+                raise ReadError(f"{path}: {name} has the type {arrays[name].dtype}, expected real numbers")
+        if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
+            raise ReadError(f"{path}: a position of map_x or map_y is not a finite number; expected metres")
+        if (
+            (x.ndim, y.ndim, z.ndim) != (1, 1, 2)
+            or z.shape != (len(y), len(x))
+            or (sigma is not None and sigma.shape != z.shape)
+        ):
             raise ReadError(f"{path}: map_z has shape {z.shape}, expected one row per map_y and one column per map_x")
         return HeightMapFile(z, _even_grid(x.astype(np.float64), y.astype(np.float64), path), sigma)
 
@@ -178,8 +199,8 @@ def read_gocator(path: str | os.PathLike[str]) -> HeightFile:
     Raises
     ------
     ReadError
-        The file has no such section, or its rows differ in length, or the positions are not evenly spaced, or the map
-        has more cells than `gpuvision.host.reading.MAX_PIXELS`.
+        The file has no such section, or the section does not end with ``End``, or its rows differ in length, or the
+        positions are not evenly spaced, or the map has more cells than `gpuvision.host.reading.MAX_PIXELS`.
 
     References
     ----------
@@ -213,18 +234,19 @@ def _rows(path: Path) -> Iterator[list[str]]:
                 yield cells
 
 
-def _section(rows: Iterator[list[str]]) -> Iterator[list[str]]:
-    """Yield the rows of a section, without its two rows of attributes."""
+def _section(rows: Iterator[list[str]], path: Path) -> Iterator[list[str]]:
+    """Yield the rows of a section, without its two rows of attributes, and check that the section ends."""
     next(rows, None), next(rows, None)
     for row in rows:
         if row[0] == _END:
             return
         yield row
+    raise ReadError(f"{path}: the section of heights does not end with {_END}; the file was cut")
 
 
 def _surface(rows: Iterator[list[str]], path: Path) -> tuple[Float64, Float64, Float64]:
     """Return x, y and heights [mm] of the rows of a surface; the first row holds x, the first column y."""
-    section = _section(rows)
+    section = _section(rows, path)
     x = _numbers(next(section, []), 1)
     table = [(_numbers(row[:1], 0)[0], _heights(row, 1, len(x), path)) for row in _limited(section, len(x), path)]
     return _table(x, table, path)
@@ -232,7 +254,7 @@ def _surface(rows: Iterator[list[str]], path: Path) -> tuple[Float64, Float64, F
 
 def _profiles(rows: Iterator[list[str]], path: Path) -> tuple[Float64, Float64, Float64]:
     """Return x, y and heights [mm] of the rows of profiles whose column ``Axis`` is Z."""
-    section = _section(rows)
+    section = _section(rows, path)
     header = next(section, [])
     if "Axis" not in header or "Y" not in header:
         raise ReadError(f"{path}: its section Profile has no columns Y and Axis; expected the CSV export of a Gocator")

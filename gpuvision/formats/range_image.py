@@ -11,6 +11,7 @@ NPZ         all arrays, and their units as JSON
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -39,6 +40,8 @@ _CENTIMETRE = 0.01  # [m]: the resolution tags count cells per centimetre
 _MAX_CODE = 65535
 _MIN_SCALE = 1e-9  # m per code, if all heights are equal
 _PNG_HEAD = 8 + 25  # signature and IHDR
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # both byte orders; + is BigTIFF
 _PLY_TYPES = {"float32": "float", "float64": "double", "uint8": "uchar", "uint16": "ushort", "uint32": "uint"}
 _PLY_DTYPES = {name: np.dtype(dtype).newbyteorder("<") for dtype, name in _PLY_TYPES.items()}
 _UNITS_KEY = "units"
@@ -161,13 +164,20 @@ def read_tiff(path: str | os.PathLike[str]) -> HeightFile:
     Raises
     ------
     ReadError
-        The file is not such a TIFF file, or has more pixels than `gpuvision.host.reading.MAX_PIXELS`.
+        The file is not such a TIFF file, holds another quantity than heights, or has more pixels than
+        `gpuvision.host.reading.MAX_PIXELS`.
     """
     with reading(path, "TIFF file of heights"), tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
         check_tiff_page(page, str(path))
         z = page.asarray()
-        return HeightFile(z, _grid_of(json.loads(page.description), z.shape))
+        description = json.loads(page.description)
+        quantity = description.get("quantity", "height")
+        if quantity != "height":
+            raise ReadError(f"{path}: its values are the {quantity}, expected heights")
+        if z.ndim != 2 or z.dtype.kind not in "iuf":
+            raise ReadError(f"{path}: an image of shape {z.shape} and type {z.dtype}, expected heights (rows, columns)")
+        return HeightFile(z, _grid_of(description, z.shape))
 
 
 # ---- 16-bit PNG ------------------------------------------------------------------------------------------------
@@ -263,6 +273,30 @@ def read_png16(path: str | os.PathLike[str]) -> HeightFile:
             raise ReadError(f"{path} is no 16-bit PNG with Offset and Scale; expected one that write_png16 wrote")
         z = float(text["Offset"]) + float(text["Scale"]) * (codes.astype(np.float64) - 1)
         return HeightFile(np.where(codes == 0, np.nan, z), _grid_of(text, z.shape))
+
+
+def states_grid(path: str | os.PathLike[str]) -> bool:
+    """Return whether a TIFF or PNG file states the grid of its heights, as `write_tiff` and `write_png16` do.
+
+    Raises
+    ------
+    ReadError
+        The file is a damaged TIFF or PNG file.
+    OSError
+        The file cannot be read.
+    """
+    path = Path(path)
+    with path.open("rb") as file:
+        head = file.read(len(_PNG_SIGNATURE))
+    table: Any = None
+    with reading(path, "image"):
+        if head == _PNG_SIGNATURE:
+            table = _text_chunks(path.read_bytes())
+        elif head[:4] in _TIFF_SIGNATURES:
+            with tifffile.TiffFile(path) as tiff, contextlib.suppress(ValueError):
+                page: Any = tiff.pages[0]
+                table = json.loads(page.description)
+    return isinstance(table, dict) and all(key in table for key in _GRID_KEYS)
 
 
 # ---- PLY -------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.formats.height_files import read_heights
+from gpuvision.formats.height_files import read_heights, scanned_map
 from gpuvision.formats.range_image import read_npz, write_npz, write_png16, write_tiff
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.errors import ReadError
@@ -124,9 +124,11 @@ class HeightMapMerge:
             "gpuvision": version("gpuvision"),
             "first": self.names[0],
             "second": self.names[1],
-            **self.settings,
+            "max_sigmas": self.settings["max_sigmas"],
+            "tolerance_m": self.settings["tolerance"],
+            "disagreement": self.settings["disagreement"],
             "cells": self.counts(),
-            "difference": {"median": middle, "robust_sigma": spread},
+            "difference": {"median_m": middle, "robust_sigma_m": spread},
             "weights": "equal" if self.heights.sigma is None else "inverse variance",
             "map": dataclasses.asdict(self.grid),
             "warnings": list(self.advice()),
@@ -170,7 +172,7 @@ class HeightMapMerge:
                 "map_source": (heights.source, "flags: 1 first, 2 second, 4 disagree"),
             }
             if heights.sigma is not None:
-                write_tiff(inside / SIGMA_FILE, heights.sigma, grid)
+                write_tiff(inside / SIGMA_FILE, heights.sigma, grid, quantity="random sigma of height")
                 held["map_sigma"] = (heights.sigma, "m")
             arrays, units = ({name: each[part] for name, each in held.items()} for part in (0, 1))
             write_npz(inside / "range_image.npz", arrays, units)
@@ -204,8 +206,12 @@ def read_height_map(path: str | Path) -> tuple[HeightMap, Grid]:
     file = height_map_file(path)
     if not file.exists():
         raise FileNotFoundError(f"{file}: no such file")
-    z, grid, sigma = read_heights(file)
     arrays = read_npz(file)[0] if file.suffix.lower() == ".npz" else {}
+    z, grid, sigma = scanned_map(arrays, file) if arrays else read_heights(file)
+    for name, kinds in (("map_status", "iu"), ("map_intensity", "iuf")):
+        if name in arrays and arrays[name].dtype.kind not in kinds:
+            expected = "real numbers" if "f" in kinds else "integers"
+            raise ReadError(f"{file}: {name} has the type {arrays[name].dtype}, expected {expected}")
     for name in ("map_status", "map_intensity"):
         if name in arrays and arrays[name].shape != z.shape:
             raise ReadError(f"{file}: {name} has shape {arrays[name].shape}, expected {z.shape} as map_z")

@@ -5,9 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from gpuvision.formats.height_files import ImageScale, read_gocator, read_heights
-from gpuvision.formats.range_image import write_npz, write_png16, write_tiff
+from gpuvision.formats.range_image import read_tiff, write_npz, write_png16, write_tiff
 from gpuvision.ranging.regrid import Grid
 
 GRID = Grid(left=-2e-3, top=5e-3, cell_x=20e-6, cell_y=30e-6, columns=4, rows=3)
@@ -82,6 +83,8 @@ def test_profiles_of_a_gocator_without_their_intensity(write):
         ("-1.980", "left", "not a readable CSV file of a Gocator: could not convert string to float: 'left'"),
         ("4.970,", "nan,", "a position is not a finite number"),
         ("Y,-2.000,-1.980,-1.960,-1.940\n", "End\n", "0 rows of 0 heights, expected a height map"),
+        ("5.000,0.210,0.220,0.230,-0.240\nEnd\n", "", "does not end with End; the file was cut"),
+        (",-0.240\nEnd\n", "", "does not end with End; the file was cut"),
     ],
 )
 def test_damaged_gocator_files_are_refused(write, old, new, message):
@@ -139,3 +142,43 @@ def test_the_files_of_a_scan(tmp_path, rng):
         read_heights(tmp_path / "map.npz", ImageScale(cell_x=1.0, cell_y=1.0, step=1.0))
     with pytest.raises(ValueError, match="a folder"):
         read_heights(tmp_path)
+
+
+def test_a_scale_for_a_file_with_a_grid_is_refused(tmp_path, rng):
+    scale = ImageScale(cell_x=1.0, cell_y=1.0, step=5.0)
+    for name, write in (("map.tiff", write_tiff), ("map.png", write_png16)):
+        write(tmp_path / name, rng.normal(size=GRID.shape), GRID)
+        with pytest.raises(ValueError, match=rf"{name}: the file states its scale"):
+            read_heights(tmp_path / name, scale)
+    tifffile.imwrite(tmp_path / "levels.tiff", np.arange(12, dtype=np.uint16).reshape(3, 4), description="a camera")
+    assert np.nanmax(read_heights(tmp_path / "levels.tiff", scale).z) == 55.0
+
+
+def test_a_tiff_of_another_quantity_is_refused(tmp_path, rng):
+    write_tiff(tmp_path / "sigma.tiff", rng.normal(size=GRID.shape), GRID, quantity="random sigma of height")
+    with pytest.raises(ValueError, match=r"sigma\.tiff: its values are the random sigma of height, expected heights"):
+        read_heights(tmp_path / "sigma.tiff")
+    tifffile.imwrite(tmp_path / "colour.tiff", np.zeros((3, 4, 3), np.uint8), photometric="rgb", description="{}")
+    with pytest.raises(ValueError, match=r"colour\.tiff: an image of shape \(3, 4, 3\)"):
+        read_tiff(tmp_path / "colour.tiff")
+    tifffile.imwrite(tmp_path / "complex.tiff", np.zeros((3, 4), np.complex64), description="{}")
+    with pytest.raises(ValueError, match=r"complex\.tiff: an image of shape \(3, 4\) and type complex64"):
+        read_tiff(tmp_path / "complex.tiff")
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"map_x": np.full(4, np.nan)}, "a position of map_x or map_y is not a finite number"),
+        ({"map_y": np.full(3, np.inf)}, "a position of map_x or map_y is not a finite number"),
+        ({"map_x": np.zeros((4, 1))}, "map_z has shape"),
+        ({"map_z": np.full(GRID.shape, "high")}, "map_z has the type <U4, expected real numbers"),
+        ({"map_z": np.zeros(GRID.shape, complex)}, "map_z has the type complex128, expected real numbers"),
+        ({"map_sigma": np.zeros(GRID.shape, bool)}, "map_sigma has the type bool, expected real numbers"),
+    ],
+)
+def test_a_bad_npz_of_a_scan_is_refused(tmp_path, bad, message):
+    held = {"map_x": GRID.x, "map_y": GRID.y, "map_z": np.zeros(GRID.shape)} | bad
+    write_npz(tmp_path / "bad.npz", held, dict.fromkeys(held, "m"))
+    with pytest.raises(ValueError, match=rf"bad\.npz: {message}"):
+        read_heights(tmp_path / "bad.npz")

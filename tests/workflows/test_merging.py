@@ -96,6 +96,10 @@ def test_occlusion_is_filled_and_disagreement_flagged(scans: tuple[Path, Path], 
     np.testing.assert_array_equal(read_tiff(out / "range_image.tiff").z, arrays["map_z"])
     report = json.loads((out / "report.json").read_text())
     assert report["weights"] == "inverse variance"
+    assert report["tolerance_m"] == 0.0
+    assert abs(report["difference"]["median_m"]) < 1e-6 < report["difference"]["robust_sigma_m"]
+    with pytest.raises(ReadError, match="its values are the random sigma of height"):
+        read_tiff(out / SIGMA_FILE)
     assert report["cells"]["second"] == np.count_nonzero(source == SECOND)
     assert report["cells"]["disagrees"] == np.count_nonzero(source & DISAGREES)
     assert "from the second alone" in text
@@ -160,6 +164,10 @@ def test_wrong_files_are_refused(rng: np.random.Generator, tmp_path: Path) -> No
     write_npz(tmp_path / "cut.npz", {**arrays, "map_x": arrays["map_x"][:-1]}, units)
     with pytest.raises(ReadError, match="map_z has shape"):
         merge_scans(scan, tmp_path / "cut.npz")
+    for name, expected in (("map_status", "integers"), ("map_intensity", "real numbers")):
+        write_npz(tmp_path / "text.npz", {**arrays, name: np.full(arrays["map_z"].shape, "bad")}, units, overwrite=True)
+        with pytest.raises(ReadError, match=rf"text\.npz: {name} has the type <U3, expected {expected}"):
+            merge_scans(scan, tmp_path / "text.npz")
     write_tiff(tmp_path / "bare.tiff", np.zeros((4, 4)))
     with pytest.raises(ReadError, match="states no grid"):
         merge_scans(scan, tmp_path / "bare.tiff", tolerance=1e-6)
@@ -171,3 +179,10 @@ def test_inputs_are_not_replaced(scans: tuple[Path, Path], run: Run) -> None:
     assert code == 1
     assert "range_image.npz" in err
     assert (scans[0] / "range_image.npz").read_bytes() == before
+
+
+def test_an_npz_is_read_once(scans: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    read, load = [], np.load
+    monkeypatch.setattr(np, "load", lambda path, **options: read.append(path) or load(path, **options))
+    assert read_height_map(scans[0])[0].sigma is not None
+    assert read == [scans[0] / "range_image.npz"]

@@ -35,10 +35,12 @@ def read_leads(path: str | os.PathLike[str]) -> tuple[Aperture, ...]:
     Raises
     ------
     ReadError
-        The file has another header, a row has no finite numbers or sides above 0, or there are more than `MAX_LEADS`.
+        The file has another header, a row has no finite numbers or sides above 0, two rows have one name, or there are
+        more than `MAX_LEADS`.
     """
     path = Path(path)
     regions: list[Aperture] = []
+    lines: dict[str, int] = {}  # line number of each name
     with reading(path, "CSV file of leads"), path.open(newline="", encoding="utf-8-sig") as file:
         header = [each.strip() for each in file.readline(_LONGEST_LINE).split(",")]
         if tuple(header[:5]) != _COLUMNS or header[5:] not in ([], ["angle"]):
@@ -53,10 +55,13 @@ def read_leads(path: str | os.PathLike[str]) -> tuple[Aperture, ...]:
             turn = angle[0] if angle else 0.0
             if not all(map(math.isfinite, (x, y, turn, width, height))) or not (width > 0 and height > 0):
                 raise ReadError(f"{path}: line {number}: expected finite numbers and sides above 0 [m]")
+            name = row[0].strip() or str(number - 1)
+            if lines.setdefault(name, number) != number:
+                raise ReadError(f"{path}: line {number}: the name {name!r} is that of line {lines[name]}; give another")
             cos, sin = math.cos(turn), math.sin(turn)
             corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array([width, height]) / 2
             outline = corners @ np.array([[cos, sin], [-sin, cos]]) + np.array([x, y])
-            regions.append(make_aperture(row[0].strip() or str(number - 1), [Shape(outline)]))
+            regions.append(make_aperture(name, [Shape(outline)]))
     if not regions:
         raise ReadError(f"{path}: no lead; expected one line for each lead")
     return tuple(regions)

@@ -27,6 +27,8 @@ def test_rectangles_with_and_without_an_angle(tmp_path):
         ("name,x,y,width,height\nA,1,2,3\n", "line 2 has 4 cells, expected 5"),
         ("name,x,y,width,height\nA,1,2,3,0\n", "line 2: expected finite numbers and sides above 0"),
         ("name,x,y,width,height\nA,1,nan,3,1\n", "line 2: expected finite numbers"),
+        ("name,x,y,width,height\nA,1,2,3,1\nA,4,2,3,1\n", "line 3: the name 'A' is that of line 2"),
+        ("name,x,y,width,height\n2,1,2,3,1\n,4,2,3,1\n", "line 3: the name '2' is that of line 2"),
         ("name,x,y,width,height\nA,1,two,3,1\n", "not a readable CSV file of leads: could not convert"),
     ],
 )
@@ -41,6 +43,6 @@ def test_damaged_files_are_refused(tmp_path, text, message):
 def test_too_many_leads_are_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("GPUVISION_MAX_LEADS", "2")
     path = tmp_path / "leads.csv"
-    path.write_text("name,x,y,width,height\n" + "A,1,2,3,4\n" * 3)
+    path.write_text("name,x,y,width,height\n" + ",1,2,3,4\n" * 3)
     with pytest.raises(ValueError, match="3 leads or more, expected at most 2"):
         read_leads(path)

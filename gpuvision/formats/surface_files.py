@@ -39,6 +39,8 @@ _SUR_HOLE = -2  # added to the smallest integer (Digital Surf, as read by Gwyddi
 _MAX_SDF_POINTS = 65535  # ISO 25178-71: numbers of points and profiles are unsigned 16-bit integers
 _SDF_TYPES = {"float32": 3, "float64": 7}
 _X3P_TYPES = {"float32": "F", "float64": "D"}
+# The schema of ISO 5436-2:2000 requires a date of calibration in Record2. It is not known here: the comment says so.
+_UNKNOWN_DATE = "1970-01-01T00:00:00+00:00"
 
 Array = npt.NDArray[Any]
 
@@ -87,8 +89,9 @@ def write_x3p(path: str | os.PathLike[str], z: Values, grid: Grid, *, overwrite:
         "<Increment>1</Increment><Offset>0</Offset></CZ></Axes></Record1>"
         f"<Record2><Date>{now}</Date><Instrument><Manufacturer>{escape(_PRODUCER)}</Manufacturer>"
         "<Model>sheet of light</Model><Serial>not available</Serial><Version>not available</Version></Instrument>"
-        f"<CalibrationDate>{now}</CalibrationDate><ProbingSystem><Type>NonContacting</Type>"
-        "<Identification>laser triangulation</Identification></ProbingSystem><Comment/></Record2>"
+        f"<CalibrationDate>{_UNKNOWN_DATE}</CalibrationDate><ProbingSystem><Type>NonContacting</Type>"
+        "<Identification>laser triangulation</Identification></ProbingSystem>"
+        "<Comment>The date of calibration is not known</Comment></Record2>"
         f"<Record3><MatrixDimension><SizeX>{grid.columns}</SizeX><SizeY>{grid.rows}</SizeY><SizeZ>1</SizeZ>"
         "</MatrixDimension><DataLink><PointDataLink>bindata/data.bin</PointDataLink>"
         f"<MD5ChecksumPointData>{_md5(points)}</MD5ChecksumPointData></DataLink></Record3>"

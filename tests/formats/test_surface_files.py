@@ -54,6 +54,8 @@ def test_an_x3p_states_positions_and_checksums(tmp_path, z):
     assert "<Offset>-0.002</Offset>" in text  # x of the first column
     assert f"<Offset>{5e-3 - 4 * 30e-6!r}</Offset>" in text  # y of the lowest row
     assert hashlib.md5(points).hexdigest().upper() in text
+    assert "<CalibrationDate>1970-01-01T00:00:00+00:00</CalibrationDate>" in text
+    assert "<Comment>The date of calibration is not known</Comment>" in text
     assert checksum == hashlib.md5(text.encode()).hexdigest().upper()
 
 

@@ -157,6 +157,7 @@ def calibrate_sensor(
     ]
     outputs = Outputs("calibrate", inputs=inputs, overwrite=overwrite)
     outputs.claim(*sensor_calibration_files(out), as_json)
+    _check_place(out, options)
     with progress_bar(f"detecting {camera['pattern']}") as progress:
         done = run(
             images,
@@ -197,6 +198,17 @@ def _check(options: SensorOptions, camera: dict[str, Any]) -> None:
         raise ValueError("--block needs --transport-views, which show the plane of the stage")
     if options.on_stage and options.transport_views is None:
         raise ValueError("--on-stage has no effect without --transport-views; leave it out")
+
+
+def _check_place(out: Path, options: SensorOptions) -> None:
+    """Refuse an output in a folder of images: the next run would take the picture for one of them."""
+    for name in ("laser", "transport_views", "block"):
+        folder = getattr(options, name)
+        if folder is not None and out.resolve().parent == folder.resolve():
+            raise ValueError(
+                f"--out is {out}, in the folder of --{name.replace('_', '-')}: its picture would be one of the images; "
+                "give another folder"
+            )
 
 
 def _checked_channel(name: str | None) -> RecordingChannel:

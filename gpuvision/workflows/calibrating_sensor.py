@@ -36,6 +36,7 @@ from gpuvision.ranging.sensor_geometry import SensorGeometry
 from gpuvision.ranging.sheet_calibration import DEFAULT_LIMITS, Along, LaserLine, SheetFit, fit_sheet
 from gpuvision.ranging.sheet_from_points import sheet_from_points
 from gpuvision.ranging.transport_calibration import TransportFit, fit_transport
+from gpuvision.validation import finite
 from gpuvision.workflows.calibrating import detect_targets
 from gpuvision.workflows.laser_images import (
     ImagePairs,
@@ -175,8 +176,8 @@ class SensorCalibration:
                 for each in self.readings
             ],
             "transport": None if geometry.transport is None else self._transport_report(geometry.transport),
-            "step": geometry.step,
-            "cell": self.cell,
+            "step_m": geometry.step,
+            "cell_m": self.cell,
             "scene": {"axes": geometry.scene_axes.tolist(), "origin": geometry.scene_origin.tolist()},
             "covariance": {"names": list(geometry.names), "matrix": geometry.covariance.tolist()},
             "warnings": list(self.warnings),
@@ -184,8 +185,8 @@ class SensorCalibration:
 
     def _transport_report(self, transport: TransportFit) -> dict[str, Any]:
         return {
-            "step": transport.step.tolist(),
-            "step_sigma": self.step_sigma,
+            "step_m": transport.step.tolist(),
+            "step_sigma_m": self.step_sigma,
             "residuals": transport.residuals.tolist(),
             "rotations": transport.rotations.tolist(),
             "view_ratio": transport.view_ratio,
@@ -268,6 +269,10 @@ def calibrate_sensor(
         raise ValueError(f"step is {step}, expected metres per profile, not 0")
     if block is not None and transport is None:
         raise ValueError("a block needs transport views: they show the plane of the stage that carries it")
+    if block is not None and len(block.heights) < 2:
+        raise ValueError(f"the block has {len(block.heights)} height, expected those of two steps at least")
+    if transport is not None and finite(transport.profiles_between, "profiles_between") == 0.0:
+        raise ValueError("profiles_between is 0, expected the number of profiles from one transport view to the next")
     folder = None if laser is None else Path(laser)
     pairs = pair_images([Path(each) for each in images], folder, required=block is None and points is None)
     if points is not None and (block is not None or any(pairs.lasers)):
@@ -382,8 +387,6 @@ def _other_lines(
     images: ImagePairs, block: BlockViews, along: Along, channel: Channel, device: Device | None
 ) -> tuple[tuple[LineImage, Float64], ...]:
     """Read the laser lines on the block; return each with the heights of its readings."""
-    if len(block.heights) < 2:
-        raise ValueError(f"the block has {len(block.heights)} height, expected those of two steps at least")
     found = []
     for dark, laser in _pairs(images):
         light = image_light(dark, laser, channel)

@@ -105,14 +105,19 @@ def pair_images(images: Sequence[Path], laser: Path | None, *, required: bool = 
     Raises
     ------
     ValueError
-        A laser image has no target image, or none of the target images has a laser image.
+        A laser image has no target image or is a target image, or none of the target images has a laser image.
     RecordingError
         The folder has no images.
     """
     lasers = image_files(laser) if laser is not None else [each for each in images if each.stem.endswith(SUFFIX)]
     targets = [each for each in images if laser is not None or not each.stem.endswith(SUFFIX)]
     found: dict[Path, Path] = {}
+    known = {each.resolve() for each in targets}
     for each in lasers:
+        if each.resolve() in known:
+            raise ValueError(
+                f"{each} is a target image and a laser image; give the laser images a folder for them alone"
+            )
         fitting = [target for target in targets if _is_pair(target, each)]
         if len(fitting) != 1:
             raise ValueError(

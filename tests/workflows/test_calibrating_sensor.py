@@ -6,6 +6,7 @@ The written file is judged by float64 oracles of OpenCV and NumPy against the re
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import tomllib
 from pathlib import Path
@@ -20,7 +21,7 @@ import pytest
 from gpuvision.cli.main import application
 from gpuvision.host import Device
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.workflows.calibrating_sensor import TransportViews, _warnings, calibrate_sensor
+from gpuvision.workflows.calibrating_sensor import BlockViews, TransportViews, _warnings, calibrate_sensor
 from gpuvision.workflows.laser_images import pair_images, split_steps
 from gpuvision.workflows.scanning import scan
 from laser_sensor import PITCH, PROFILES_BETWEEN, LaserSensor, sensor, up, write_images
@@ -107,7 +108,7 @@ def test_parameters_are_within_their_sigma(written: Path) -> None:
     bend = table["triangulation"]["bend"]
     assert abs(bend[0] + bend[2] - BEND[0] - BEND[2]) < 4.0 * np.hypot(sigma["gg"], sigma["hh"])
     step = float(np.linalg.norm(TRUTH.step))
-    assert abs(table["transport"]["step"] - step) < 4.0 * report["transport"]["step_sigma"] < 1e-7
+    assert abs(table["transport"]["step"] - step) < 4.0 * report["transport"]["step_sigma_m"] < 1e-7
     assert report["sheet"]["bend_test"]["significant"]
 
 
@@ -151,7 +152,8 @@ def test_parts_keep_their_shape(written: Path) -> None:
 
 def test_report_and_picture_belong_to_the_file(written: Path) -> None:
     table, report = read(written)
-    assert table["transport"]["step"] == report["step"]
+    assert table["transport"]["step"] == report["step_m"]
+    assert table["output"]["cell"] == report["cell_m"]
     assert table["triangulation"]["sheet_origin"] == report["sheet"]["origin"]
     assert len(report["laser_images"]) == VIEWS
     assert sum(each["readings"] for each in report["laser_images"]) == report["sheet"]["readings"] > 1000
@@ -172,6 +174,37 @@ def test_inputs_are_not_replaced(images: Path) -> None:
         run(*command(images), "--out", images / "pose0.toml", "--overwrite")
     with pytest.raises(FileExistsError, match=r"1\.png"):
         run(*command(images), "--out", images / "moved" / "1.toml", "--overwrite")
+
+
+@pytest.mark.parametrize("option", ["laser", "transport-views", "block"])
+def test_an_output_among_the_images_is_refused(tmp_path: Path, option: str) -> None:
+    """The next run would take the picture ``sensor.png`` for an image of the folder."""
+    folder = tmp_path / "shots"
+    folder.mkdir()
+    given: dict[str, object] = {"--transport-views": tmp_path, "--profiles-between": 40}
+    if option == "block":
+        given["--block-heights"] = "0,1mm"
+    given[f"--{option}"] = folder
+    options = [each for pair in given.items() for each in pair]
+    with pytest.raises(ValueError, match=f"--out is .*, in the folder of --{option}"):
+        run("calibrate", "a.png", "--sensor", "--pitch", PITCH, *options, "--out", folder / "sensor.toml")
+
+
+@pytest.mark.parametrize(
+    ("between", "heights", "said"),
+    [
+        (40.0, (0.0,), "the block has 1 height"),
+        (0.0, (0.0, 1e-3), "profiles_between is 0"),
+        (math.nan, (0.0, 1e-3), "profiles_between must be finite"),
+    ],
+)
+def test_settings_are_checked_before_the_images_are_read(
+    tmp_path: Path, between: float, heights: tuple[float, ...], said: str
+) -> None:
+    moved = TransportViews(folder=tmp_path / "none", profiles_between=between)
+    block = BlockViews(folder=tmp_path / "none", heights=heights)
+    with pytest.raises(ValueError, match=said):
+        calibrate_sensor([tmp_path / "none.png"], pitch=PITCH, transport=moved, block=block)
 
 
 @pytest.mark.parametrize(
@@ -210,6 +243,10 @@ def test_pairs_are_found_by_name_and_number(tmp_path: Path) -> None:
     (lasers / "010_laser.png").touch()
     with pytest.raises(ValueError, match="has two laser images"):
         pair_images(targets, lasers)
+    for each in targets:
+        each.touch()
+    with pytest.raises(ValueError, match=r"target_2\.png is a target image and a laser image"):
+        pair_images(targets, tmp_path)
 
 
 def test_steps_of_a_block_are_told_apart() -> None:

@@ -157,16 +157,19 @@ def quantities(text: str, option: str, units: str) -> tuple[float, ...]:
     Raises
     ------
     ValueError
-        The count or a unit differs from the expected ones.
+        The count or a unit differs from the expected ones, or a number is too large for a float.
     """
     kinds, parts = units.split(","), text.split(",")
     found = [_NUMBER.fullmatch(part) for part in parts]
     if len(parts) == len(kinds):
         known = [each and each[2] in _UNITS[kind] for each, kind in zip(found, kinds, strict=True)]
         if all(known):
-            return tuple(
+            values = tuple(
                 float(each[1]) * _UNITS[kind][each[2]] for each, kind in zip(found, kinds, strict=True) if each
             )
+            if not all(map(math.isfinite, values)):
+                raise ValueError(f"{option} is {text!r}, expected finite numbers")
+            return values
     ends = {"m": "m (or cm, mm, um)", "rad": "rad (or mrad, deg)"}
     expected = ", ".join(ends[kind] for kind in kinds)
     raise ValueError(f"{option} is {text!r}, expected {len(kinds)} number{'s' * (len(kinds) > 1)}: {expected}")

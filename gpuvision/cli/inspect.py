@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
@@ -25,8 +25,9 @@ from gpuvision.cli.select import Side
 if TYPE_CHECKING:
     from gpuvision.formats.height_files import ImageScale
     from gpuvision.inspection.apertures import Aperture
+    from gpuvision.inspection.deposits import PasteSettings
     from gpuvision.workflows.inspecting_leads import LeadInspection
-    from gpuvision.workflows.inspecting_paste import PasteInspection
+    from gpuvision.workflows.inspecting_paste import PasteInspection, VolumeLimits
 
 Heights = Annotated[
     Path,
@@ -192,13 +193,11 @@ def inspect(
     largest height, offset. Of each lead or ball: distance from the seating plane and from the least-squares plane.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    from gpuvision.formats.height_files import read_heights
     from gpuvision.host.outputs import Outputs
-    from gpuvision.inspection.apertures import BoardPlacement, read_apertures
     from gpuvision.inspection.deposits import PasteSettings
-    from gpuvision.matching.artwork.artwork import read_artwork
-    from gpuvision.workflows.inspecting_leads import LEAD_FILES, inspect_leads
-    from gpuvision.workflows.inspecting_paste import PASTE_FILES, ScaleSigma, VolumeLimits, inspect_paste
+    from gpuvision.validation import finite
+    from gpuvision.workflows.inspecting_leads import LEAD_FILES
+    from gpuvision.workflows.inspecting_paste import PASTE_FILES, VolumeLimits
 
     if not heights.exists():
         raise FileNotFoundError(f"{heights}: no such file")
@@ -207,10 +206,18 @@ def inspect(
     outputs = Outputs("inspect", inputs=inputs, overwrite=overwrite)
     outputs.claim_folder(out, PASTE_FILES if leads is None else LEAD_FILES)
     outputs.claim(as_json)
-    scale = _image_scale(cell, height_step, height_offset, hole)
-    noise = _length(sigma, "--sigma")
-    chosen: Literal["top", "bottom"] = "bottom" if side is Side.bottom else "top"
-    at = _pose(pose, "--pose")
+    common = _Common(
+        heights=heights,
+        scale=_image_scale(cell, height_step, height_offset, hole),
+        board=board,
+        side="bottom" if side is Side.bottom else "top",
+        layers=layers,
+        pose=_pose(pose, "--pose"),
+        sigma=None if sigma is None else finite(_length(sigma, "--sigma"), "--sigma", above=0.0),
+        correlation_area=None
+        if correlation_area is None
+        else finite(correlation_area, "--correlation-area", minimum=1.0),
+    )
     found: PasteInspection | LeadInspection
     if leads is not None:
         reject_unused(
@@ -228,24 +235,8 @@ def inspect(
             scale_sigma=scale_sigma,
             pin_names=pin_names,
         )
-        regions = _regions(leads, lead_file, board, layers, chosen)
-        if lead_file is None and at is None:
-            raise ValueError(f"--leads is {leads!r}, a part: give --pose too, or a CSV file of leads")
-        if at is None:
-            reject_unused("without --pose", side=side)
-        # A part with its leads up is the mirror image of its pads.
-        mirrored = (chosen == "top") == (lead_file is None)
-        gravity = None if centre is None else quantities(centre, "--centre", "m,m")
-        found = inspect_leads(
-            read_heights(heights, scale),
-            regions,
-            placement=None
-            if at is None
-            else BoardPlacement(x=at[0], y=at[1], theta=at[2], side="bottom" if mirrored else "top"),
-            sigma=noise,
-            correlation_area=correlation_area or 1.0,
-            centre=None if gravity is None else (gravity[0], gravity[1]),
-            maximum=_length(maximum_gap, "--maximum-gap"),
+        found = _inspect_leads(
+            common, leads, lead_file, side_given=side is not None, centre=centre, maximum_gap=maximum_gap
         )
     else:
         reject_unused("without --leads", centre=centre, maximum_gap=maximum_gap)
@@ -254,40 +245,130 @@ def inspect(
             raise ValueError(f"{missing} is missing; expected a board with its stencil, or --leads")
         if pose is not None:
             reject_unused("with --pose, a known place", initial_pose=initial_pose, search_range=search_range)
-        settings = PasteSettings(
-            stencil=quantities(stencil, "--stencil", "m")[0],
-            threshold=_length(threshold, "--threshold"),
-            margin=quantities(margin or "50um", "--margin", "m")[0],
-            ring=quantities(ring or "0.2mm", "--ring", "m")[0],
-            reference_order=1 if reference_order is None else reference_order,
-            pad_height=quantities(pad_height or "0", "--pad-height", "m")[0],
+        found = _inspect_paste(
+            common,
+            board,
+            PasteSettings(
+                stencil=quantities(stencil, "--stencil", "m")[0],
+                threshold=_length(threshold, "--threshold"),
+                margin=quantities(margin or "50um", "--margin", "m")[0],
+                ring=quantities(ring or "0.2mm", "--ring", "m")[0],
+                reference_order=1 if reference_order is None else reference_order,
+                pad_height=quantities(pad_height or "0", "--pad-height", "m")[0],
+            ),
+            VolumeLimits(
+                minimum=0.5 if minimum_volume is None else minimum_volume,
+                maximum=1.5 if maximum_volume is None else maximum_volume,
+            ),
+            initial_pose=initial_pose,
+            search_range=search_range,
+            scale_sigma=scale_sigma,
+            pin_names=pin_names,
         )
-        limits = VolumeLimits(
-            minimum=0.5 if minimum_volume is None else minimum_volume,
-            maximum=1.5 if maximum_volume is None else maximum_volume,
-        )
-        scales = None if scale_sigma is None else ScaleSigma(**_scale_sigmas(scale_sigma))
-        pads = read_artwork(board, side=chosen, layers=layers_of(layers)).pads if pin_names else ()
-        reach = quantities(search_range or "2mm,3deg", "--search-range", "m,rad")
-        found = inspect_paste(
-            read_heights(heights, scale),
-            read_apertures(board, side=chosen, layers=layers_of(layers), pads=pads),
-            settings,
-            side=chosen,
-            pose=at,
-            initial_pose=_pose(initial_pose, "--initial-pose"),
-            search_range=(reach[0], reach[1]),
-            sigma=noise,
-            correlation_area=correlation_area,
-            limits=limits,
-            scale_sigma=scales,
-        )
-        for each in found.warnings():
-            echo(f"warning: {each}", err=True)
     found.write(out, overwrite=overwrite)
     write_report(as_json, found.report(), outputs)
     picture = out / ("volume.png" if leads is None else "coplanarity.png")
     echo(f"{found.summary()}\nlook at {picture} and {out / 'report.json'}", err=prints_report(as_json))
+
+
+class _Common(NamedTuple):
+    """Parsed options that the inspections of paste and of leads share."""
+
+    heights: Path
+    scale: ImageScale | None
+    board: Path | None
+    side: Literal["top", "bottom"]
+    layers: list[str] | None
+    pose: tuple[float, float, float] | None
+    sigma: float | None
+    correlation_area: float | None
+
+
+def _inspect_leads(
+    common: _Common,
+    leads: str,
+    lead_file: Path | None,
+    *,
+    side_given: bool,
+    centre: str | None,
+    maximum_gap: str | None,
+) -> LeadInspection:
+    """Measure the leads of a CSV file or of a part of the board."""
+    from gpuvision.formats.height_files import read_heights
+    from gpuvision.inspection.apertures import BoardPlacement
+    from gpuvision.workflows.inspecting_leads import inspect_leads
+
+    pose = common.pose
+    regions = _regions(leads, lead_file, common.board, common.layers, common.side)
+    if lead_file is None and pose is None:
+        raise ValueError(f"--leads is {leads!r}, a part: give --pose too, or a CSV file of leads")
+    if pose is None:
+        reject_unused("without --pose", side=side_given)
+    # A part with its leads up is the mirror image of its pads.
+    mirrored = (common.side == "top") == (lead_file is None)
+    placement = None
+    if pose is not None:
+        placement = BoardPlacement(x=pose[0], y=pose[1], theta=pose[2], side="bottom" if mirrored else "top")
+    gravity = None if centre is None else quantities(centre, "--centre", "m,m")
+    return inspect_leads(
+        read_heights(common.heights, common.scale),
+        regions,
+        placement=placement,
+        sigma=common.sigma,
+        correlation_area=common.correlation_area or 1.0,
+        centre=None if gravity is None else (gravity[0], gravity[1]),
+        maximum=_length(maximum_gap, "--maximum-gap"),
+        files={
+            "height_map": str(common.heights),
+            **({} if common.board is None else {"board": str(common.board)}),
+            "leads": leads,
+        },
+    )
+
+
+def _inspect_paste(
+    common: _Common,
+    board: Path,
+    settings: PasteSettings,
+    limits: VolumeLimits,
+    *,
+    initial_pose: str | None,
+    search_range: str | None,
+    scale_sigma: str | None,
+    pin_names: bool,
+) -> PasteInspection:
+    """Measure the solder paste of a board, and print the warnings."""
+    from gpuvision.formats.height_files import read_heights
+    from gpuvision.inspection.apertures import read_apertures
+    from gpuvision.matching.artwork.artwork import read_artwork
+    from gpuvision.validation import finite
+    from gpuvision.workflows.inspecting_paste import ScaleSigma, inspect_paste
+
+    scales = None if scale_sigma is None else ScaleSigma(**_scale_sigmas(scale_sigma))
+    shift, turn = quantities(search_range or "2mm,3deg", "--search-range", "m,rad")
+    reach = (
+        finite(shift, "the shift of --search-range", minimum=0.0),
+        finite(turn, "the rotation of --search-range", minimum=0.0),
+    )
+    layers = layers_of(common.layers)
+    pads = read_artwork(board, side=common.side, layers=layers).pads if pin_names else ()
+    found = inspect_paste(
+        read_heights(common.heights, common.scale),
+        read_apertures(board, side=common.side, layers=layers, pads=pads),
+        settings,
+        side=common.side,
+        pose=common.pose,
+        initial_pose=_pose(initial_pose, "--initial-pose"),
+        search_range=reach,
+        sigma=common.sigma,
+        correlation_area=common.correlation_area,
+        limits=limits,
+        scale_sigma=scales,
+        files={"height_map": str(common.heights), "board": str(board)},
+    )
+    for each in found.warnings():
+        echo(f"warning: {each}", err=True)
+    return found
 
 
 def _regions(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from gpuvision.inspection.coplanarity import Coplanarity, measure_coplanarity
 from gpuvision.matching.artwork.board_artwork import Pad
 from gpuvision.matching.artwork.shapes import Shape
 from gpuvision.plots.inspection import draw_regions
+from gpuvision.validation import finite
 from gpuvision.workflows.inspection_tables import write_tables
 
 LEAD_FILES = ("leads.csv", "report.json", "coplanarity.png")
@@ -40,12 +42,15 @@ class LeadInspection:
         Tops, gaps and deviations.
     maximum : float or None
         Largest gap that passes [m]; None without a limit.
+    files : mapping of str to str
+        Names of the input files for the report, such as ``height_map`` and ``board``. Default: none.
     """
 
     heights: HeightMapFile
     regions: tuple[Aperture, ...]
     leads: Coplanarity
     maximum: float | None
+    files: Mapping[str, str] = field(default_factory=dict)
 
     def verdicts(self) -> tuple[str, ...]:
         """Return "pass" or "high" of each lead by its gap, or "holes" of a lead without a top."""
@@ -84,13 +89,14 @@ class LeadInspection:
         """Return the content of ``report.json``; None for numbers that are not known."""
         tree = {
             "gpuvision": version("gpuvision"),
+            "files": dict(self.files),
             "summary": self.summary(),
-            "coplanarity": self.leads.coplanarity,
-            "coplanarity_sigma": self.leads.coplanarity_sigma,
+            "coplanarity_m": self.leads.coplanarity,
+            "coplanarity_sigma_m": self.leads.coplanarity_sigma,
             "lowest": self.leads.lowest,
             "seats": list(self.leads.seats),
-            "maximum": self.maximum,
-            "noise": self.leads.noise,
+            "maximum_gap_m": self.maximum,
+            "noise_m": self.leads.noise,
             "map": asdict(self.heights.grid),
             "leads": self.rows(),
         }
@@ -140,6 +146,7 @@ def inspect_leads(
     correlation_area: float = 1.0,
     centre: tuple[float, float] | None = None,
     maximum: float | None = None,
+    files: Mapping[str, str] = MappingProxyType({}),
 ) -> LeadInspection:
     """Measure the coplanarity of leads or balls in a height map of a component with its leads up.
 
@@ -159,6 +166,8 @@ def inspect_leads(
         Centre of gravity, in the coordinates of the regions [m]. Default: mean of the regions.
     maximum : float, optional
         Largest gap that passes [m].
+    files : mapping of str to str
+        Names of the input files for the report. Default: none.
 
     Returns
     -------
@@ -167,7 +176,7 @@ def inspect_leads(
     Raises
     ------
     ValueError
-        Fewer than three tops are measured, or the centre of gravity is not between them.
+        Fewer than three tops are measured, the centre of gravity is not between them, or a number is out of range.
     """
     gravity: npt.NDArray[np.float64] | None = None if centre is None else np.array(centre)
     moved = tuple(regions)
@@ -178,8 +187,8 @@ def inspect_leads(
         heights.z,
         heights.grid,
         moved,
-        sigma=heights.sigma if sigma is None else sigma,
+        sigma=heights.sigma if sigma is None else finite(sigma, "sigma", above=0.0),
         correlation_area=correlation_area,
         centre=None if gravity is None else (float(gravity[0]), float(gravity[1])),
     )
-    return LeadInspection(heights=heights, regions=moved, leads=leads, maximum=maximum)
+    return LeadInspection(heights=heights, regions=moved, leads=leads, maximum=maximum, files=files)

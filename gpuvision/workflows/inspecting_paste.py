@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ SEARCH_RANGE = (2e-3, math.radians(3.0))
 """Default search range of a board: shift [m] and rotation [rad]."""
 # Correlation of the pattern below which the alignment is doubtful. Chosen: without paste it is below 0.2.
 _WEAK_CORRELATION = 0.3
+# Units of the settings and of the pose, at the end of their keys in the report.
+_SUFFIXES = {**dict.fromkeys(("stencil", "threshold", "margin", "ring", "pad_height", "x", "y"), "_m"), "theta": "_rad"}
 _ROUGH = 2.0  # scatter of the board over the sigma of its heights, from which on they disagree. Chosen
 
 
@@ -102,6 +105,8 @@ class PasteInspection:
         Limits of the verdicts.
     scale_sigma : ScaleSigma or None
         Systematic standard deviations; None if they are not known.
+    files : mapping of str to str
+        Names of the input files for the report, such as ``height_map`` and ``board``. Default: none.
     """
 
     heights: HeightMapFile
@@ -112,6 +117,7 @@ class PasteInspection:
     deposits: Deposits
     limits: VolumeLimits
     scale_sigma: ScaleSigma | None
+    files: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def volume_ratio(self) -> Float64:
@@ -219,23 +225,24 @@ class PasteInspection:
         if fitted is not None:
             alignment = {
                 "covariance": fitted.covariance.tolist(),
-                "centre": fitted.centre.tolist(),
-                "residual_scale": fitted.residual_scale,
+                "centre_m": fitted.centre.tolist(),
+                "residual_scale_m": fitted.residual_scale,
                 "deposits": fitted.count,
                 "correlation": fitted.correlation,
                 "second_correlation": fitted.second_correlation,
             }
         tree = {
             "gpuvision": version("gpuvision"),
+            "files": dict(self.files),
             "summary": self.summary(),
             "warnings": list(self.warnings()),
-            "settings": asdict(self.settings),
+            "settings": {name + _SUFFIXES.get(name, ""): each for name, each in asdict(self.settings).items()},
             "limits": asdict(self.limits),
             "scale_sigma": None if self.scale_sigma is None else asdict(self.scale_sigma),
-            "pose": asdict(self.placement),
+            "pose": {name + _SUFFIXES.get(name, ""): each for name, each in asdict(self.placement).items()},
             "alignment": alignment,
-            "noise": self.deposits.noise,
-            "board_scatter": self.deposits.board_scatter,
+            "noise_m": self.deposits.noise,
+            "board_scatter_m": self.deposits.board_scatter,
             "correlation_area_cells": self.deposits.correlation_area,
             "map": asdict(self.heights.grid),
             "deposits": self.rows(),
@@ -287,6 +294,7 @@ def inspect_paste(
     correlation_area: float | None = None,
     limits: VolumeLimits = VolumeLimits(),
     scale_sigma: ScaleSigma | None = None,
+    files: Mapping[str, str] = MappingProxyType({}),
 ) -> PasteInspection:
     """Measure the solder paste of a board in a height map.
 
@@ -316,6 +324,8 @@ def inspect_paste(
         Limits of the verdicts.
     scale_sigma : ScaleSigma, optional
         Systematic standard deviations of the scales.
+    files : mapping of str to str
+        Names of the input files for the report. Default: none.
 
     Returns
     -------
@@ -324,11 +334,11 @@ def inspect_paste(
     Raises
     ------
     ValueError
-        The board is not found in the height map, or both poses are given.
+        The board is not found in the height map, both poses are given, or a number is out of range.
     """
     if pose is not None and initial_pose is not None:
         raise ValueError("pose and initial_pose are both given; expected a known pose or the beginning of a search")
-    noise = heights.sigma if sigma is None else sigma
+    noise = heights.sigma if sigma is None else finite(sigma, "sigma", above=0.0)
     alignment = None
     if pose is None:
         if initial_pose is None:
@@ -353,6 +363,7 @@ def inspect_paste(
         deposits=deposits,
         limits=limits,
         scale_sigma=scale_sigma,
+        files=files,
     )
 
 

@@ -11,9 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
+from gpuvision.formats.height_files import HeightMapFile
 from gpuvision.formats.range_image import write_tiff
 from gpuvision.inspection.apertures import BoardPlacement
-from paste_maps import Box, Cap, board_grid, paste_map
+from gpuvision.inspection.deposits import PasteSettings
+from gpuvision.workflows.inspecting_leads import inspect_leads
+from gpuvision.workflows.inspecting_paste import inspect_paste
+from paste_maps import Box, Cap, board_grid, circle, paste_map
 from scanning import Ran, check_refused
 
 HEAD = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
@@ -73,9 +77,15 @@ def test_the_paste_of_a_board(gerbers: Path, paste: Path, tmp_path: Path, run: A
     np.testing.assert_allclose(float(rows[0]["volume_systematic_sigma_m3"]), volume[0] * np.hypot(0.01, 0.004))
     assert rows[4]["offset_x_m"] == ""
     report = json.loads((out / "report.json").read_text())
-    np.testing.assert_allclose([report["pose"][name] for name in ("x", "y", "theta")], [1e-4, -3e-4, 0.02], atol=1e-4)
+    np.testing.assert_allclose(
+        [report["pose"][name] for name in ("x_m", "y_m", "theta_rad")], [1e-4, -3e-4, 0.02], atol=1e-4
+    )
+    assert report["files"] == {"height_map": str(paste), "board": str(gerbers)}
+    assert report["settings"]["stencil_m"] == pytest.approx(120e-6)
+    assert report["board_scatter_m"] == pytest.approx(1e-6, rel=0.1)
+    assert report["alignment"]["residual_scale_m"] < 1e-5
     assert report["deposits"][4]["offset_x_m"] is None
-    assert report["noise"] == pytest.approx(1e-6, rel=0.1)
+    assert report["noise_m"] == pytest.approx(1e-6, rel=0.1)
     assert (out / "volume.png").stat().st_size > 10_000
     limits = ("--minimum-volume=0.1", "--maximum-volume=0.4", "--sigma=2um", "--margin=20um", "--ring=0.1mm")
     pose = ("--pose=0.1mm,-0.3mm,0.02rad", "--json", "-")
@@ -83,7 +93,7 @@ def test_the_paste_of_a_board(gerbers: Path, paste: Path, tmp_path: Path, run: A
     told = json.loads(ran.out)
     assert [each["verdict"] for each in told["deposits"]] == ["high", "pass", "high", "high", "low"]
     assert told["alignment"] is None
-    assert told["noise"] == 2e-6
+    assert told["noise_m"] == 2e-6
     assert told["warnings"] == []
     ran = run(
         paste, "--board", gerbers, "--stencil=120um", *LAYERS, "--out", out, "--sigma=0.4um", pose[0], "--pin-names"
@@ -131,6 +141,12 @@ def test_the_leads_of_a_component(gerbers: Path, tmp_path: Path, run: Any, by_pa
     assert [each["seat"] for each in rows] == ["True", "False", "True", "True", "False"]
     assert "coplanarity 30 um" in ran.out
     assert (tmp_path / "out" / "coplanarity.png").exists()
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert [report[name] for name in ("maximum_gap_m", "noise_m")] == pytest.approx([20e-6, 1e-6])
+    assert report["coplanarity_m"] == pytest.approx(30e-6, abs=1e-6)
+    assert report["files"]["height_map"] == str(tmp_path / "map.tiff")
+    assert report["files"]["leads"] == str(chosen[0].removeprefix("--leads=") if by_part else chosen[1])
+    assert ("board" in report["files"]) == by_part
 
 
 @pytest.mark.parametrize(
@@ -145,6 +161,19 @@ def test_the_leads_of_a_component(gerbers: Path, tmp_path: Path, run: Any, by_pa
         (("--leads=U7", "--pin-names"), "--pin-names has no effect with --leads"),
         (("--centre=0,0",), "--centre has no effect without --leads"),
         (("--cell=1um",), "--height-step is missing"),
+        (("--leads=U7", "--sigma=-5um"), r"--sigma is -[0-9.e-]+, expected a number > 0"),
+        (("--leads=U7", "--sigma=1e400m"), "--sigma is '1e400m', expected finite numbers"),
+        (("--leads=U7", "--correlation-area=inf"), "--correlation-area must be finite"),
+        (("--board", "GERBERS", "--stencil=1", "--sigma=0"), "--sigma is 0.0, expected a number > 0"),
+        (("--board", "GERBERS", "--stencil=1", "--correlation-area=inf"), "--correlation-area must be finite"),
+        (
+            ("--board", "GERBERS", "--stencil=0.1mm", "--search-range=-1mm,1deg"),
+            "the shift of --search-range is -0.001, expected a number >= 0",
+        ),
+        (
+            ("--board", "GERBERS", "--stencil=0.1mm", "--search-range=1mm,-1deg"),
+            "the rotation of --search-range is -0.01[0-9]*, expected a number >= 0",
+        ),
         (("--hole=1",), "--hole has no effect without --cell and --height-step"),
         (("--board", "GERBERS", "--stencil=1", "--pose=0,0,0", "--search-range=1,1"), "--search-range has no effect"),
         (("--board", "GERBERS", "--stencil=0.1mm", "--scale-sigma=1"), "--scale-sigma is '1', expected two numbers"),
@@ -164,3 +193,21 @@ def test_options_that_do_not_fit_are_refused(
 
 def test_a_missing_height_map_is_named(gerbers: Path, tmp_path: Path, run: Any) -> None:
     check_refused(run(tmp_path / "no.tiff", "--out", tmp_path / "out"), r"no\.tiff: no such file")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"sigma": -5e-6}, "sigma is -5e-06, expected a number > 0"),
+        ({"sigma": float("inf")}, "sigma must be finite"),
+        ({"correlation_area": float("nan")}, "correlation_area must be finite"),
+    ],
+)
+def test_noise_that_is_no_noise_is_refused(given: dict[str, float], message: str) -> None:
+    grid = board_grid(20, 20)
+    heights = HeightMapFile(np.zeros(grid.shape), grid)
+    place = [circle(str(k), (1e-4 * k, 1e-4 * k**2), 5e-5) for k in (1, 2, 3)]
+    with pytest.raises(ValueError, match=message):
+        inspect_leads(heights, place, **given)
+    with pytest.raises(ValueError, match=message):
+        inspect_paste(heights, place, PasteSettings(stencil=1e-4), pose=(0.0, 0.0, 0.0), **given)

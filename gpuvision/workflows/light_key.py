@@ -18,7 +18,8 @@ from gpuvision.sensor.light_source import Light
 from gpuvision.sensor.sensor import Sensor
 
 NOT_OPTICAL: dict[type, frozenset[str]] = {
-    Sensor: frozenset({"name", "recording", "output", "auto_threshold", "files"}),
+    # The transports of a task hold what an encoder measured.
+    Sensor: frozenset({"name", "recording", "output", "auto_threshold", "files", "encoder"}),
     Light: frozenset({"responsivity", "ambient", "modulated", "exposure", "full_well", "read_noise"}),
     PsdReadout: frozenset(
         {

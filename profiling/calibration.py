@@ -61,12 +61,12 @@ class Radial(NamedTuple):
 def cases(device: Device) -> Iterator[Case]:
     """Yield fits of k1 and k2 to the lines of each target: two dot grids and one line grid.
 
-    The cases ``fit/`` have the covariance for independent errors, the cases ``tested-fit/`` test the residuals for lack
+    The cases ``fit/`` have the covariance for independent errors, the cases ``tested/`` test the residuals for lack
     of fit and include a smooth field of them in the covariance. discorpy estimates no errors in either case.
     """
     for name, file, shape in _TARGETS:
         yield case_of(name, file, shape, "independent")
-        yield case_of(f"tested-{name}", file, shape, "auto")
+        yield case_of(name.replace("fit/", "tested/"), file, shape, "auto")
 
 
 @functools.lru_cache(maxsize=2 * len(_TARGETS))

@@ -24,7 +24,7 @@ def _without_recordings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
 def test_cases_without_recordings(device: Device) -> None:
     cases = list(calibration.cases(device))
     assert [case.name for case in cases] == [
-        f"{start}fit/{target}" for target in ("66x96", "33x39", "lines") for start in ("", "tested-")
+        f"{kind}/{target}" for target in ("66x96", "33x39", "lines") for kind in ("fit", "tested")
     ]
     for case in cases:
         assert set(case.peers) == {"discorpy"}

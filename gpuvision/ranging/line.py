@@ -191,9 +191,9 @@ class LineReadout(VisionOperation[LineReading]):
     for flagged samples. It is too large by up to 20 % where the threshold lies within the noise of the background. If a
     background image was subtracted from the frames, ``read_noise`` must contain the noise of both.
 
-    Cost of ``sigma``, in processor time of the readout of 16 frames (512, 1024) uint8 on two cores, PoCL and Intel:
-    ``"windowed"`` 14 and 20 %, ``"gauss3"`` 0 and 2 %, ``"fir"`` 11 and 13 %, ``"ml"`` 17 and 15 %, ``"centroid"``
-    19 to 34 %.
+    Cost of ``sigma`` over the readout of 16 frames (512, 1024) uint8 without it, idle two-core machine, PoCL and Intel:
+    ``"windowed"`` 12 and 15 %, ``"gauss3"`` 3 and 3 %, ``"fir"`` 13 and 10 %, ``"ml"`` 20 and 15 %, ``"centroid"``
+    22 and 28 %.
 
     References
     ----------

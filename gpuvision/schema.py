@@ -256,7 +256,7 @@ class Section:
                 raise self.error(f"unknown key '{_shown(self.dotted(key))}'; {hint}")
 
     def _below(self, table: Mapping[str, Any], name: str) -> Section:
-        """Return a sub-table, which adds the files that it names to those of this table."""
+        """Return a sub-table; it shares the list of named files with this table."""
         below = Section(table, self._source, name, folder=self._folder)
         below._files = self._files
         return below

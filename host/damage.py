@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import simplejpeg  # type: ignore[import-untyped]
+import simplejpeg
 
 
 def is_damaged_jpeg(content: bytes) -> bool:

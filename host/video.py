@@ -122,7 +122,7 @@ class VideoDecoder:
         return RecordingError(f"{self._path}: no frame of this video can be decoded: damaged, or of an unknown codec")
 
     def _displayed(self, stream: Any) -> int:
-        """Return the number of pictures in the header, without those that the edit list of an MP4 file cuts off."""
+        """Return the number of pictures by the header, less the pictures that the edit list of an MP4 file cuts off."""
         frames = int(stream.frames)
         if not frames or "mp4" not in self._container.format.name.split(","):
             return frames
@@ -276,6 +276,6 @@ class VideoDecoder:
 
 
 def _time(part: Any) -> int | None:
-    """Return the time of a packet or picture, by which pictures are matched with packets; None if it has none."""
+    """Return the time of a packet or picture, or None. Equal times match a picture with its packet."""
     time: int | None = part.pts if part.pts is not None else part.dts
     return time

@@ -18,7 +18,7 @@ _OF_KERNELS = {f"test_{path.parent.name}" for path in (_ROOT / "kernels").glob("
 # Folders whose test files are not about a kernel, also where they have the name of one.
 _COMPOSED = frozenset({"cli", "formats", "profiling", "workflows"})
 # Test functions of a file that the fast tier runs in both kernel variants: the variants differ in few functions of a
-# kernel, and each variant is a compilation of its own.
+# kernel, and each variant takes another compilation.
 _IN_BOTH_VARIANTS = 2
 # Tests of this run that the tier leaves out, for `pytest.Session`.
 LEFT = pytest.StashKey[list[pytest.Item]]()
@@ -89,7 +89,7 @@ def collected_items(session: pytest.Session) -> list[pytest.Item]:
 
 
 def without_other_variants(items: Sequence[pytest.Item]) -> Iterator[pytest.Item]:
-    """Yield the tests but those of a device's other kernel variant beyond the first functions of each file.
+    """Yield the tests; beyond the first functions of each file, only tests of the device's default kernel variant.
 
     A function without cases of the device's default variant keeps its cases.
     """

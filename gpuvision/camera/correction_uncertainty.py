@@ -196,7 +196,7 @@ def _size(model: Lens | Camera, name: str, radius: float) -> float:
         return float(radius ** (-2.0 * int(name[1:])))
     if name in ("f", "fx", "fy"):
         return model.matrix[0][0]
-    # Half the power of the normalised radius by which the coefficient is multiplied.
+    # The distortion has the term: coefficient times normalised radius to the power of twice this order.
     order = {"k1": 1.0, "k2": 2.0, "k3": 3.0, "p1": 0.5, "p2": 0.5, "k4": 1.0, "k5": 2.0, "k6": 3.0}[name]
     return float((radius / model.matrix[0][0]) ** (-2.0 * order))
 

@@ -43,7 +43,7 @@ class LineFrame:
     image : numpy.ndarray
         Frame as the readout sees it, (rows, columns).
     position : numpy.ndarray
-        Position of the line for each sample, (samples,) [px]; NaN where there is none.
+        Position of the line for each sample, (samples,) [px]; NaN where no line was found.
     status : numpy.ndarray
         `Status` flags of the samples, (samples,) uint8.
     """

@@ -107,7 +107,7 @@ class StraightTable(NamedTuple):
 
 
 class BentTable(NamedTuple):
-    """Parameters of ``kernels/range_image/range_image.cl`` after those of `StraightTable`, under ``SHEET_BENT``."""
+    """Parameters of a bent sheet in ``kernels/range_image/range_image.cl``, at the end of `StraightTable`."""
 
     bend: npt.ArrayLike
     pinhole: npt.ArrayLike

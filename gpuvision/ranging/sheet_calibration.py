@@ -97,8 +97,8 @@ class LaserLine(NamedTuple):
         Pose of the target (its plane is Z = 0), the covariance of the pose, and its derivative by the camera. Lines
         with the same object share its error.
     height : numpy.ndarray or float
-        (n,) or one number: height of the lit surface over the target's plane, towards the camera [m]. Default 0; other
-        heights are those of a stepped block on the plane.
+        (n,) or one number: height of the lit surface over the target's plane, towards the camera [m]. Default 0; a
+        stepped block on the plane has other heights.
     """
 
     points: Float64

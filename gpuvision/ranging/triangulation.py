@@ -340,7 +340,7 @@ class Triangulation(VisionOperation[SheetPoints]):
     def parameter_derivatives(self, points: npt.ArrayLike) -> Float64:
         """Return the derivatives (..., 2, 8) of (G, H) at measured points (u, v) (..., 2) by the parameters.
 
-        The parameters are those of `conditioned`, whose covariance is ``covariance``. NaN beyond the horizon.
+        `conditioned` returns the parameters, and ``covariance`` is their covariance. NaN beyond the horizon.
         """
         return homography.displacement_design(*self._at(np.asarray(points, dtype=np.float64))[:2])
 

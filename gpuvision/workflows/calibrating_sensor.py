@@ -123,7 +123,7 @@ class SensorCalibration:
     cell : float
         Cell of the height map for scans [m].
     warnings : tuple of str
-        Doubts about sheet and transport, after those about the camera.
+        Doubts about the camera, then about sheet and transport.
     """
 
     name: str
@@ -270,7 +270,7 @@ def calibrate_sensor(
     if block is not None and transport is None:
         raise ValueError("a block needs transport views: they show the plane of the stage that carries it")
     if block is not None and len(block.heights) < 2:
-        raise ValueError(f"the block has {len(block.heights)} height, expected those of two steps at least")
+        raise ValueError(f"the block has {len(block.heights)} height, expected the heights of at least two steps")
     if transport is not None and finite(transport.profiles_between, "profiles_between") == 0.0:
         raise ValueError("profiles_between is 0, expected the number of profiles from one transport view to the next")
     folder = None if laser is None else Path(laser)

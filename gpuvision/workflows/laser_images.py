@@ -210,7 +210,7 @@ def read_block(
     Returns
     -------
     LineImage
-        Readings on the steps, without those near the edges.
+        Readings on the steps; readings near the edges are left out.
     numpy.ndarray
         (n,): number of the step of each reading, from 0 along the image axis of the line.
 

@@ -89,7 +89,7 @@ def predict_errors(
     sensor : Sensor
         Gives the geometry and the jitter of the transport.
     fields : mapping of str to numpy.ndarray
-        Outputs of the readout by name, (profiles, samples), with those of `sigma_outputs`.
+        Outputs of the readout by name, (profiles, samples); `sigma_outputs` lists the needed standard deviations.
     points : RangePoints
         Points of the scan.
     transports : numpy.ndarray

@@ -108,7 +108,7 @@ class Scan:
         Cells of the height map.
     frame_numbers : numpy.ndarray
         Number of each profile's frame in the recording, (profiles,); not consecutive where frames were dropped. Of a
-        focus stack: number of the sharpest frame of each pixel, (rows, columns), -1 where there is none.
+        focus stack: number of the sharpest frame of each pixel, (rows, columns); -1 without a sharpest frame.
     device : Device
         Device of the computation.
     stream : StreamReport
@@ -236,7 +236,7 @@ class Scan:
         and ``scan.png`` show the organised points. ``range_image.npz`` holds both. ``report.json`` holds the report.
         With a noise model ``range_image_sigma.tiff`` holds the random standard deviation of the height map; with the
         covariance of a calibration ``range_image_systematic.tiff`` holds the systematic one. The PLY and NPZ files have
-        those of the points, ``sigma_x`` and ``systematic_x`` and so on.
+        the standard deviations of the points, ``sigma_x`` and ``systematic_x`` and so on.
 
         Files of an earlier scan for a standard deviation or a format that this scan does not have are removed, if they
         were not changed since.

@@ -41,7 +41,7 @@ static inline reals add_noise(reals sum, reals v, reals d, constant LineTable *t
 #define NEARLY_ALL 1
 #endif
 #define NOISE_MARGIN 6  // samples on either side of the centroids that are read first: about the half width of a line
-#define NOISE_STEP 4    // samples on either side by which the range grows
+#define NOISE_STEP 4    // growth of the range on either side, in samples
 
 // Add the samples begin <= k < end of every lane to the sum of the noise (add_noise) and to the light found.
 static inline void add_noises(const Centroid *centroid, const Profiles *profiles, int begin, int end, reals *sum,

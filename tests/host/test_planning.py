@@ -16,4 +16,4 @@ def test_batch_sizes_double_from_one_frame() -> None:
 def test_limits_are_given_by_name() -> None:
     assert PlanLimits(min_ring=8).min_ring == 8
     with pytest.raises(TypeError, match="positional argument"):
-        PlanLimits(8)  # type: ignore[misc]
+        PlanLimits(8)

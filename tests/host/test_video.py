@@ -29,7 +29,7 @@ def frames_of_a_line() -> Any:
 
 
 def written(path: Path, codec: str | None = None, frames: Any = None, **options: str) -> Path:
-    """Write a video with a key frame in every 12 frames. The options are those of the codec."""
+    """Write a video with a key frame in every 12 frames. The options belong to the codec."""
     frames = frames_of_a_line() if frames is None else frames
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(codec or CODECS[path.suffix[1:]], rate=25)

@@ -136,7 +136,7 @@ def test_the_height_bar_stands_beside_the_map(tmp_path, heights):
     coloured = np.flatnonzero(np.ptp(bar, axis=1) > 20)
     assert abs(coloured[0] - 0.72 * 150) <= 2
     assert abs(np.ptp(coloured) - 4.5 * 150) <= 4
-    # Its colours are those of the highest and the lowest cell.
+    # It has the colours of the highest and the lowest cell.
     row, column = np.divmod([np.nanargmax(heights.z), np.nanargmin(heights.z)], GRID.columns)
     cells = image[(108 + (row + 0.5) * 4.4).astype(int), (45 + (column + 0.5) * 4.4).astype(int)]
     ends = bar[[coloured[0] + 4, coloured[-1] - 4]]

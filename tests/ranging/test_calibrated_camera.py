@@ -196,7 +196,7 @@ def test_fit_with_a_camera(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("along", ["columns", "rows"])
 def test_fused_in_the_readout_with_axes(device: Device, along: Any, rng: np.random.Generator) -> None:
-    """The readout's g and h are those of the triangulation at its positions, for windows and binned pixels too."""
+    """The readout and the triangulation at its positions give the same g and h, for windows and binned pixels too."""
     camera = CAMERAS["tilted"]
     operation = scanner(camera, along)
     frames = rng.integers(0, 20, (2, 48, 64)).astype(np.uint8)

@@ -50,7 +50,7 @@ def test_likelihood_reaches_the_bound(device, rng, sigma, peak):
 
 
 @pytest.mark.parametrize(
-    # Each sigma has a window, and with it a kernel, of its own.
+    # The window follows the sigma, and each window takes another kernel.
     ("sigma", "peak"),
     [pytest.param(*each, marks=pytest.mark.slow if each[0] in (0.5, 4.0) else []) for each in FIGURES],
 )

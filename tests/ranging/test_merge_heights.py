@@ -48,7 +48,7 @@ def run(operation: MergeHeights, one: Arrays, two: Arrays, device: Device, **mor
 
 def assert_close(found: Any, operation: MergeHeights, one: Arrays, two: Arrays) -> None:
     if not operation.sigma:
-        one, two = (*one[:3], None), (*two[:3], None)  # type: ignore[assignment]
+        one, two = (*one[:3], None), (*two[:3], None)
     expected = reference(
         one,
         two,

@@ -364,5 +364,5 @@ def test_unused_short_line_is_named() -> None:
     lines = [SimpleNamespace(image=Path("pose1_laser.png"), note="")]
     for residual, count in ((np.full(10, np.nan), 1), (np.zeros(10), 0)):
         sheet = SimpleNamespace(residuals=(residual,), view_ratio=1.0)
-        found = _warnings(SimpleNamespace(sheet=sheet, transport=transport), lines)  # type: ignore[arg-type]
+        found = _warnings(SimpleNamespace(sheet=sheet, transport=transport), lines)
         assert found == ["pose1_laser.png: the line has 10 readings, the sheet uses lines of 16 or more"][:count]

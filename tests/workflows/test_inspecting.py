@@ -90,11 +90,11 @@ def test_the_paste_of_a_board(gerbers: Path, paste: Path, tmp_path: Path, run: A
     limits = ("--minimum-volume=0.1", "--maximum-volume=0.4", "--sigma=2um", "--margin=20um", "--ring=0.1mm")
     pose = ("--pose=0.1mm,-0.3mm,0.02rad", "--json", "-")
     ran = run(paste, "--board", gerbers, "--stencil=120um", *LAYERS, "--out", out, *limits, *pose)
-    told = json.loads(ran.out)
-    assert [each["verdict"] for each in told["deposits"]] == ["high", "pass", "high", "high", "low"]
-    assert told["alignment"] is None
-    assert told["noise_m"] == 2e-6
-    assert told["warnings"] == []
+    report = json.loads(ran.out)
+    assert [each["verdict"] for each in report["deposits"]] == ["high", "pass", "high", "high", "low"]
+    assert report["alignment"] is None
+    assert report["noise_m"] == 2e-6
+    assert report["warnings"] == []
     ran = run(
         paste, "--board", gerbers, "--stencil=120um", *LAYERS, "--out", out, "--sigma=0.4um", pose[0], "--pin-names"
     )

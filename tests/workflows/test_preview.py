@@ -48,7 +48,7 @@ def test_frames_are_spread_over_the_recording(device: Device) -> None:
         np.testing.assert_allclose(frame.position[48:], ROWS[frame.number, 48:], rtol=0, atol=0.05)
         assert np.all(frame.status[:48] & Status.LOW_SIGNAL)
         assert frame.found_fraction == pytest.approx(0.9)
-    threshold = found.sensor.readout.threshold  # type: ignore[union-attr]
+    threshold = found.sensor.readout.threshold
     assert 4 <= threshold <= 40
     assert found.summary() == (
         f"preview of 5 frames at threshold {threshold:g} grey levels, background median: "
@@ -102,7 +102,7 @@ def test_the_guide_of_a_hobby_rig_finds_the_line_of_a_real_frame(data: Path, tmp
     found = preview_scan(tmp_path / "frames", sensor)
     assert found.summary().startswith("preview of 1 frames at threshold 40 grey levels, background background.png: ")
     assert found.found_fraction > 0.85
-    # Most of the rows have a depth in front of the camera, and the heights are those of the same lines.
+    # Most of the rows have a depth in front of the camera, and the heights belong to the same lines.
     done = scan(tmp_path / "frames", sensor)
     assert done.valid_fraction == pytest.approx(found.found_fraction, abs=0.01)
     assert 0.1 < -float(np.nanmedian(done.points.z)) < 1.0

@@ -82,7 +82,7 @@ def test_predicted_errors_are_the_scatter(
     for file, values in (("sigma", sigma), ("systematic", made.errors.map_systematic)):
         with tifffile.TiffFile(tmp_path / "out" / f"range_image_{file}.tiff") as tiff:
             np.testing.assert_array_equal(tiff.pages[0].asarray(), values)
-            assert file[:6] in tiff.pages[0].description  # type: ignore[union-attr]
+            assert file[:6] in tiff.pages[0].description
 
 
 def test_systematic_errors_are_those_of_the_calibration(device: Device, rng: np.random.Generator) -> None:

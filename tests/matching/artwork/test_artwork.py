@@ -121,7 +121,7 @@ def test_a_filled_outline_is_cut_along_its_contour(tmp_path: Path) -> None:
 
 
 def test_a_hole_that_is_repeated_in_place_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its 2e6 pairs would take 200 MB, those of the 1e5 holes that a file may have all memory."""
+    """Its 2e6 pairs would take 200 MB. A file may have 1e5 holes; their pairs would take all memory."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     once = read(tmp_path).holes
     (tmp_path / "plated.drl").write_text(

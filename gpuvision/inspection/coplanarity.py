@@ -19,13 +19,13 @@ from gpuvision.inspection.coverage import covered
 from gpuvision.inspection.deposits import cells_of, complete_sigmas
 from gpuvision.inspection.top_height import top_height
 from gpuvision.matching.artwork.shapes import Float64
+from gpuvision.normal_distribution import MAD_TO_SIGMA
 from gpuvision.ranging.regrid import Grid
 from gpuvision.validation import finite
 
 _TOP_PATCH = 0.15  # half width of the patch of a top, in square roots of the area of the region. Chosen
 _TOUCHING = 1e-6  # distance from the seating plane, in ranges of the heights, of leads that touch it
 _FLAT = 1e-9  # smallest share of the area of the leads that three seats span
-_MAD = 1.4826
 
 
 class SeatingPlane(NamedTuple):
@@ -258,4 +258,4 @@ def _noise(parts: Sequence[tuple[Float64, npt.NDArray[np.bool_], slice, slice]])
     if not values.size:
         return math.nan
     # The variance of a third difference is (1 + 9 + 9 + 1) times that of a height; the median ignores edges.
-    return _MAD * float(np.median(np.abs(values - np.median(values)))) / math.sqrt(20)
+    return MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values)))) / math.sqrt(20)

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from gpuvision.matching.artwork.shapes import Float64
+from gpuvision.normal_distribution import MAD_TO_SIGMA
 
 MAX_ORDER = 2
 _TUKEY = 4.685  # tuning constant of Tukey's biweight: 95 % efficiency for normal residuals (Holland and Welsch 1977)
-_MAD = 1.4826  # standard deviation of normal residuals over their median absolute value
 _LEAST_SCALE = 1e-12  # [m]: residuals of a noise-free plane are rounding errors
 _LAD_STEPS, _TUKEY_STEPS = 15, 30
 _LAD_TOLERANCE = 0.1  # change of the residuals, in their scale: the result is only the start of the second fit
@@ -91,12 +91,12 @@ def fit_reference(x: Float64, y: Float64, z: Float64, order: int) -> ReferenceSu
     coefficients = np.zeros(design.shape[1])
     residual = z - level
     for _ in range(_LAD_STEPS):
-        scale = max(_MAD * float(np.median(np.abs(residual))), _LEAST_SCALE)
+        scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), _LEAST_SCALE)
         coefficients = _weighted(design, z - level, 1.0 / np.maximum(np.abs(residual), 1e-2 * scale))
         before, residual = residual, z - level - design @ coefficients
         if np.max(np.abs(residual - before)) < _LAD_TOLERANCE * scale:
             break
-    scale = max(_MAD * float(np.median(np.abs(residual))), _LEAST_SCALE)
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), _LEAST_SCALE)
     weights = np.zeros_like(residual)
     for _ in range(_TUKEY_STEPS):
         ratio = np.minimum((residual / (_TUKEY * scale)) ** 2, 1.0)

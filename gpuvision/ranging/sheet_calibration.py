@@ -34,6 +34,7 @@ from scipy.special import fdtrc
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.views.pose_response import PoseResponse, ray_derivatives
+from gpuvision.normal_distribution import MAD_TO_SIGMA
 
 Along = Literal["columns", "rows"]
 Float64 = npt.NDArray[np.float64]
@@ -42,7 +43,6 @@ SHEET_PARAMETERS = ("offset", "slope_g", "slope_h", "gg", "gh", "hh")
 """Names of the parameters of a sheet [m, -, -, 1/m, 1/m, 1/m]; a plane has the first three."""
 
 # Standard deviation of a normal distribution over its median absolute deviation.
-_SIGMA_OF_MAD = 1.4826
 # Tuning constant of Tukey's loss: 95 % efficiency for normal noise.
 _TUKEY = 4.685
 # Degrees of freedom that the line of a view contributes to the tests: offset, direction and curvature.
@@ -439,7 +439,7 @@ def _robust_fit(frame: _Frame, readings: _Readings, limits: SheetLimits) -> tupl
         frame = frame.moved(change)
         bend = bend + (change[3:] if count > 3 else 0.0)
         pixels = (system.distance - system.design @ change) / scale
-        before, sigma = sigma, max(_SIGMA_OF_MAD * float(np.median(np.abs(pixels[known]))), limits.noise_floor_px)
+        before, sigma = sigma, max(MAD_TO_SIGMA * float(np.median(np.abs(pixels[known]))), limits.noise_floor_px)
         weight = np.where(known, np.clip(1.0 - (pixels / (_TUKEY * sigma)) ** 2, 0.0, None) ** 2, 0.0)
         if abs(before - sigma) <= 1e-6 * sigma:
             break

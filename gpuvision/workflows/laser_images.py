@@ -16,6 +16,7 @@ from gpuvision.camera.calibration import DetectedTarget
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.recordings import Channel, image_files, read_frame
+from gpuvision.normal_distribution import MAD_TO_SIGMA
 from gpuvision.ranging.background import line_threshold, noise_threshold
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.sheet_calibration import Along
@@ -35,7 +36,6 @@ _LEAST_JUMP = 5.0
 # Readings left out on either side of an edge: both levels lie in the window of the readout, or the edge is round.
 _EDGE = 6
 # Standard deviation of a normal distribution over its median absolute deviation.
-_SIGMA_OF_MAD = 1.4826
 
 
 class LightImage(NamedTuple):
@@ -257,7 +257,7 @@ def split_steps(points: npt.ArrayLike, steps: int) -> tuple[npt.NDArray[np.bool_
     windows = np.median(np.lib.stride_tricks.sliding_window_view(level, _STEP_WINDOW), axis=1)
     # Jump between the readings i - 1 and i, from the medians of a window before and a window after it.
     jump = np.abs(windows[_STEP_WINDOW:] - windows[:-_STEP_WINDOW])
-    noise = _SIGMA_OF_MAD * float(np.median(np.abs(slopes - np.median(slopes))))
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(slopes - np.median(slopes))))
     edges: list[int] = []
     for _ in range(steps - 1):
         place = int(np.argmax(jump))

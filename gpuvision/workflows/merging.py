@@ -19,6 +19,7 @@ from gpuvision.host import Device, to_numpy
 from gpuvision.host.errors import ReadError
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
+from gpuvision.normal_distribution import MAD_TO_SIGMA
 from gpuvision.plots.range_image import draw_height_map
 from gpuvision.ranging.merge_heights import (
     DISAGREES,
@@ -36,7 +37,6 @@ MERGE_FILES = ("range_image.tiff", "range_image.png", "range_image.npz", "pictur
 """Names of the files that `HeightMapMerge.write` writes; ``range_image_sigma.tiff`` is added if sigma is known."""
 SIGMA_FILE = "range_image_sigma.tiff"
 # Standard deviation of a normal distribution over its median absolute deviation.
-_NORMAL_MAD = 1.4826
 # Median difference of the maps, in standard deviations of one difference, from which a warning names an offset of the
 # frames. Chosen: half a standard deviation moves 12 % of the agreeing cells beyond two.
 _OFFSET = 0.5
@@ -86,7 +86,7 @@ class HeightMapMerge:
         if not len(self.differences):
             return math.nan, math.nan
         middle = float(np.median(self.differences))
-        return middle, _NORMAL_MAD * float(np.median(np.abs(self.differences - middle)))
+        return middle, MAD_TO_SIGMA * float(np.median(np.abs(self.differences - middle)))
 
     def advice(self) -> tuple[str, ...]:
         """Return what to check: no common cells, an offset of the two frames, or many cells that disagree."""

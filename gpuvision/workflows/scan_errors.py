@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device, to_numpy
+from gpuvision.normal_distribution import MAD_TO_SIGMA
 from gpuvision.ranging.range_image import RangeImage, RangePoints, StraightTransport
 from gpuvision.sensor.sensor import Sensor
 
@@ -22,7 +23,6 @@ Array = npt.NDArray[Any]
 
 _PROFILES = 256  # largest number of profiles that determine the measured scatter. Chosen: its cost stays below 0.1 s
 _FEWEST = 100  # smallest number of samples that determine a median absolute deviation, to about 12 %
-_NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _PLANE_SHARE = 8.0 / 9.0  # variance of a sample's residual from the plane through its 3 x 3 samples, over its variance
 
 
@@ -177,7 +177,7 @@ def scatter_about_plane(z: Array) -> float:
     if residuals.size < _FEWEST:
         return math.nan
     deviation = np.median(np.abs(residuals - np.median(residuals)))
-    return float(_NORMAL * deviation / math.sqrt(_PLANE_SHARE))
+    return float(MAD_TO_SIGMA * deviation / math.sqrt(_PLANE_SHARE))
 
 
 def error_budget(errors: ScanErrors | None, z: Array, map_sigma: Array | None, *, camera: bool) -> dict[str, Any]:

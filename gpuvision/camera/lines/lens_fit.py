@@ -14,6 +14,7 @@ from gpuvision.camera.lines.line_families import Float64, LineFamilies, PackedLi
 from gpuvision.camera.lines.straightness import pencil_basis
 from gpuvision.camera.lines.variable_projection import Minimum, vanishing_start
 from gpuvision.camera.smooth_field import LackOfFit
+from gpuvision.normal_distribution import MAD_TO_SIGMA
 
 LensModel = Literal["none", "k1", "k1,k2", "k1,k2,k3", "k1,k2,k3,k4"]
 LineConstraint = Literal["auto", "vanishing", "free"]
@@ -21,7 +22,6 @@ LineConstraint = Literal["auto", "vanishing", "free"]
 MODELS: tuple[LensModel, ...] = ("none", "k1", "k1,k2", "k1,k2,k3", "k1,k2,k3,k4")
 """Lens models by number of distortion coefficients."""
 # Standard deviation of a normal distribution over its median absolute deviation.
-_NORMAL_MAD = 1.4826
 # Residual [half-diagonals] at rounding level.
 _ROUNDING = 1e-9
 
@@ -258,10 +258,10 @@ def fit_warnings(
     single = np.bincount(packed.family, minlength=packed.families) < 2
     if fit.lines == "vanishing" and single.any():
         yield f"families {np.flatnonzero(single).tolist()} have fewer than two lines, hence no vanishing point"
-    robust_sigma = _NORMAL_MAD * packed.unit * float(np.median(np.abs(found.evaluation.distance)))
+    robust_sigma = MAD_TO_SIGMA * packed.unit * float(np.median(np.abs(found.evaluation.distance)))
     if fit.rms_px > max(limits.max_tail_ratio * robust_sigma, _ROUNDING * packed.unit):
         yield (
-            f"half of the points lie within {robust_sigma / _NORMAL_MAD:.3g} pixels, but the rms is {fit.rms_px:.3g}: "
+            f"half of the points lie within {robust_sigma / MAD_TO_SIGMA:.3g} pixels, but the rms is {fit.rms_px:.3g}: "
             "there are outliers; use loss='tukey'"
         )
     lack = fit.lack_of_fit

@@ -12,6 +12,7 @@ import scipy.special
 from gpuvision.camera.lines.line_families import Float64, PackedLines
 from gpuvision.camera.lines.straightness import Parameters, constrained_lines, inner_products, projected_columns
 from gpuvision.camera.lines.variable_projection import Minimum, linear_start, minimise
+from gpuvision.normal_distribution import MAD_TO_SIGMA
 
 Loss = Literal["squared", "huber", "tukey"]
 
@@ -24,7 +25,6 @@ _SETTLED = 1e-3
 # Relative eigenvalue below which the data do not determine a parameter. Derived: above double rounding.
 _SINGULAR = 1e-13
 # Standard deviation of a normal distribution over its median absolute deviation.
-_NORMAL_MAD = 1.4826
 # Square root of Tukey's least weight.
 _LEAST_ROOT = 1e-4
 # Residuals [half-diagonals] at rounding level, which no test may compare. Derived from double precision.
@@ -196,7 +196,7 @@ def robust_start(packed: PackedLines, centre: Float64 | None) -> tuple[Parameter
     for _ in range(_MAX_ROUNDS):
         start = linear_start(packed, centre, weight)
         distance = start.distances(packed, weight)
-        weight = robust_weights(distance, max(_NORMAL_MAD * float(np.median(np.abs(distance))), _ROUNDING), "huber")
+        weight = robust_weights(distance, max(MAD_TO_SIGMA * float(np.median(np.abs(distance))), _ROUNDING), "huber")
     return start.parameters, weight
 
 
@@ -213,7 +213,7 @@ def fit_reweighted(
     for stage in stages:
         for _ in range(_MAX_ROUNDS):
             distance, before = found.evaluation.distance, weight
-            scale = sigma if sigma is not None else float(_NORMAL_MAD * left * np.median(np.abs(distance)))
+            scale = sigma if sigma is not None else float(MAD_TO_SIGMA * left * np.median(np.abs(distance)))
             scale = max(scale, _ROUNDING)
             weight = robust_weights(distance, scale, stage)
             found = minimise(packed, found.parameters, weight=weight, keep_centre=keep_centre)

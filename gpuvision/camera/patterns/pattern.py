@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.image import grey_image
+from gpuvision.normal_distribution import MAD_TO_SIGMA
 
 Float64: TypeAlias = npt.NDArray[np.float64]
 Float32: TypeAlias = npt.NDArray[np.float32]
@@ -18,7 +19,6 @@ LineFamilies: TypeAlias = tuple[tuple[Float64, ...], ...]
 """Families of lines that are parallel in the world; a line is an array (n, 2) of measured (column, row), in order."""
 
 # Standard deviation of a normal distribution over its median absolute deviation.
-_SIGMA_OF_MAD = 1.4826
 # Highest order of differences, and least number of differences of an order, for the noise estimate.
 _MAX_ORDER = 6
 _MIN_DIFFERENCES = 12
@@ -83,7 +83,7 @@ def estimate_localisation_noise(points: npt.ArrayLike) -> float:
         known = np.abs(np.concatenate(steps))
         known = known[np.isfinite(known)]
         if known.size >= _MIN_DIFFERENCES:
-            estimates.append(float(np.median(known)) * _SIGMA_OF_MAD / math.sqrt(math.comb(2 * order, order)))
+            estimates.append(float(np.median(known)) * MAD_TO_SIGMA / math.sqrt(math.comb(2 * order, order)))
     return float(np.fmin.reduce(estimates))
 
 

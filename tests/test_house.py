@@ -186,6 +186,7 @@ FLOORS = (
     ("simulation.errors", "simulation.transport"),
     ("simulation.clustering",),
     ("simulation",),
+    ("servoing",),
     ("formats", "plots"),
     ("sensor",),
     ("workflows",),

@@ -50,7 +50,7 @@ PACKAGES = {
     ),
     "servoing": (
         "Visual servoing",
-        "Steer a head by its camera: delay, observer, controllers, machine model, and the loop.",
+        "Steer a head by its camera: frames, calibration of the machine, delay, control, and the placement of parts.",
     ),
     "sensor": ("Sensors", "A sensor as its description file states it: readout, light source, simulated twin."),
     "formats": ("Files", "Read and write sensor, lens, field, feature and material files, and range images."),
@@ -100,6 +100,7 @@ MODULES = (
     "gpuvision.reference.triangulation",
     "gpuvision.reference.undistort_image",
     "gpuvision.reference.visible_intervals",
+    "gpuvision.servoing.frames",
     "gpuvision.sensor.light_source",
     "gpuvision.sensor.sensor",
     "gpuvision.formats.camera_file",

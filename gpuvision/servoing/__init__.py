@@ -1,1 +1,1 @@
-"""Visual servoing: frames, delay, observer, controllers and the loop that steers a head by its camera."""
+"""Visual servoing: frames and calibration of a machine, delay, observer, control, and the placement of parts."""

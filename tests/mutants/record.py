@@ -20,6 +20,12 @@ from mutants.faults import ROOT, Fault
 OUT = ROOT / "build" / "mutants"
 _MAX_FILES, _MAX_FILES_OF_MODULE = 6, 3
 _DATA, _TIMES = OUT / "coverage", OUT / "times.xml"
+# Tests that read the text of every source file: no record shows them.
+_TESTS_OF_TEXTS = (
+    "tests/test_source_rules.py",
+    "tests/test_house.py::test_dataclasses_are_frozen",
+    "tests/docs/test_documented_defaults.py",
+)
 
 
 def record_lines(arguments: Iterable[str] = ()) -> None:
@@ -46,6 +52,7 @@ def environment(tree: Path) -> dict[str, str]:
 def tests_of(fault: Fault, budget: float) -> list[str]:
     """Return tests for a fault, in the order to run them: recorded tests, the shortest first, then test files.
 
+    Python files have tests that read the source, too. They take a few seconds and come before the test files.
     The recorded tests run the lines of the fault and take up to `budget` seconds together. Lines that run only at
     import have no recorded tests; for them, take all tests that run any line of the file. For a kernel, take the test
     file of its name and the tests of the operations that launch it; for a header of many kernels, at most `_MAX_FILES`
@@ -67,7 +74,7 @@ def tests_of(fault: Fault, budget: float) -> list[str]:
             total += times[_key(name)]
             if total <= budget:
                 chosen.append(name)
-    return [*chosen, *files]
+    return [*chosen, *(_TESTS_OF_TEXTS if is_code else ()), *files]
 
 
 @cache

@@ -1,0 +1,106 @@
+"""Rules that every source file keeps: flags of dataclasses, keyword-only parameters, equal lengths in zip.
+
+A test of one operation does not see that a class lost its flag. These tests read the source and take a second.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TypeVar
+
+ROOT = Path(__file__).resolve().parents[1]
+Node = TypeVar("Node", bound=ast.AST)
+
+# Dataclasses whose members may be given by position: records that one module makes and reads, and pairs and triples
+# of the host. All others are made by keyword: operations, options and results get new members between the old ones.
+POSITIONAL_DATACLASSES = {
+    *("ExchangedAxes", "PixelMap", "Packer", "SmoothResiduals", "PackedLines", "Evaluation", "Minimum", "FitState"),
+    *("CorrelatedErrors", "_Task", "_Candidate", "TransformedAperture", "Shape", "DrawnObject", "_ModelProblem"),
+    *("LightCut", "LightTree", "Bvh", "Defects", "Scene", "LitSegments", "ProjectedLines", "MirrorSurfaces", "Patches"),
+    *("SheetIndex", "_Job", "Batch", "_Site", "ListedDevice", "ProbedDevice", "Launch", "Trial", "Plan", "FileLimit"),
+    *("DurationStatistics", "Step", "WorkSize"),
+}
+# Dataclasses that are compared by identity. They hold arrays, whose comparison has no single truth value, or they are
+# keys of caches, where a comparison of all members would be slow.
+COMPARED_BY_IDENTITY = {
+    *("PixelMap", "BoardView", "Aperture", "Pad", "Artwork", "Shape", "DrawnObject", "LocatedBoard", "FeatureSet"),
+    *("DistanceMap", "LocatedRobot", "CoarseRegistration", "ClusteredIrradiance", "LightCut", "LightTree"),
+    *("ErrorAttribution", "StripErrorModel", "LightPaths", "Bvh", "Scene", "CameraSimulator", "Mask", "PsdSimulator"),
+    *("SensorView", "ViewRays", "DirectLight", "LitSegments", "LensVisibility", "ProjectedLines", "MirrorFacets"),
+    *("MirrorPoints", "MirrorSurfaces", "Mirrors", "Patches", "Radiosity", "SheetIndex", "SpecularInterreflection"),
+    *("SurfaceReflection", "SimulationTask", "_Site"),
+}
+# Calls of zip that end with the shorter sequence, and why.
+UNEQUAL_LENGTHS = {
+    "gpuvision/matching/artwork/board_files.py": 1,  # the common beginning of two names
+    "gpuvision/camera/image_map.py": 1,  # each table takes the first of the shifts
+    "host/recordings.py": 1,  # a damaged TIFF states more strips than it counts
+}
+
+
+@functools.cache
+def _trees() -> dict[str, ast.Module]:
+    files = [path for folder in ("gpuvision", "host") for path in sorted((ROOT / folder).rglob("*.py"))]
+    return {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in files}
+
+
+def _nodes(kind: type[Node]) -> Iterator[tuple[str, Node]]:
+    """Yield the file and the node of each node of a kind."""
+    for file, tree in _trees().items():
+        for node in ast.walk(tree):
+            if isinstance(node, kind):
+                yield file, node
+
+
+def _flags() -> Iterator[tuple[str, dict[str, bool]]]:
+    """Yield the name and the flags of each dataclass."""
+    for _, node in _nodes(ast.ClassDef):
+        for each in node.decorator_list:
+            if ast.unparse(each).partition("(")[0] == "dataclass":
+                words = each.keywords if isinstance(each, ast.Call) else []
+                yield node.name, {str(word.arg): ast.literal_eval(word.value) for word in words}
+
+
+def test_dataclasses_are_made_by_keyword() -> None:
+    classes = list(_flags())
+    assert len(classes) > 150
+    assert {name for name, flags in classes if not flags.get("kw_only", False)} - POSITIONAL_DATACLASSES == set()
+
+
+def test_dataclasses_with_arrays_are_compared_by_identity() -> None:
+    assert COMPARED_BY_IDENTITY - {name for name, flags in _flags() if not flags.get("eq", True)} == set()
+
+
+def test_zip_needs_equal_lengths() -> None:
+    """A sequence that is too short is a fault of the program; zip would drop the last members without a word."""
+    found: dict[str, int] = {}
+    calls = 0
+    for file, node in _nodes(ast.Call):
+        if ast.unparse(node.func) == "zip":
+            calls += 1
+            if {word.arg: ast.unparse(word.value) for word in node.keywords} != {"strict": "True"}:
+                found[file] = found.get(file, 0) + 1
+    assert calls > 100
+    assert found == UNEQUAL_LENGTHS
+
+
+def test_nothing_is_overwritten_by_default() -> None:
+    """The default of each parameter and member `overwrite` is False."""
+    defaults = []
+    for file, node in _nodes(ast.arguments):
+        places = [*node.posonlyargs, *node.args]
+        pairs = [*zip(places[len(places) - len(node.defaults) :], node.defaults, strict=True)]
+        pairs += [(name, value) for name, value in zip(node.kwonlyargs, node.kw_defaults, strict=True) if value]
+        defaults += [(file, ast.unparse(value)) for name, value in pairs if name.arg == "overwrite"]
+    assert len(defaults) > 30
+    assert [each for each in defaults if each[1] != "False"] == []
+
+
+def test_options_are_given_by_keyword() -> None:
+    """After positional-only parameters come no parameters that are positional, too, but ``**values`` or options."""
+    signatures = list(_nodes(ast.arguments))
+    assert [(file, ast.unparse(node)) for file, node in signatures if node.posonlyargs and node.args] == []
+    assert [(file, ast.unparse(node)) for file, node in signatures if node.posonlyargs and node.defaults] == []

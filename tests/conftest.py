@@ -23,6 +23,7 @@ import pytest
 
 from gpuvision.host import Device, debug
 from gpuvision.host.discovery import INSTALL_HINT
+from processor_time import record_test, table_of_files
 from tiers import LEFT, device_of, select_fast, select_full
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -139,8 +140,16 @@ def _a_device_is_there(request: pytest.FixtureRequest, monkeypatch: pytest.Monke
         monkeypatch.setattr(device, "inline_device", None)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Start the processor time of a test, before its fixtures."""
+    record_test(item)
+
+
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
     """Write the arrays of a test whose comparison failed to the folder of ``GPUVISION_DEBUG``, if it is set."""
+    if call.when == "teardown":
+        record_test(item)
     if call.excinfo is None or not call.excinfo.errisinstance(AssertionError):
         return
     frames = [each.frame for each in call.excinfo.traceback if each.path == item.path]
@@ -160,6 +169,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     if left:
         more = "full tier (make test-full)" if config.getoption("tier") == "fast" else "nightly tier (make nightly)"
         terminalreporter.write_line(f"left to the {more}: {_counts(left)}")
+    for line in table_of_files(each for each in terminalreporter.getreports("") if each.when == "teardown"):
+        terminalreporter.write_line(line)
     if config.getoption("strict_skips"):
         for each in _unexpected_skips(config):
             terminalreporter.write_line(f"unexpected skip: {each}", red=True)

@@ -141,7 +141,7 @@ def non_oscillating_gain(delay: float) -> float:
     """
     whole, part = delay_taps(delay)
     if part == 0.0:
-        return whole**whole / (whole + 1.0) ** (whole + 1)
+        return (whole / (whole + 1.0)) ** whole / (whole + 1.0)
     # The gain z^(n+1) (1 - z) / ((1 - f) z + f) is largest where its derivative, a quadratic in z, is 0.
     roots = np.roots([-(whole + 1) * (1.0 - part), (whole + 1) * (1.0 - 2.0 * part) - 1.0, (whole + 1) * part])
     z = max(float(each.real) for each in roots if 0.0 < each.real < 1.0)

@@ -56,7 +56,7 @@ class PasteSettings:
         Height [m] of the bare pad above the reference surface: copper is higher than laminate, and lower than a solder
         mask that covers the traces around it. Default 0.
     least_valid : float
-        Least fraction of cells with a height, 0 to 1; below it a deposit is not measured. Default 0.8.
+        Least fraction of cells with a height, above 0, at most 1; below it a deposit is not measured. Default 0.8.
     least_reference : int
         Least number of cells of the reference surface. Default 30.
 

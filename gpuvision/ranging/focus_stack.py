@@ -145,8 +145,8 @@ class FocusStack:
     threshold : float
         Smallest focus measure of a valid pixel [grey levels; mean over the window], default 0.
     ambiguity : float, optional
-        Second maximum, relative to the largest one, from which on a pixel is AMBIGUOUS, 0 to 1. Between two maxima the
-        measure falls below half of the smaller one. Default: not checked.
+        Second maximum, relative to the largest one, from which on a pixel is AMBIGUOUS, above 0, at most 1. Between two
+        maxima the measure falls below half of the smaller one. Default: not checked.
     saturation : float, optional
         Level at which a pixel is saturated [grey levels]; default: the largest code of integer frames.
     principal_point_px : (column, row), optional

@@ -145,8 +145,8 @@ class LineReadout(VisionOperation[LineReading]):
         Level at which a sample is saturated [grey levels]; default: the largest code of integer frames, no limit for
         float32. ``"ml"`` leaves saturated samples out of the fit.
     ambiguity : float, optional
-        Fraction of the peak's light, 0 to 1. A sample outside the window with at least this fraction sets the flag
-        AMBIGUOUS. Default: no search for such samples.
+        Fraction of the peak's light, above 0, at most 1. A sample outside the window with at least this fraction sets
+        the flag AMBIGUOUS. Default: no search for such samples.
     fir_length : {4, 8}
         Taps of the derivative filter, default 4.
     read_noise, gain : float

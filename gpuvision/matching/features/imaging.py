@@ -38,9 +38,10 @@ class Imaging:
     smoothing_ratio : float
         Smoothing of the rulers over the blur, above 0, default sqrt(5): the best for isolated edges. A smaller ratio
         needs less room between edges and is less precise (1.44 times the sigma at 1).
-    shift, angle : float
-        Search range: largest offset of the board along x and along y [m], above 0, default 100 um, and largest angle
-        [rad], default 5 mrad.
+    shift : float
+        Search range: largest offset of the board along x and along y [m], above 0, default 100 um.
+    angle : float
+        Search range: largest angle of the board [rad], 0 or more, default 5 mrad.
 
     Raises
     ------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gpuvision.host.errors import ReadError, RecordingError
-from gpuvision.host.reading import reading, reason_of
+from gpuvision.host.reading import FileLimit, check_pixels, reading, reason_of
 
 
 @pytest.mark.parametrize(
@@ -51,3 +51,28 @@ def test_an_error_of_the_file_system_without_a_file_is_foreign() -> None:
 def test_reasons_are_one_printable_line(problem: BaseException, reason: str) -> None:
     assert reason_of(problem).startswith(reason)
     assert reason_of(problem).isprintable()
+
+
+def test_a_limit_is_inclusive_and_may_be_changed(monkeypatch: pytest.MonkeyPatch) -> None:
+    limit = FileLimit("GPUVISION_MAX_TEST", 10)
+    limit.check(10, "a.stl: 10 triangles")
+    with pytest.raises(RecordingError, match=r"^a\.stl: 11 triangles"):
+        limit.check(11, "a.stl: 11 triangles", RecordingError)
+    monkeypatch.setenv("GPUVISION_MAX_TEST", "0.5")
+    assert limit.value == 0.5
+    for text in ("0", "-1", "nan", "many"):
+        monkeypatch.setenv("GPUVISION_MAX_TEST", text)
+        with pytest.raises(ReadError, match=f"^the environment variable GPUVISION_MAX_TEST is '{text}', expected"):
+            limit.check(1, "a.stl")
+
+
+@pytest.mark.parametrize(
+    ("shape", "fits"), [((3, 4), True), ((3, 5), False), ((13,), False), ((), True), ((4, 3, 3), True)]
+)
+def test_pixels_are_rows_times_columns(shape: tuple[int, ...], fits: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GPUVISION_MAX_PIXELS", "12")
+    if fits:
+        check_pixels(shape, "a.png")
+    else:
+        with pytest.raises(ReadError, match=rf"^a\.png: {(*shape, 1)[1]} x {shape[0]} pixels"):
+            check_pixels(shape, "a.png")

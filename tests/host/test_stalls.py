@@ -160,6 +160,7 @@ def test_pauses_outside_a_stall_do_not_count(clock: ManualClock) -> None:
     collect(clock, 5 * MS)
     assert pauses.overlap(0, 10 * MS) == 0
     assert pauses.overlap(12 * MS, 13 * MS) == MS
+    assert pauses.overlap(20 * MS, 30 * MS) == 0
     assert pauses.overlap(0, 100 * MS) == pytest.approx(5 * MS, abs=10_000)
     assert not any(getattr(each, "__self__", None) is pauses for each in gc.callbacks)
 

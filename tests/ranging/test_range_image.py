@@ -307,11 +307,20 @@ def test_an_unknown_transport_spoils_its_profile_only(device, geometry, variant)
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_limits_are_inclusive(device, variant):
-    g = np.array([[-0.5, -0.25, 0.0, 0.25, 0.5]], np.float32)
-    op = RangeImage(geometry=StraightTransport(), limits=((-0.25, 0.25), (-1, 1), (0, 1)), variant=variant)
-    made = op(g, np.zeros_like(g), np.zeros(1, np.float32), np.zeros(g.shape, np.uint8), device=device)
-    assert made.status[0].tolist() == [4, 0, 0, 0, 4]
-    assert np.isnan(made.y[0]).tolist() == [True, False, False, False, True]
+    values = np.array([-0.5, -0.25, 0.0, 0.25, 0.5], np.float32)
+    zero = np.zeros((1, 5), np.float32)
+    for axis, limits in enumerate([(-0.25, 0.25), (-0.25, 0.25), (0.0, 0.25)]):
+        bounds = [(-1.0, 1.0)] * 3
+        bounds[axis] = limits
+        op = RangeImage(geometry=StraightTransport(), limits=bounds, variant=variant)
+        g, h = (values[None] if number == axis else zero for number in (0, 2))
+        transport = values if axis == 1 else np.zeros(1, np.float32)
+        g, h = (np.broadcast_to(each, (len(transport), 5)).copy() for each in (g, h))
+        made = op(g, h, transport, np.zeros(g.shape, np.uint8), device=device)
+        status, y = (made.status, made.y) if axis != 1 else (made.status.T, made.y.T)
+        inside = (values >= limits[0]) & (values <= limits[1])
+        np.testing.assert_array_equal(status, np.broadcast_to(np.where(inside, 0, 4), status.shape))
+        np.testing.assert_array_equal(np.isnan(y), status != 0)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

@@ -85,6 +85,19 @@ def test_a_gap_stays_a_hole(device):
     np.testing.assert_allclose(bridged.z, GRID.x + GRID.y[:, None] / 2, atol=1e-14)
 
 
+def test_gaps_and_steps_are_joined_up_to_their_limits(device):
+    """Two samples a quarter apart in x and an eighth in height; all numbers are exact."""
+    x, y = np.broadcast_to([-0.5, -0.25], (3, 2)).copy(), np.broadcast_to([[-0.25], [0.0], [0.25]], (3, 2)).copy()
+    z = np.broadcast_to([0.0, 0.125], (3, 2)).copy()
+    frames = (x, y, z, np.ones((3, 2)), np.zeros((3, 2), np.uint8))
+    between = (GRID.x == -0.375).argmax()
+    for gap, step, is_joined in ((0.25, 0.125, True), (0.2499, 0.125, False), (0.25, 0.1249, False)):
+        made = dataclasses.replace(OP, max_gap=gap, max_step=step)(*frames, device=device)
+        row = (GRID.y == 0.0).argmax()
+        assert (made.status[row, between] == 0) == is_joined
+        assert not is_joined or made.z[row, between] == 0.0625
+
+
 def test_a_step_is_not_joined(device):
     x, y, z, intensity, status = flat((40, 61))
     z = np.where(x > 0.03, 0.3, 0.0)

@@ -85,11 +85,24 @@ def test_few_files_give_the_options_to_copy(tmp_path: Path, capfd: pytest.Captur
     assert capfd.readouterr() == ("", "")
 
 
+def test_a_file_above_the_limit_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file of the limit's size is read; of the folder only files count, not the folders in it."""
+    board(tmp_path)
+    (tmp_path / "empty").mkdir()
+    largest = max(path.stat().st_size for path in tmp_path.iterdir() if path.is_file())
+    monkeypatch.setenv("GPUVISION_MAX_BOARD_BYTES", str(largest))
+    assert read_artwork(tmp_path).warnings == ()
+    (tmp_path / "notes.txt").write_text("n" * (largest + 1))
+    with pytest.raises(ReadError, match=rf"notes\.txt has {largest + 1} bytes"):
+        read_artwork(tmp_path)
+
+
 def test_two_boards_in_one_folder_give_the_options_of_one(tmp_path: Path) -> None:
     board(tmp_path, "front_panel")
     board(tmp_path, "main")
     with pytest.raises(ReadError, match=r"two boards in one folder .*: front_panel\.gtl, main\.gtl\)") as error:
         read_artwork(tmp_path)
+    assert "layers unknown" not in str(error.value)
     layers = proposed(error)
     with open_board(tmp_path, layers) as stack:
         names = {each.original_path.name for each in stack.graphic_layers.values()}

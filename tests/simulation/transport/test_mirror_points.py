@@ -233,8 +233,10 @@ def test_what_it_does_not_take(device: Device) -> None:
         MirrorPoints(corners=corners[0], normals=normals, numbers=[])
     with pytest.raises(ValueError, match="length"):
         MirrorPoints(corners=corners, normals=normals[1:], numbers=np.arange(len(corners)))
-    with pytest.raises(ValueError, match="kept"):
-        mirrors(0, kept=0)
+    for kept in (0, 256):
+        with pytest.raises(ValueError, match="kept"):
+            mirrors(0, kept=kept)
+    assert (mirrors(0, kept=1).kept, mirrors(0, kept=255).kept) == (1, 255)
     with pytest.raises(ValueError, match=r"\(\.\.\., 6\)"):
         mirrors(0)(np.zeros((4, 5)), LENS, device=device)
     with pytest.raises(TypeError, match="float32"):

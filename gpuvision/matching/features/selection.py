@@ -132,6 +132,45 @@ def predict_selection(
     return Selection(which, covariance, float(price[which].sum()), condition, _region(rulers, which, imaging))
 
 
+class TwoRowUpdate(NamedTuple):
+    """Effect of candidates with two measured coordinates each on the covariance of some parameters.
+
+    Attributes
+    ----------
+    first, second : (n, p)
+        Rows of each candidate times the covariance.
+    one, two, mixed : (n,)
+        Diagonal and off-diagonal element of ``I + w R C R'``, with R the two rows.
+    determinant : (n,)
+        Determinant of ``I + w R C R'``: the factor by which the determinant of the covariance shrinks.
+    """
+
+    first: Float64
+    second: Float64
+    one: Float64
+    two: Float64
+    mixed: Float64
+    determinant: Float64
+
+
+def two_row_update(rows: Float64, second_rows: Float64, weight: Float64, covariance: Float64) -> TwoRowUpdate:
+    """Predict how much each candidate shrinks a covariance.
+
+    Parameters
+    ----------
+    rows, second_rows
+        (n, p) derivatives of the two measured coordinates; zeros where a candidate has one coordinate.
+    weight
+        (n,) one over the variance of a coordinate.
+    covariance
+        (p, p) covariance of the parameters before the measurement.
+    """
+    first, second = rows @ covariance, second_rows @ covariance
+    one, two = (1 + weight * np.einsum("ij,ij->i", *each) for each in ((first, rows), (second, second_rows)))
+    mixed = weight * np.einsum("ij,ij->i", first, second_rows)
+    return TwoRowUpdate(first, second, one, two, mixed, one * two - mixed**2)
+
+
 def _price(rulers: FeatureCandidates, costs: Any) -> Float64:
     price = np.ones(len(rulers.sigma)) if costs is None else np.asarray(costs, dtype=np.float64)
     if price.shape != rulers.sigma.shape or not np.all(price > 0):
@@ -177,20 +216,15 @@ def _greedy(
         free &= price <= budget
         if not free.any():
             return np.array(chosen, dtype=np.int64)
-        first_gain, also = rows @ covariance, second @ covariance
-        # The determinant of I + w R C R', R the two rows of a fiducial; the second row of a ruler is 0.
-        one, two = (1 + weight * np.einsum("ij,ij->i", *each) for each in ((first_gain, rows), (also, second)))
-        mixed = weight * np.einsum("ij,ij->i", first_gain, second)
-        total = one * two - mixed**2
+        update = two_row_update(rows, second, weight, covariance)
         if criterion == "determinant":
             # Information of the pose alone: without the information of the etch bias.
-            gain = np.log(total) - np.log1p(weight * rows[:, 3] ** 2 / etch_information)
+            gain = np.log(update.determinant) - np.log1p(weight * rows[:, 3] ** 2 / etch_information)
         else:
-            products = [
-                np.sum(a[:, :2] * b[:, :2], axis=1)
-                for a, b in ((first_gain, first_gain), (first_gain, also), (also, also))
-            ]
-            gain = weight * (two * products[0] - 2 * mixed * products[1] + one * products[2]) / total
+            pairs = ((update.first, update.first), (update.first, update.second), (update.second, update.second))
+            products = [np.sum(a[:, :2] * b[:, :2], axis=1) for a, b in pairs]
+            one, two, mixed = update.one, update.two, update.mixed
+            gain = weight * (two * products[0] - 2 * mixed * products[1] + one * products[2]) / update.determinant
         best = int(np.argmax(np.where(free, gain / price, -np.inf)))
         chosen.append(best)
         for row in (rows[best], second[best]):

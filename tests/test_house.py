@@ -167,7 +167,7 @@ def test_every_kernel_has_a_module_a_test_and_a_benchmark_of_its_name() -> None:
 # sub-packages of its package. A module imports only from lower floors and from its package.
 FLOORS = (
     ("kernels", "host", "reference"),
-    ("status", "validation", "schema", "normal_distribution"),
+    ("status", "validation", "schema", "jackknife", "normal_distribution"),
     ("operation",),
     ("camera",),
     ("camera.patterns",),

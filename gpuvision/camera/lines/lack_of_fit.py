@@ -36,6 +36,7 @@ from gpuvision.camera.lines.line_statistics import image_normals, p_value_of_gai
 from gpuvision.camera.lines.straightness import ResidualJacobian, line_coefficients, projected_columns
 from gpuvision.camera.lines.variable_projection import Minimum
 from gpuvision.camera.smooth_field import LackOfFit, mode_variances, not_below
+from gpuvision.jackknife import cluster_jackknife
 
 # Degrees of the smooth field. Lines absorb the linear part. Degree 7 resolves a third of the image.
 _DEGREES = (2, 7)
@@ -151,7 +152,7 @@ def correlated_covariance(packed: PackedLines, found: Minimum, smooth: SmoothRes
     field = (shifts * by_degree[smooth.degree]) @ shifts.T
     block = _blocks(packed)
     clusters = (packed.line, block, packed.line * _BLOCKS**2 + block)
-    by_line, by_block, by_both = (_jackknife(columns, normal, smooth.rest, each) for each in clusters)
+    by_line, by_block, by_both = (cluster_jackknife(columns, normal, smooth.rest, each) for each in clusters)
     least = white[np.ix_(kept, kept)] / np.outer(scale, scale)
     total = np.array(white)
     total[np.ix_(kept, kept)] = (field + not_below(by_line + by_block - by_both, least)) * np.outer(scale, scale)
@@ -199,16 +200,3 @@ def _blocks(packed: PackedLines) -> Index:
         for place, corner in zip((packed.x, packed.y), np.maximum(packed.corner, np.finfo(float).tiny), strict=True)
     )
     return np.asarray(row * _BLOCKS + column)
-
-
-def _jackknife(columns: Float64, normal: Float64, residual: Float64, cluster: Index) -> Float64:
-    """Return the delete-one-cluster jackknife covariance, to first order in the parameters."""
-    order = np.argsort(cluster, kind="stable")
-    starts = np.flatnonzero(np.diff(cluster[order], prepend=-1))
-    ordered = columns[:, order]
-    scores = np.add.reduceat(ordered * residual[order], starts, axis=1)
-    products = np.add.reduceat(ordered[:, None] * ordered, starts, axis=2)
-    left = normal - products.transpose(2, 0, 1)
-    # The pseudoinverse: a cluster may hold all points that determine a parameter.
-    shifts = np.einsum("cij,jc->ci", np.linalg.pinv(left, hermitian=True), scores)
-    return np.asarray(shifts.T @ shifts * ((len(shifts) - 1) / len(shifts)))

@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,7 +41,14 @@ from gpuvision.matching.pose.motion import (
     project_edges,
     rotation,
 )
-from gpuvision.matching.pose.pose import SolvePose, Transform, line_rows
+from gpuvision.matching.pose.pose import BoardPose, SolvePose, Transform, line_rows
+from gpuvision.matching.pose.registration_errors import FittedEdges, registration_errors
+from gpuvision.matching.pose.registration_result import (
+    NOT_FOUND,
+    Registration,
+    RegistrationLimits,
+    ScoredMotion,
+)
 from gpuvision.status import Status
 from gpuvision.validation import finite, numbers
 
@@ -53,111 +60,6 @@ _REFINEMENT_ROWS = 128  # rulers of each candidate in step 2 (cost)
 # Start candidates of a robust pose: of half bad rows all contain an outlier with a probability of 6e-8 (derived).
 _TRIALS = {"rigid": 128, "similarity": 256, "affine": 512}
 _SEPARATION = (3, 2)  # distances in cells and headings within which two candidates of the grid count as the same
-
-
-@dataclass(frozen=True, kw_only=True)
-class RegistrationLimits:
-    """Thresholds of the decisions of a coarse registration.
-
-    Parameters
-    ----------
-    min_rulers
-        Least number of rulers in the image, and of known edges, to decide on a pose (chosen: four times the three
-        unknowns).
-    significance
-        Difference of two counts of rulers that is significant [standard deviations] (3: one error in 700 for normal
-        counts).
-    min_ratio
-        Ratio of scores, or of the counts of rulers that speak for one pose only, from which on a pose is preferred to
-        another one (chosen; tests on boards with repeated patterns confirm it).
-    border_cost
-        Cost of an edge beyond the image, relative to the mean cost in the image (measured). With 1, poses that keep
-        more edges in the image would win over the right one; below 0.5, poses that keep few edges in the image would
-        win.
-    refinements
-        Number of measurements of the best pose along short rulers, each placed at the pose of the previous one
-        (chosen).
-    """
-
-    min_rulers: int = 12
-    significance: float = 3.0
-    min_ratio: float = 2.0
-    border_cost: float = 0.7
-    refinements: int = 3
-
-
-class Registration(NamedTuple):
-    """Pose with its score; lengths in the unit of the known edges (metres of a board, pixels of an image).
-
-    Attributes
-    ----------
-    pose : (3,)
-        x, y, theta [rad]: a known point p appears at R(theta) (I + D) p + (x, y). Where the pose is refused, NaN like
-        ``deformation``, ``placement`` and ``covariance``.
-    deformation : (3,)
-        Scales along the known axes less 1, and shear: I + D = ((1 + kx, shear), (0, 1 + ky)); 0 for a rigid transform.
-    placement : (2,)
-        Measured position of the placement point.
-    covariance : (f, f)
-        Covariance of the placement point's x, y, of theta, and of the free deformation parameters, from the residuals
-        of the edges.
-    score : float
-        Share of the rulers in the image whose edge lies within the tolerance of the pose, 0 to 1; of the best pose
-        where it is refused.
-    runner_up : float
-        Score of the best other pose; where AMBIGUOUS, of the best pose that the edges do not exclude. 0 without one.
-    runner_up_pose : (3,)
-        NaN without one.
-    rulers : int
-        Number of verification rulers in the image.
-    status : Status
-        OK. With a pose: AMBIGUOUS (among the rulers that agree with one of the two poses only, too few more agree with
-        this pose than with the runner-up). Refused: LOW_SIGNAL (no pose reaches the least score), NO_DATA (too few
-        known edges in the image), AMBIGUOUS with NaN (the found edges do not determine all unknowns).
-    """
-
-    pose: Float64
-    deformation: Float64
-    placement: Float64
-    covariance: Float64
-    score: float
-    runner_up: float
-    runner_up_pose: Float64
-    rulers: int
-    status: Status
-
-
-class _ScoredMotion(NamedTuple):
-    """A motion (2, 3), and (n,) which verification rulers lie in the image and which agree with it."""
-
-    motion: Float64
-    inside: npt.NDArray[np.bool_]
-    agrees: npt.NDArray[np.bool_]
-
-    @property
-    def rulers(self) -> int:
-        return int(np.count_nonzero(self.inside))
-
-    @property
-    def score(self) -> float:
-        return float(np.count_nonzero(self.agrees)) / self.rulers
-
-    def is_better_than(self, other: _ScoredMotion, limits: RegistrationLimits) -> bool:
-        """Return whether the rulers prefer this motion significantly.
-
-        Counted are the rulers in the image for both motions that agree with only one of them. With two valid motions (a
-        repeated pattern), about the same number of rulers agrees with each. An edge agrees with a wrong motion by
-        chance only: the counts must differ by three standard deviations of their difference, and by a factor of two. A
-        factor of two between the scores is also sufficient, for images with few rulers in common.
-        """
-        if self.score >= limits.min_ratio * other.score:
-            return True
-        both = self.inside & other.inside
-        only_self = np.count_nonzero(both & self.agrees & ~other.agrees)
-        its = np.count_nonzero(both & other.agrees & ~self.agrees)
-        return bool(
-            only_self >= max(limits.min_ratio * its, its + limits.significance * math.sqrt(only_self + its), 1.0)
-        )
 
 
 class _MeasuredRulers(NamedTuple):
@@ -201,6 +103,10 @@ class CoarseRegistration:
     min_score : float
         Least accepted score, above 0 to 1, default 0.4. 1.5 / sqrt(rulers), three standard deviations of a share of one
         half, is added: among few rulers many may agree by chance.
+    etch_bias_sigma : float, optional
+        Standard deviation of the etch bias (unit of the known edges, above 0): a displacement of all edges along their
+        normals becomes one more unknown. The normals of all ``rulers`` must then point to the same side of their edges:
+        out of the copper, or from dark to bright. None: edges are where they are known.
     limits : RegistrationLimits
         Thresholds of the other decisions.
 
@@ -222,7 +128,8 @@ class CoarseRegistration:
     cell_px: int = 2
     max_candidates: int = 48
     min_score: float = 0.4
-    limits: RegistrationLimits = RegistrationLimits()
+    etch_bias_sigma: float | None = None
+    limits: RegistrationLimits = field(default_factory=RegistrationLimits)
 
     def __post_init__(self) -> None:
         matrix = np.asarray(self.to_image, np.float64)
@@ -239,6 +146,8 @@ class CoarseRegistration:
                 )
         if not 0.0 <= finite(self.angle, "CoarseRegistration.angle") <= math.pi:
             raise ValueError(f"CoarseRegistration.angle is {self.angle}, expected 0 to pi")
+        if self.etch_bias_sigma is not None:
+            finite(self.etch_bias_sigma, "CoarseRegistration.etch_bias_sigma", above=0.0)
         if not isinstance(self.ruler, RulerEdges) or self.ruler.edge_selection == "all" or self.ruler.pairs:
             raise TypeError("CoarseRegistration.ruler must be a RulerEdges that returns one single edge")
         if not isinstance(self.max_candidates, int) or self.max_candidates < 1:
@@ -260,10 +169,10 @@ class CoarseRegistration:
             The array is not such an image, or the image is smaller than five cells or than a ruler.
         """
         if min(len(self.rulers.point), len(self.search.point)) < self.limits.min_rulers:
-            return _NOT_FOUND
+            return NOT_FOUND
         tried = self._verify(image, self._search_grid(image, device), device)
         if not tried:
-            return _NOT_FOUND
+            return NOT_FOUND
         best = max(tried, key=lambda each: each.score)
         others = self._distinct_from(best, tried)
         if not self._is_accepted(best):
@@ -323,11 +232,13 @@ class CoarseRegistration:
         image: npt.NDArray[Any],
         known: KnownEdges,
         motions: list[Float64],
+        etch_biases: npt.ArrayLike,
         ruler: RulerEdges,
         device: Device | None,
     ) -> _MeasuredRulers:
-        """Measure edges along rulers placed where each motion has the known edges."""
+        """Measure edges along rulers placed where each motion, with its etch bias, has the known edges."""
         centre, direction = project_edges(known, motions, self.placement, np.asarray(self.to_image))
+        centre = centre + direction * (self._etch_px * np.asarray(etch_biases, np.float64))[:, None, None]
         placed = np.concatenate([centre, direction], axis=-1).reshape(-1, 4).astype(np.float32)
         edges = ruler(image, placed, device=device)
         position, amplitude = (to_numpy(each).reshape(centre.shape[:2]) for each in (edges.position, edges.amplitude))
@@ -346,20 +257,23 @@ class CoarseRegistration:
         point, normal = move_edges(known, motions, self.placement)
         place = np.stack(motions)[:, None, :, 2]
         sigma = np.full(point.shape[:2], self.tolerance_px / self._pixels_per_unit)
-        rows = line_rows(normal, point - place, found - place, sigma)
+        etch_factor = None if self.etch_bias_sigma is None else np.ones_like(sigma)
+        rows = line_rows(normal, point - place, found - place, sigma, etch_factor)
         return rows.reshape(*point.shape[:2], -1).astype(np.float32)
 
-    def _verify(self, image: npt.NDArray[Any], starts: list[Float64], device: Device | None) -> list[_ScoredMotion]:
+    def _verify(self, image: npt.NDArray[Any], starts: list[Float64], device: Device | None) -> list[ScoredMotion]:
         """Refine each start by the pose that most edges agree with, and score the refined motions."""
         known = self._verification_edges
-        measured = self._measure_rulers(image, known, starts, self._ruler(self._candidate_error_px), device)
+        range_px = self._candidate_error_px
+        measured = self._measure_rulers(image, known, starts, np.zeros(len(starts)), self._ruler(range_px), device)
         rows = np.stack([_select_found(each) for each in self._pose_rows(known, starts, measured)])
         solver = SolvePose(
             loss="ransac",
             tuning_constant=1.0,
             min_inlier_fraction=0.0,
             transform=self.transform,
-            max_trials=_TRIALS[self.transform],
+            etch_bias_sigma=self.etch_bias_sigma,
+            max_trials=self._trials,
         )
         fits = solver(rows, device=device)
         status, pose, deformation = (to_numpy(each) for each in (fits.status, fits.pose, fits.deformation))
@@ -367,24 +281,29 @@ class CoarseRegistration:
             start if status[number] else compose(start, pose[number], deformation[number])
             for number, start in enumerate(starts)
         ]
-        return self._score(image, motions, device)
+        etch_biases = np.where(status == 0, to_numpy(fits.etch_bias), 0.0)
+        return self._score(image, motions, etch_biases, device)
 
     @functools.cached_property
     def _verification_edges(self) -> KnownEdges:
         step = -(-len(self.rulers.point) // _VERIFICATION_RULERS)
         return KnownEdges(*(each[::step] for each in self.rulers))
 
-    def _score(self, image: npt.NDArray[Any], motions: list[Float64], device: Device | None) -> list[_ScoredMotion]:
+    def _score(
+        self, image: npt.NDArray[Any], motions: list[Float64], etch_biases: Float64, device: Device | None
+    ) -> list[ScoredMotion]:
         """Score motions by the share of rulers, placed where each motion has the edges, that find an edge there.
 
         The rulers are placed again: from the start of a refined motion, some edges lie beyond the ends of its rulers.
         """
         known = self._verification_edges
-        measured = self._measure_rulers(image, known, motions, self._ruler(self._candidate_error_px), device)
-        scored = map(_ScoredMotion, motions, measured.inside, np.abs(measured.offset_px) <= self.tolerance_px)
+        ruler = self._ruler(self._candidate_error_px)
+        measured = self._measure_rulers(image, known, motions, etch_biases, ruler, device)
+        agrees = np.abs(measured.offset_px) <= self.tolerance_px
+        scored = map(ScoredMotion, motions, etch_biases, measured.inside, agrees)
         return [each for each in scored if each.rulers >= self.limits.min_rulers]
 
-    def _distinct_from(self, best: _ScoredMotion, tried: list[_ScoredMotion]) -> list[_ScoredMotion]:
+    def _distinct_from(self, best: ScoredMotion, tried: list[ScoredMotion]) -> list[ScoredMotion]:
         """Return the motions whose rulers lie at other places than the rulers of the best motion, best first."""
         limit = (2.0 * self.tolerance_px + 1.0) / self._pixels_per_unit
         change = np.stack([each.motion for each in tried]) - best.motion
@@ -393,22 +312,29 @@ class CoarseRegistration:
         return sorted(itertools.compress(tried, is_other), key=lambda each: -each.score)
 
     def _measure(
-        self, image: npt.NDArray[Any], best: _ScoredMotion, others: list[_ScoredMotion], device: Device | None
+        self, image: npt.NDArray[Any], best: ScoredMotion, others: list[ScoredMotion], device: Device | None
     ) -> Registration:
         """Measure the best pose again, along short rulers placed where it has the edges."""
         ruler = self._ruler(2.0 * self.tolerance_px)
         # Huber's loss is convex: its solution does not depend on the start, so that similar images give similar poses.
         # A wrong edge has a bounded influence, since the rulers are short.
-        solver = SolvePose(loss="huber", scale=1.0, transform=self.transform, max_trials=_TRIALS[self.transform])
-        motion = best.motion
+        solver = SolvePose(
+            loss="huber",
+            scale=1.0,
+            transform=self.transform,
+            etch_bias_sigma=self.etch_bias_sigma,
+            max_trials=self._trials,
+        )
+        motion, etch_bias = best.motion, best.etch_bias
         for _ in range(self.limits.refinements):
-            measured = self._measure_rulers(image, self.rulers, [motion], ruler, device)
+            measured = self._measure_rulers(image, self.rulers, [motion], [etch_bias], ruler, device)
             fit = solver(self._pose_rows(self.rulers, [motion], measured), device=device)
             status = Status(int(to_numpy(fit.status)[0]))
             if status:
                 return self._refuse(status, best, others)
             motion = compose(motion, to_numpy(fit.pose)[0], to_numpy(fit.deformation)[0])
-        scored = self._score(image, [motion], device)
+            etch_bias = float(to_numpy(fit.etch_bias)[0])
+        scored = self._score(image, [motion], np.array([etch_bias]), device)
         if not scored:
             return self._refuse(Status.NO_DATA, best, others)
         (last,) = scored
@@ -416,25 +342,52 @@ class CoarseRegistration:
             return self._refuse(Status.LOW_SIGNAL, last, others)
         close = [other for other in others if not last.is_better_than(other, self.limits)]
         pose, deformation = decompose(motion, self.placement)
-        residual_scale = float(to_numpy(fit.residual_scale)[0])
+        errors = registration_errors(self._fitted_edges(motion, fit), self.transform)
         return self._refuse(Status.AMBIGUOUS if close else Status.OK, last, close or others)._replace(
             pose=pose,
             deformation=deformation if self.transform != "rigid" else np.zeros(3),
             placement=motion[:, 2],
-            covariance=to_numpy(fit.covariance)[0].astype(np.float64) * residual_scale**2,
+            covariance=errors.covariance,
+            etch_bias=etch_bias,
+            misfit=errors.misfit,
         )
 
-    def _refuse(self, status: Status, best: _ScoredMotion, others: list[_ScoredMotion]) -> Registration:
+    def _fitted_edges(self, motion: Float64, fit: BoardPose) -> FittedEdges:
+        """Return the edges of the last fit under the motion."""
+        place, normal = (each[0] for each in move_edges(self.rulers, [motion], self.placement))
+        return FittedEdges(
+            known=self.rulers.point - self.placement,
+            place=place - motion[:, 2],
+            normal=normal,
+            residual=to_numpy(fit.residuals)[0].astype(np.float64),
+            weight=to_numpy(fit.weights)[0].astype(np.float64),
+            rotation=rotation(math.atan2(motion[1, 0], motion[0, 0])),
+            etch_bias_sigma=self.etch_bias_sigma or 0.0,
+            sigma=self.tolerance_px / self._pixels_per_unit,
+        )
+
+    def _refuse(self, status: Status, best: ScoredMotion, others: list[ScoredMotion]) -> Registration:
         """Return the scores without a pose."""
-        refused = _NOT_FOUND._replace(score=best.score, rulers=best.rulers, status=status)
+        refused = NOT_FOUND._replace(score=best.score, rulers=best.rulers, status=status)
         if not others:
             return refused
         pose, _ = decompose(others[0].motion, self.placement)
         return refused._replace(runner_up=others[0].score, runner_up_pose=pose)
 
-    def _is_accepted(self, tried: _ScoredMotion) -> bool:
+    def _is_accepted(self, tried: ScoredMotion) -> bool:
         # A share of one half has the standard deviation 0.5 / sqrt(n).
         return tried.score >= self.min_score + 0.5 * self.limits.significance / math.sqrt(tried.rulers)
+
+    @property
+    def _trials(self) -> int:
+        """Number of start candidates: twice as many with the etch bias, one more unknown."""
+        return _TRIALS[self.transform] * (1 if self.etch_bias_sigma is None else 2)
+
+    @property
+    def _etch_px(self) -> float:
+        """Displacement of an edge along its direction in the image per etch bias [px per unit]."""
+        matrix = np.asarray(self.to_image)
+        return math.copysign(self._pixels_per_unit, float(np.linalg.det(matrix)) * matrix[2, 2])
 
     # ---- coordinates -----------------------------------------------------------------------------------------
 
@@ -484,16 +437,3 @@ def _select_found(rows: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     if not len(found_rows):
         return np.full((_REFINEMENT_ROWS, rows.shape[1]), np.nan, np.float32)
     return rows[found_rows[np.arange(_REFINEMENT_ROWS) * len(found_rows) // _REFINEMENT_ROWS]]
-
-
-_NOT_FOUND = Registration(
-    pose=np.full(3, np.nan),
-    deformation=np.full(3, np.nan),
-    placement=np.full(2, np.nan),
-    covariance=np.full((3, 3), np.nan),
-    score=0.0,
-    runner_up=0.0,
-    runner_up_pose=np.full(3, np.nan),
-    rulers=0,
-    status=Status.NO_DATA,
-)

@@ -16,7 +16,10 @@ Float64 = npt.NDArray[np.float64]
 
 
 class KnownEdges(NamedTuple):
-    """Edges that an image should show: (n, 2) points and their (n, 2) unit normals, of either sign."""
+    """Edges that an image should show: (n, 2) points and their (n, 2) unit normals.
+
+    The sign of a normal matters only where an etch bias is solved for.
+    """
 
     point: Float64
     normal: Float64

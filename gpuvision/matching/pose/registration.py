@@ -19,13 +19,11 @@ from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.features.candidates import find_ruler_candidates
 from gpuvision.matching.features.imaging import Imaging
 from gpuvision.matching.features.ruler import RulerEdges, best_smoothing
-from gpuvision.matching.pose.coarse_registration import (
-    MAX_RULERS,
-    CoarseRegistration,
-    Registration,
-)
+from gpuvision.matching.pose.coarse_registration import MAX_RULERS, CoarseRegistration
 from gpuvision.matching.pose.motion import KnownEdges, apply_homography
 from gpuvision.matching.pose.pose import Transform
+from gpuvision.matching.pose.registration_result import Registration
+from gpuvision.status import Status
 
 Float64 = npt.NDArray[np.float64]
 _MAX_RULERS, _MAX_POINTS = 512, 512  # known edges for the rulers and for the grid search (cost)
@@ -203,6 +201,7 @@ def register_images(
     transform: Transform = "affine",
     tolerance_px: float = 1.0,
     cell_px: int = 4,
+    etch_bias_px: float = 1.0,
     device: Device | None = None,
 ) -> Registration:
     """Find the points of a template image in another image; lengths are pixels, theta turns from x towards y.
@@ -221,12 +220,18 @@ def register_images(
     transform, tolerance_px, cell_px
         As in `CoarseRegistration`. Images of two line cameras, or of two boards, also differ in their scales along x
         and y; the default is therefore "affine".
+    etch_bias_px
+        Standard deviation of the displacement of all edges along their normals [px], above 0, default 1: copper etched
+        wider or narrower, another threshold of a binary image. It is solved for; positive where bright areas are
+        smaller than in the template.
     device
         Where to run; None: `Device.best`.
 
     Returns
     -------
     Registration
+        AMBIGUOUS also where its ``misfit`` exceeds the tolerance: the edges fit a larger transform significantly
+        better. The scale of a pair that is registered as "rigid" shows in this way.
 
     Raises
     ------
@@ -255,8 +260,11 @@ def register_images(
         tolerance_px=tolerance_px,
         cell_px=cell_px,
         max_candidates=_IMAGE_CANDIDATES,
+        etch_bias_sigma=etch_bias_px,
     )
     found, start = fix(image, device=device), np.array([*away, 0.0])
+    if found.misfit > tolerance_px:
+        found = found._replace(status=Status.AMBIGUOUS)
     return found._replace(
         pose=found.pose + start, placement=found.placement + away, runner_up_pose=found.runner_up_pose + start
     )

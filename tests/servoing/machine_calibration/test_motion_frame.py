@@ -58,6 +58,30 @@ def test_exact_poses_give_back_the_planted_machine() -> None:
     np.testing.assert_allclose(frame.camera_to_motion.apply(in_camera), commands[1, :2] - commands[0, :2], atol=1e-14)
 
 
+def test_covariance_is_the_derivative_of_the_fit_by_each_measured_value() -> None:
+    seen = _draws(COMMANDS, 1, 9)[0]
+    each_pose = COVARIANCE * np.array([1, 7, 2, 9, 3, 1, 5])[:, None, None]
+    frame = fit_motion_frame(COMMANDS, seen, each_pose)
+    spread, of_moves = np.zeros((7, 7)), np.zeros((6, 6))
+    for row in range(len(seen)):
+        columns, moved = [], []
+        for column in range(3):
+            step = np.zeros_like(seen)
+            step[row, column] = 1e-6
+            more, less = (fit_motion_frame(COMMANDS, seen + sign * step, each_pose) for sign in (1, -1))
+            columns.append((more.parameters - less.parameters) / 2e-6)
+            moved.append((more.camera_to_motion.matrix - less.camera_to_motion.matrix).ravel() / 2e-6)
+        jacobian, by_value = np.stack(columns, axis=1), np.stack(moved, axis=1)
+        spread += jacobian @ each_pose[row] @ jacobian.T
+        of_moves += by_value @ each_pose[row] @ by_value.T
+    unit = frame.sigmas
+    np.testing.assert_allclose(frame.covariance / np.outer(unit, unit), spread / np.outer(unit, unit), atol=1e-4)
+    linear = np.ix_([0, 1, 3, 4], [0, 1, 3, 4])
+    covariance, expected = (each[linear] for each in (frame.camera_to_motion.covariance, of_moves))
+    unit = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(covariance / np.outer(unit, unit), expected / np.outer(unit, unit), atol=1e-4)
+
+
 def _check_coverage(count: int) -> None:
     inside, errors, moves = [], [], []
     vector = np.array([2e-3, 1e-3])

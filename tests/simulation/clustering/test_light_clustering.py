@@ -215,6 +215,34 @@ def test_far_light_is_one_cluster_for_each_wall(device: Device, variant: Any) ->
     assert cut.counts["work"] == 2 * receivers.shape[1]
 
 
+@TWO_WAYS
+def test_a_roof_over_an_end_of_a_cluster_is_seen(device: Device, variant: Any) -> None:
+    """The edge of the roof, of either winding and on either side, passes over the lit line off its middle."""
+    _, _, weights, reading = valley(32, 1, 40)
+    ends = np.linspace(-0.004, 0.004, 33)
+    places = np.zeros((32, 2, 3))
+    places[:, :, 0] = np.stack([ends[:-1], ends[1:]], axis=1)
+    segments = np.hstack([places.reshape(-1, 6), np.tile([0.0, 0.0, 1.0, 1.0], (32, 1))])
+    x, y = np.meshgrid(np.linspace(-0.03, 0.03, 8), np.linspace(-0.03, 0.03, 5))
+    place = np.stack([x, y, np.full_like(x, 1.0)], axis=2).reshape(1, -1, 3)
+    receivers = np.concatenate([place, np.broadcast_to([0.0, 0.0, -1.0], place.shape)], axis=2)
+    free = LightClustering(tolerance=0.0, variant=variant)(segments, receivers, weights, reading, device=device)
+    for side in (-1.0, 1.0):
+        for edge in (-0.002, 0.001, 0.003):
+            roof = np.array([[[edge, -0.5, 0.02], [edge, 0.5, 0.02], [side, 0.0, 0.02]]])
+            for triangles in (roof, roof[:, ::-1]):
+                clustering = LightClustering(
+                    tolerance=1e-2 * free.bound_if_omitted.max(), scene=Scene(triangles), variant=variant
+                )
+                cut = clustering(segments, receivers, weights, reading, device=device)
+                seen = reference.visibility(receivers.reshape(-1, 6), segments, triangles)
+                light = reference.pair_irradiance(receivers.reshape(-1, 6), segments)
+                assert 0.0 < np.sum(seen * light) < 0.95 * np.sum(light)
+                sums = np.sum(seen * light, axis=1).reshape(receivers.shape[:2]), by_cut(cut, receivers, triangles)
+                exact, ours = (reference.mean_position(reading.power, reading.moment, weights, each) for each in sums)
+                assert np.all(SLOPE * np.abs(exact - ours) <= cut.bound + 1e-15)
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("with_scene", [False, True])
 def test_bounds_hold_far_from_the_origin(device: Device, dtype: Any, with_scene: bool) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TypeVar
@@ -39,6 +40,11 @@ UNEQUAL_LENGTHS = {
     "gpuvision/camera/image_map.py": 1,  # each table takes the first of the shifts
     "host/recordings.py": 1,  # a damaged TIFF states more strips than it counts
 }
+# Units of messages by the factor on a value in SI units, or on a fraction.
+UNITS = {100: {"%"}, 1e3: {"mm", "ms", "mrad"}, 1e6: {"um", "µm", "us"}, 1e9: {"nm"}}
+# An angle, the length of a text, and a number whose unit is in the next text.
+OTHER_NUMBERS = {"min(tilt, 90.0)", "last[:200]", "100 * entry.part"}
+_UNIT = re.compile(r"%|(?<![\w])(?:mm|ms|mrad|um|µm|us|nm|m|s|rad|px|degrees)\b")
 
 
 @functools.cache
@@ -104,3 +110,29 @@ def test_options_are_given_by_keyword() -> None:
     signatures = list(_nodes(ast.arguments))
     assert [(file, ast.unparse(node)) for file, node in signatures if node.posonlyargs and node.args] == []
     assert [(file, ast.unparse(node)) for file, node in signatures if node.posonlyargs and node.defaults] == []
+
+
+def _scaled_values() -> Iterator[tuple[str, ast.expr, str]]:
+    """Yield the file, the expression and the following text of each value of a message that a large number scales."""
+    for file, node in _nodes(ast.JoinedStr):
+        for number, part in enumerate(node.values):
+            if isinstance(part, ast.FormattedValue):
+                numbers = [each.value for each in ast.walk(part.value) if isinstance(each, ast.Constant)]
+                if any(isinstance(each, int | float) and abs(each) > 50 for each in numbers):
+                    texts = [each.value for each in node.values[number + 1 :] if isinstance(each, ast.Constant)]
+                    yield f"{file}:{node.lineno}", part.value, "".join(texts)
+
+
+def test_a_factor_in_a_message_belongs_to_its_unit() -> None:
+    """100 stands before %, 1e3 before mm, ms or mrad, 1e6 before um or us; nothing but a product has such a number."""
+    wrong, count = [], 0
+    for place, value, text in _scaled_values():
+        products = [each for each in ast.walk(value) if isinstance(each, ast.BinOp) and isinstance(each.op, ast.Mult)]
+        factors = [each for product in products for each in (product.left, product.right)]
+        factor = next((each.value for each in factors if isinstance(each, ast.Constant) and each.value in UNITS), None)
+        unit = _UNIT.search(text)
+        count += 1
+        if ast.unparse(value) not in OTHER_NUMBERS and (factor is None or unit is None or unit[0] not in UNITS[factor]):
+            wrong.append(f"{place}: {ast.unparse(value)} before {unit[0] if unit else None!r}")
+    assert count > 60
+    assert wrong == []

@@ -10,6 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from gpuvision.schema import DescriptionError, Section
@@ -21,6 +22,10 @@ PRESETS = {
     for each in resources.files("gpuvision").joinpath("presets", "sensors").iterdir()
 }
 POSE = {"sheet_origin": [0.0, 0.0, 0.2], "g_axis": [1.0, 0.0, 0.0], "h_axis": [0.0, -0.5, -0.8]}
+
+
+# Defaults that stand in the text below the heading of their table.
+IN_TEXT = {("axes", "position_pitch"): 1.0, ("axes", "sample_pitch"): 1.0, ("triangulation", "horizon"): 1e-3}
 
 
 def described() -> Iterator[dict[str, Any]]:
@@ -108,3 +113,48 @@ def test_every_key_of_the_reader_is_on_the_page(monkeypatch: pytest.MonkeyPatch)
 def test_every_table_of_the_page_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     tables = {table for table, _ in asked(monkeypatch)}
     assert set(documented()) - {""} <= tables
+
+
+def stated_defaults() -> dict[tuple[str, str], str]:
+    """Return the texts of the column `default` by table and key."""
+    found = {}
+    table, has_defaults = "", False
+    for line in PAGE.read_text(encoding="utf-8").split("## Keys\n")[1].split("\n## ")[0].splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if line.startswith("### "):
+            heading = re.fullmatch(r"### `\[([a-z.]+)\]`", line)
+            table = heading[1] if heading else ""
+        elif line.startswith("| key"):
+            has_defaults = cells[2] == "default"
+        elif line.startswith("| `") and has_defaults:
+            keys = re.findall(r"`(\w+)`", cells[0])
+            texts = re.split(r", (?![^(]*\))", cells[2])
+            for key, text in zip(keys, texts if len(texts) == len(keys) else [cells[2]] * len(keys), strict=True):
+                found[table, key] = text
+    return found
+
+
+def test_numbers_that_the_page_states_are_the_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
+    read: dict[tuple[str, str], set[Any]] = {}
+    value_of = Section._value
+
+    def recorded(section: Section, key: str, expected: str, default: Any) -> Any:
+        numbers = default if isinstance(default, tuple) else (default,)
+        if all(isinstance(each, int | float) for each in numbers):
+            read.setdefault((section.name, key), set()).add(default)
+        return value_of(section, key, expected, default)
+
+    monkeypatch.setattr(Section, "_value", recorded)
+    asked(monkeypatch)
+    stated = stated_defaults()
+    compared = 0
+    for place, defaults in read.items():
+        if place not in stated:  # in the text of its table; what it does not name is 0
+            assert {number for each in defaults for number in np.atleast_1d(each)} == {IN_TEXT.get(place, 0.0)}, place
+            continue
+        numbers = [float(each) for each in re.findall(r"-?\d[\d.]*", stated[place].replace(" ", ""))]
+        if numbers and not re.search("[a-z]", stated[place]):
+            for default in defaults:
+                assert (list(default) if isinstance(default, tuple) else [default]) == numbers, place
+                compared += 1
+    assert compared > 30

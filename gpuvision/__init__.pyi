@@ -3,6 +3,9 @@
 from .camera.camera import (
     Camera as Camera,
 )
+from .camera.cmos_sensor import (
+    CmosSensor as CmosSensor,
+)
 from .camera.correction_uncertainty import (
     CorrectionMap as CorrectionMap,
 )
@@ -14,6 +17,9 @@ from .camera.correction_uncertainty import (
 )
 from .camera.correction_uncertainty import (
     correction_sigma as correction_sigma,
+)
+from .camera.detection_stage import (
+    DetectionStage as DetectionStage,
 )
 from .camera.image_map import (
     PixelMap as PixelMap,
@@ -305,6 +311,21 @@ from .ranging.transport_calibration import (
 )
 from .ranging.triangulation import (
     Triangulation as Triangulation,
+)
+from .simulation.board_image.board_image import (
+    BoardImage as BoardImage,
+)
+from .simulation.board_image.board_image import (
+    RenderBoard as RenderBoard,
+)
+from .simulation.board_image.board_image import (
+    exposure_poses as exposure_poses,
+)
+from .simulation.board_image.reflectance_map import (
+    BoardReflectance as BoardReflectance,
+)
+from .simulation.board_image.reflectance_map import (
+    ReflectanceMap as ReflectanceMap,
 )
 from .simulation.errors.error_attribution import (
     ErrorAttribution as ErrorAttribution,

@@ -44,6 +44,7 @@ OPERATIONS = {
     "simulate": "light_paths",
     "light_clustering": "light_clustering",
     "field": "field_pose",
+    "board_image": "board_image",
     "ruler": "ruler",
     "blob": "blob",
     "line_fit": "line_fit",

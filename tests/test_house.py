@@ -183,7 +183,7 @@ FLOORS = (
     ("inspection",),
     ("simulation.scene",),
     ("simulation.sensors",),
-    ("simulation.errors", "simulation.transport"),
+    ("simulation.board_image", "simulation.errors", "simulation.transport"),
     ("simulation.clustering",),
     ("simulation",),
     ("servoing",),

@@ -1,0 +1,129 @@
+"""Reflectance map of a board: materials, order of the layers, etch bias, filter and refused parameters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpuvision.matching.artwork.artwork import Artwork
+from gpuvision.matching.artwork.board_artwork import Holes
+from gpuvision.matching.artwork.edges import BoardEdges
+from gpuvision.matching.artwork.shapes import Shape
+from gpuvision.reference.board_image import edge_response
+from gpuvision.simulation.board_image.reflectance_map import WHITE, BoardReflectance, ReflectanceMap
+
+PIXEL = 20e-6
+NO_EDGES = BoardEdges(*([np.empty((0, 2))] * 3), *([np.empty(0)] * 4))
+MATERIALS = BoardReflectance(laminate_masked=0.1, copper_masked=0.3, laminate=0.2, copper=0.8, silk=0.9, hole=0.05)
+
+
+def box(x0: float, y0: float, x1: float, y1: float, dark: bool = True) -> Shape:
+    """Return a rectangle from millimetres."""
+    return Shape(1e-3 * np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), dark)
+
+
+def board(**layers: Any) -> Artwork:
+    holes = Holes(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty(0, np.int8))
+    given = {"copper": (), "mask": (), "silk": (), "holes": holes, **layers}
+    return Artwork(side="top", pads=(), edges=NO_EDGES, bounds=np.array([[0.0, 0.0], [2e-3, 2e-3]]), **given)
+
+
+def value_at(board_map: ReflectanceMap, x: float, y: float) -> float:
+    """Return the reflectance at a place [mm], to the nearest node."""
+    column, row = np.rint((1e-3 * np.array([x, y]) - board_map.origin) / board_map.cell).astype(int)
+    return float(board_map.values[row, column]) / WHITE
+
+
+def test_each_material_lies_where_the_layers_put_it() -> None:
+    holes = Holes(
+        1e-3 * np.array([[0.5, 0.5]]), 1e-3 * np.array([[0.5, 0.5]]), np.array([0.2e-3]), np.zeros(1, np.int8)
+    )
+    artwork = board(
+        copper=(box(0.2, 0.2, 1.2, 1.2), box(0.8, 0.8, 1.0, 1.0, dark=False)),
+        mask=(box(0.3, 0.3, 1.8, 0.7),),
+        silk=(box(0.2, 0.6, 0.6, 1.8),),
+        holes=holes,
+    )
+    found = ReflectanceMap.of(artwork, pixel=PIXEL, reflectance=MATERIALS)
+    expected = {
+        (1.5, 1.5): 0.1,  # laminate under the mask
+        (1.1, 1.1): 0.3,  # copper under the mask
+        (0.9, 0.9): 0.1,  # cleared copper
+        (1.5, 0.5): 0.2,  # laminate in the opening
+        (0.8, 0.5): 0.8,  # copper in the opening
+        (0.4, 1.5): 0.9,  # silk over laminate
+        (0.4, 0.65): 0.9,  # silk over bare copper
+        (0.5, 0.5): 0.05,  # hole through everything
+    }
+    for (x, y), reflectance in expected.items():
+        assert value_at(found, x, y) == pytest.approx(reflectance, abs=2e-3), (x, y)
+    assert found.values.shape == (401, 401)
+    moved = ReflectanceMap.of(
+        artwork, pixel=PIXEL, reflectance=MATERIALS, mask_shift=(0.0, 0.9e-3), silk_shift=(1e-3, 0.0)
+    )
+    assert [value_at(moved, *place) for place in ((0.8, 0.3), (1.5, 1.4), (1.4, 1.0), (0.4, 1.7))] == pytest.approx(
+        [0.3, 0.9, 0.9, 0.1], abs=2e-3
+    )
+
+
+def test_without_a_mask_all_copper_is_bare() -> None:
+    found = ReflectanceMap.of(board(copper=(box(0.5, 0.5, 1.5, 1.5),)), pixel=PIXEL, reflectance=MATERIALS)
+    assert (value_at(found, 1.0, 1.0), value_at(found, 0.2, 0.2)) == pytest.approx((0.8, 0.2), abs=1e-4)
+
+
+def test_shapes_that_touch_and_overlap_have_no_seam() -> None:
+    """Coverages of overlapping shapes that were added or multiplied would leave a seam along common borders."""
+    parts = (box(0.2, 0.2, 1.003, 1.8), box(1.003, 0.2, 1.8, 1.8), box(0.7, 0.2, 1.4, 1.8))
+    whole = ReflectanceMap.of(board(copper=(box(0.2, 0.2, 1.8, 1.8),)), pixel=PIXEL)
+    pieces = ReflectanceMap.of(board(copper=parts), pixel=PIXEL)
+    assert np.abs(whole.values.astype(int) - pieces.values).max() <= 1
+    crossed = Shape(1e-3 * np.array([[0.2, 0.2], [1.8, 1.8], [1.8, 0.2], [0.2, 1.8]]))  # even-odd: a bow tie
+    tie = ReflectanceMap.of(board(copper=(crossed,)), pixel=PIXEL, reflectance=MATERIALS)
+    found = [value_at(tie, *place) for place in ((0.4, 1.0), (1.6, 1.0), (1.0, 0.4))]
+    assert found == pytest.approx([0.8, 0.8, 0.2], abs=1e-4)
+
+
+@pytest.mark.parametrize(("blur_px", "fine"), [(0.5, 4), (1.0, 3), (0.25, 8)])
+def test_an_edge_has_the_blur_of_lens_and_pixel(blur_px: float, fine: int) -> None:
+    artwork = board(copper=(box(-5.0, -5.0, 1.0, 5.0),))
+    found = ReflectanceMap.of(
+        artwork,
+        pixel=PIXEL,
+        region=((0.9e-3, 0.9e-3), (1.1e-3, 1.1e-3)),
+        blur_px=blur_px,
+        nodes_per_pixel=fine,
+        reflectance=MATERIALS,
+    )
+    x = found.origin[0] + found.cell * np.arange(found.values.shape[1])
+    exact = 0.2 + 0.6 * edge_response((1e-3 - x) / PIXEL, 0.0, blur_px)
+    # The filter is a sum over the cells: trapezoidal rule at the kinks of an edge's mean over a pixel, and cut tails.
+    error = 0.6 / (30.0 * fine**2 * blur_px) + 1e-4
+    np.testing.assert_allclose(found.values[found.values.shape[0] // 2] / WHITE, exact, atol=error)
+
+
+def test_the_etch_bias_moves_the_edges_of_the_copper() -> None:
+    artwork = board(copper=(box(0.5, 0.5, 1.5, 1.5), box(0.9, 0.9, 1.1, 1.1, dark=False)))
+    for bias in (-17e-6, 0.0, 23e-6):
+        found = ReflectanceMap.of(artwork, pixel=PIXEL, reflectance=MATERIALS, etch_bias=bias)
+        light = (found.values[1:-1, 1:-1] / WHITE - 0.2).sum() * found.cell**2 / 0.6
+        assert light == pytest.approx((1e-3 + 2 * bias) ** 2 - (0.2e-3 - 2 * bias) ** 2, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"pixel": 0.0}, "pixel"),
+        ({"blur_px": -1.0}, "blur_px"),
+        ({"nodes_per_pixel": 0}, "nodes_per_pixel"),
+        ({"region": ((0.0, 0.0), (0.0, 1.0))}, "least and then the greatest"),
+        ({"region": ((0.0, 0.0), (1.0, 1.0))}, "expected 2\\^28 at most"),
+    ],
+)
+def test_wrong_parameters_are_refused(change: dict[str, Any], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        ReflectanceMap.of(board(), **{"pixel": PIXEL, **change})
+    with pytest.raises(ValueError, match="silk"):
+        replace(MATERIALS, silk=1.1)

@@ -14,6 +14,7 @@ from typing import TypeVar
 
 ROOT = Path(__file__).resolve().parents[1]
 Node = TypeVar("Node", bound=ast.AST)
+_KINDS = (ast.ClassDef, ast.Call, ast.arguments, ast.JoinedStr)
 
 # Dataclasses whose members may be given by position: records that one module makes and reads, and pairs and triples
 # of the host. All others are made by keyword: operations, options and results get new members between the old ones.
@@ -48,17 +49,22 @@ _UNIT = re.compile(r"%|(?<![\w])(?:mm|ms|mrad|um|µm|us|nm|m|s|rad|px|degrees)\b
 
 
 @functools.cache
-def _trees() -> dict[str, ast.Module]:
-    files = [path for folder in ("gpuvision", "host") for path in sorted((ROOT / folder).rglob("*.py"))]
-    return {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in files}
+def _all_nodes() -> dict[type[ast.AST], list[tuple[str, ast.AST]]]:
+    """Return the file and the node of each node, by its kind."""
+    found: dict[type[ast.AST], list[tuple[str, ast.AST]]] = {}
+    for path in (each for folder in ("gpuvision", "host") for each in sorted((ROOT / folder).rglob("*.py"))):
+        file = path.relative_to(ROOT).as_posix()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, _KINDS):
+                found.setdefault(type(node), []).append((file, node))
+    return found
 
 
 def _nodes(kind: type[Node]) -> Iterator[tuple[str, Node]]:
     """Yield the file and the node of each node of a kind."""
-    for file, tree in _trees().items():
-        for node in ast.walk(tree):
-            if isinstance(node, kind):
-                yield file, node
+    for file, node in _all_nodes()[kind]:
+        assert isinstance(node, kind)
+        yield file, node
 
 
 def _flags() -> Iterator[tuple[str, dict[str, bool]]]:

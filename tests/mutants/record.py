@@ -90,7 +90,7 @@ def _test_files(path: Path, *, direct: bool = True) -> tuple[str, ...]:
     chosen = list(dict.fromkeys([*own, *others]))[:_MAX_FILES_OF_MODULE]
     files = [str(each.relative_to(ROOT)) for each in chosen]
     if direct and not own and not any(found[file] > 1 for file in chosen):
-        for user in sorted((ROOT / "gpuvision").rglob("*.py")):
+        for user in (each for folder in ("gpuvision", "host") for each in sorted((ROOT / folder).rglob("*.py"))):
             if f".{path.stem} import" in user.read_text():
                 files += _test_files(user, direct=False)
     return tuple(files)

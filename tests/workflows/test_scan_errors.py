@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import types
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,18 @@ import tifffile
 
 from gpuvision.formats.range_image import read_ply
 from gpuvision.host import Device, to_numpy
-from gpuvision.ranging.range_image import RangeImage
+from gpuvision.ranging.range_image import RangeImage, StraightTransport
 from gpuvision.reference.line import pixel_gaussian
 from gpuvision.schema import DescriptionError, read_toml
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.workflows.scan_errors import budget_line, error_budget, predict_errors, scatter_about_plane
+from gpuvision.workflows.scan_errors import (
+    budget_line,
+    error_budget,
+    predict_errors,
+    scatter_about_plane,
+    sigma_outputs,
+)
+from gpuvision.workflows.scan_result import Scan
 from gpuvision.workflows.scanning import scan
 
 READ_NOISE, GAIN, JITTER = 1.5, 0.1, 20e-6
@@ -125,6 +133,26 @@ def test_errors_of_a_rotating_sheet(device: Device, rng: np.random.Generator) ->
     for drawn, predicted in zip(noisy[:3], errors.random, strict=True):
         # 3000 trials determine a standard deviation to 1.3 %.
         np.testing.assert_allclose(np.std(drawn, axis=0), predicted[0], rtol=0.07, atol=1e-7)
+
+
+def test_sigmas_need_a_noise_model_and_a_sheet() -> None:
+    """A point sensor behind a polygon mirror has no errors yet; a rotating sheet needs the position's sigma only."""
+    described: Any = types.SimpleNamespace(noise_known=True, polygon=None, transport=None, readout=None)
+    assert sigma_outputs(described) == ("sigma",)
+    described.transport = StraightTransport()
+    assert sigma_outputs(described) == ("sigma", "sigma_g", "sigma_h")
+    described.noise_known = False
+    assert sigma_outputs(described) == ()
+    described.noise_known, described.polygon = True, object()
+    assert sigma_outputs(described) == ()
+
+
+def test_throughput_of_a_short_recording_is_that_of_the_whole_time() -> None:
+    stream: Any = types.SimpleNamespace(throughput=0.0, frames=30, seconds=2.0)
+    result: Any = types.SimpleNamespace(stream=stream)
+    assert Scan.throughput.fget(result) == 15.0
+    stream.throughput = 100.0
+    assert Scan.throughput.fget(result) == 100.0
 
 
 def test_scatter_about_a_plane(rng: np.random.Generator) -> None:

@@ -417,6 +417,11 @@ def test_wrong_input(device: Device) -> None:
         STRONGEST(np.zeros(SHAPE), rulers, device=device)
     with pytest.raises(ValueError, match=r"images \(rows, columns\)"):
         STRONGEST(np.zeros((3, 4, 5), np.uint8), rulers, device=device)
+    counted = replace(STRONGEST, count=1)
+    assert counted.launch(device, (2, 2**15 - 1), np.dtype(np.uint8)).inputs[0][0] == (2, 2**15 - 1)
+    for shape in ((1, 40), (40, 1), (2, 2**15)):
+        with pytest.raises(ValueError, match=r"images \(rows, columns\) of 2 to 32767"):
+            counted.launch(device, shape, np.dtype(np.uint8))
     with pytest.raises(ValueError, match="to the number of rulers"):
         STRONGEST.bind(device, SHAPE, np.uint8)
     with pytest.raises(TypeError, match="float32"):

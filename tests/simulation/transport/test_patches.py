@@ -244,6 +244,8 @@ def test_what_is_refused() -> None:
         FormFactors(patches=patches)(np.zeros((4, 5)), device=device)
     with pytest.raises(ValueError, match="expected a number, 0 or more"):
         FormFactors(patches=patches, rays=-1.0)
+    with pytest.raises(ValueError, match="rays"):
+        FormFactors(patches=patches, rays=np.inf)
     with pytest.raises(ValueError, match="clearance"):
         PatchLight(patches=patches, clearance=np.nan)
     with pytest.raises(TypeError, match="expected Patches"):

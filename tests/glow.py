@@ -146,8 +146,8 @@ class Room:
         Solved by a midpoint rule with smaller cells near the intersection of the lines. Where cells are too close for
         the rule, the form factors are scaled to the limit of a perpendicular plane, 1/2.
         """
-        x = self.foot(frame)[0] + 1.5 * np.sinh(np.linspace(-6.0, 6.0, 71)) / math.sinh(6.0)
-        away = np.append(0.0, np.geomspace(3e-3, CEILING, 51))
+        x = self.foot(frame)[0] + 1.5 * np.sinh(np.linspace(-6.0, 6.0, 49)) / math.sinh(6.0)
+        away = np.append(0.0, np.geomspace(3e-3, CEILING, 36))
         middles = [0.5 * (each[1:] + each[:-1]) for each in (x, away)]
         across, off = (each.ravel() for each in np.meshgrid(*middles, indexing="ij"))
         area = np.outer(np.diff(x), np.diff(away)).ravel()

@@ -73,13 +73,10 @@ def _over(start: Any, length: Any, rho: Any, of: Any, power: int) -> Any:
     width = (last - first) / _PANELS
     sums = np.zeros_like(rho)
     for panel in range(_PANELS):
-        for node, weight in zip(nodes, weights, strict=True):
-            x = first + width * (panel + 0.5 + 0.5 * node)
-            sums += weight * of(rho * np.sinh(x)) / (rho * np.cosh(x)) ** (power - 1)
-    short = np.zeros_like(rho)
-    for node, weight in zip(nodes, weights, strict=True):
-        t = start + length * (0.5 + 0.5 * node)
-        short += weight * of(t) / np.hypot(rho, t) ** power
+        x = first + width * (panel + 0.5 + 0.5 * nodes[:, None])
+        sums += weights @ (of(rho * np.sinh(x)) / (rho * np.cosh(x)) ** (power - 1))
+    t = start + length * (0.5 + 0.5 * nodes[:, None])
+    short = weights @ (of(t) / np.hypot(rho, t) ** power)
     return np.where(nearest >= length, 0.5 * length * short, 0.5 * width * sums)
 
 

@@ -97,11 +97,12 @@ def irradiance(corners: Float64, receivers: Float64, segments: Float64, clearanc
             ends, lit = segment[:6].reshape(2, 3), segment[6:9]
             if (receiver[:3] - ends[0]) @ lit <= 0.0 or ((ends - receiver[:3]) @ receiver[3:]).max() <= 0.0:
                 continue
-            one = receiver[None]
-            largest[number] += line_irradiance.irradiance(one, ends[None], lit[None], segment[9:])[1][0]
-            for low, high in visible_from_receiver(corners, receiver, segment, clearance):
-                part = ends[0] + np.array([[low], [high]]) * (ends[1] - ends[0])
-                total[number] += line_irradiance.irradiance(one, part[None], lit[None], segment[9:])[0][0]
+            one, power = receiver[None], segment[9]
+            largest[number] += line_irradiance.irradiance(one, ends[None], lit[None], [power])[1][0]
+            seen = visible_from_receiver(corners, receiver, segment, clearance)
+            parts = ends[0] + seen[..., None] * (ends[1] - ends[0])
+            same = len(parts)
+            total[number] += line_irradiance.irradiance(one, parts, np.tile(lit, (same, 1)), [power] * same)[0][0]
     return total, largest
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -38,6 +39,9 @@ def above(rng: np.random.Generator, count: int) -> np.ndarray:
     return (pairs / np.linalg.norm(pairs, axis=-1, keepdims=True)).reshape(count, 6)
 
 
+gauss_legendre = functools.cache(np.polynomial.legendre.leggauss)
+
+
 def directions(theta: np.ndarray, turn: np.ndarray) -> np.ndarray:
     sine = np.sin(theta)[:, None]
     parts = np.broadcast_arrays(sine * np.cos(turn), sine * np.sin(turn), np.cos(theta)[:, None])
@@ -49,7 +53,7 @@ def albedo(model: Brdf, angle: float) -> float:
 
     Nodes are dense where a lobe is narrow at grazing angles: at the horizon, and in the plane of the light.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(400)
+    nodes, weights = gauss_legendre(250)
     theta, turn = (nodes + 1.0) * math.pi / 4.0, (nodes + 1.0) * math.pi / 2.0
     out = directions(theta, turn)
     light = np.broadcast_to([math.sin(angle), 0.0, math.cos(angle)], out.shape)
@@ -59,7 +63,7 @@ def albedo(model: Brdf, angle: float) -> float:
 
 def lobe(model: Brdf, angle: float, alpha: float) -> float:
     """The same for a narrow lobe of facets: over half-way directions, as GGX's own distribution has them."""
-    nodes, weights = np.polynomial.legendre.leggauss(300)
+    nodes, weights = gauss_legendre(300)
     u, turn = (nodes + 1.0) / 2.0, np.arange(128) * math.tau / 128
     tilt = np.arctan(alpha * np.sqrt(u / (1.0 - u)))
     halves = directions(tilt, turn)

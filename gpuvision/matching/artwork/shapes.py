@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,7 @@ from gpuvision.host.reading import FileLimit
 
 Float64 = npt.NDArray[np.float64]
 Crossings = list[tuple[bool, Float64]]
+Number = TypeVar("Number", np.float64, np.int64)
 
 MAX_BOARD_SIZE = FileLimit("GPUVISION_MAX_BOARD_SIZE", 2.0)
 """Largest coordinate of a board [m]. Chosen: 2 m; production panels have up to 1.5 m."""
@@ -127,7 +129,8 @@ class Layer:
         """
         low, high = np.minimum(start, end), np.maximum(start, end)
         near = self._boxes.near(low, high)
-        near = near[np.all((self._low[near] <= high) & (self._high[near] >= low), axis=1)]
+        overlaps = (self._low[near] <= high) & (self._high[near] >= low)
+        near = near[overlaps[:, 0] & overlaps[:, 1]]
         self.comparisons += _PER_QUERY
         if not len(near):
             return []
@@ -137,6 +140,8 @@ class Layer:
         # Few sides cross the line: only these are sorted by shape.
         side_a, side_b = (_side(ends[sides] - start, along) for ends in (self._from, self._to))
         crossing = sides[(side_a > 0) != (side_b > 0)]
+        if not len(crossing):
+            return []
         owner = np.searchsorted(self._stop, crossing, side="right")
         first = np.searchsorted(owner, near)
         last = np.searchsorted(owner, near, side="right")
@@ -170,6 +175,7 @@ class _BoxIndex:
             return
         self._origin = low.min(axis=0)
         self._size = np.maximum((high.max(axis=0) - self._origin) / self._cells, SAGITTA)
+        self._corner, self._extent = self._origin.tolist(), self._size.tolist()
         first, last = self._cell(low), self._cell(high)
         spans = last - first + 1
         is_large = np.prod(spans, axis=1) > _MOST_CELLS_OF_A_BOX
@@ -193,10 +199,24 @@ class _BoxIndex:
         """Return, ascending, the indices of all boxes that overlap the box from low to high, and of some others."""
         if self._cells < _FEWEST_CELLS:
             return np.arange(self._count)
-        (left, bottom), (right, top) = self._cell(low), self._cell(high)
-        rows = np.arange(bottom, top + 1) * self._cells
+        (left, bottom), (right, top) = (self._cell_of(*each.tolist()) for each in (low, high))
+        rows = range(bottom * self._cells, (top + 1) * self._cells, self._cells)
         parts = [self._box[self._first[row + left] : self._first[row + right + 1]] for row in rows]
-        return np.asarray(np.unique(np.concatenate([self._large, *parts])), np.int64)
+        return sorted_unique(np.concatenate([self._large, *parts]))
+
+    def _cell_of(self, x: float, y: float) -> tuple[int, int]:
+        """Return `_cell` of one point, without the cost of small arrays."""
+        last, (left, bottom), (width, height) = self._cells - 1, self._corner, self._extent
+        return int(min(max((x - left) / width, 0), last)), int(min(max((y - bottom) / height, 0), last))
+
+
+def sorted_unique(values: npt.NDArray[Number]) -> npt.NDArray[Number]:
+    """Return the different values in ascending order: `numpy.unique`, 5 times faster for a few numbers."""
+    ordered = np.sort(values)
+    is_new = np.empty(len(ordered), np.bool_)
+    is_new[:1] = True
+    np.not_equal(ordered[1:], ordered[:-1], out=is_new[1:])
+    return np.asarray(ordered[is_new])
 
 
 def _ranges(start: npt.NDArray[np.int64], stop: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -9,7 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.matching.artwork.artwork import Artwork
-from gpuvision.matching.artwork.shapes import Float64, Layer, Shape, capsule, is_covered
+from gpuvision.matching.artwork.shapes import Float64, Layer, Shape, capsule, is_covered, sorted_unique
+
+_ENDS = np.array([0.0, 1.0])
 
 
 class VisibleLayer(NamedTuple):
@@ -46,7 +48,9 @@ def layer_edges_along(
         bool, whether the layer ends there in the direction of the normal.
     """
     found = layer.crossings(point - reach * normal, point + reach * normal)
-    cuts = np.unique(np.concatenate([np.array([0.0, 1.0]), *(where for _, where in found)]))
+    if not found:
+        return np.empty(0), np.empty(0, np.bool_)
+    cuts = sorted_unique(np.concatenate([_ENDS, *(where for _, where in found)]))
     cuts = cuts[(cuts >= 0) & (cuts <= 1)]
     inside = is_covered(found, (cuts[1:] + cuts[:-1]) / 2)
     step = inside[:-1] != inside[1:]

@@ -200,11 +200,13 @@ def _is_isolated(layers: tuple[VisibleLayer, ...], row: _Row, imaging: Imaging) 
     if 0 < across < reach:
         return False
     edges = (point,) if not across else (point - normal * across / 2, point + normal * across / 2)
+    slope = float(np.abs(normal).sum())
     for each in layers:
-        away = reach + each.max_offset * float(np.abs(normal).sum())
-        places = np.concatenate([layer_edges_along(each.layer, edge, normal, away)[0] for edge in edges])
-        if np.any(np.abs(places) > SAME_EDGE):
-            return False
+        away = reach + each.max_offset * slope
+        for edge in edges:
+            places, _ = layer_edges_along(each.layer, edge, normal, away)
+            if np.abs(places).max(initial=0.0) > SAME_EDGE:
+                return False
     return True
 
 
@@ -214,10 +216,12 @@ def _ambiguity(layers: tuple[VisibleLayer, ...], point: Float64, normal: Float64
     An edge at the distance a from the right one does so where the shift exceeds a minus the range, for shifts equally
     distributed over the search range.
     """
-    chance = 0.0
+    chance, slope = 0.0, float(np.abs(normal).sum())
     for each in layers:
-        margin = each.max_offset * float(np.abs(normal).sum())
+        margin = each.max_offset * slope
         place, ends = layer_edges_along(each.layer, point, normal, reach + found + margin)
+        if not len(place):
+            continue
         away = np.abs(place[(ends != each.dark) & (np.abs(place) > SAME_EDGE)]) - margin
         chance += float(np.sum(np.clip((reach + found - away) / (2 * reach), 0.0, 1.0)))
     return min(1.0, chance)

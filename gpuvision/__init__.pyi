@@ -108,6 +108,9 @@ from .camera.views.target_views import (
 from .camera.views.tsai import (
     fit_tsai as fit_tsai,
 )
+from .formats.cmos_sensor_file import (
+    read_cmos_sensor as read_cmos_sensor,
+)
 from .formats.features_file import (
     read_features as read_features,
 )
@@ -138,6 +141,9 @@ from .matching.artwork.artwork import (
 from .matching.artwork.artwork import (
     read_artwork as read_artwork,
 )
+from .matching.artwork.board_reflectance import (
+    BoardReflectance as BoardReflectance,
+)
 from .matching.board.located_board import (
     LocatedBoard as LocatedBoard,
 )
@@ -146,6 +152,12 @@ from .matching.features.blob import (
 )
 from .matching.features.blob import (
     FindBlobs as FindBlobs,
+)
+from .matching.features.exposure import (
+    sensor_imaging as sensor_imaging,
+)
+from .matching.features.exposure import (
+    smallest_exposure as smallest_exposure,
 )
 from .matching.features.feature_set import (
     FeatureSet as FeatureSet,
@@ -320,9 +332,6 @@ from .simulation.board_image.board_image import (
 )
 from .simulation.board_image.board_image import (
     exposure_poses as exposure_poses,
-)
-from .simulation.board_image.reflectance_map import (
-    BoardReflectance as BoardReflectance,
 )
 from .simulation.board_image.reflectance_map import (
     ReflectanceMap as ReflectanceMap,

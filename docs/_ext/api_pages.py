@@ -111,6 +111,7 @@ MODULES = (
     "gpuvision.sensor.light_source",
     "gpuvision.sensor.sensor",
     "gpuvision.formats.camera_file",
+    "gpuvision.formats.cmos_sensor_file",
     "gpuvision.formats.features_file",
     "gpuvision.formats.field_file",
     "gpuvision.formats.height_files",

@@ -15,6 +15,7 @@ import shapely
 from shapely.geometry.polygon import orient
 
 from gpuvision.matching.artwork.artwork import Artwork
+from gpuvision.matching.artwork.board_reflectance import BoardReflectance
 from gpuvision.matching.artwork.shapes import Float64, Shape, capsule
 from gpuvision.simulation.board_image.area_coverage import add_coverage
 from gpuvision.validation import finite, integer, numbers
@@ -23,42 +24,6 @@ WHITE = 65535
 """Value of the map for a reflectance of 1."""
 _MOST_NODES = 1 << 28  # of a map: 512 MiB
 _TAIL = 4.0  # standard deviations of the blur after which its filter ends: 6e-5 of the weight are beyond
-
-
-@dataclass(frozen=True, kw_only=True)
-class BoardReflectance:
-    """Reflectances of the materials of a board, relative to white, 0 to 1.
-
-    The defaults are chosen, not measured: they have the contrasts of a green board with gold on its pads under diffuse
-    light.
-
-    Parameters
-    ----------
-    laminate_masked, copper_masked : float
-        Laminate and copper under the solder mask.
-    laminate, copper : float
-        Laminate and copper in the openings of the mask.
-    silk : float
-        Silk.
-    hole : float
-        Holes.
-
-    Raises
-    ------
-    ValueError
-        A reflectance is out of its range.
-    """
-
-    laminate_masked: float = 0.24
-    copper_masked: float = 0.43
-    laminate: float = 0.35
-    copper: float = 0.78
-    silk: float = 0.94
-    hole: float = 0.06
-
-    def __post_init__(self) -> None:
-        for name in ("laminate_masked", "copper_masked", "laminate", "copper", "silk", "hole"):
-            finite(getattr(self, name), f"BoardReflectance.{name}", minimum=0.0, maximum=1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from bare_boards import board_of
 from gpuvision.camera.cmos_sensor import CmosSensor
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device
-from gpuvision.matching.artwork.artwork import Artwork
-from gpuvision.matching.artwork.board_artwork import Holes
-from gpuvision.matching.artwork.edges import BoardEdges
-from gpuvision.matching.artwork.shapes import Shape
 from gpuvision.reference import board_image as reference
 from gpuvision.simulation.board_image.board_image import RenderBoard, exposure_poses
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
@@ -55,27 +52,12 @@ SEED = 77
 ONE = np.array([7], np.uint32)
 
 
-def board(*corners: Any) -> Artwork:
-    """Return bare copper with these outlines [m]."""
-    none = np.empty((0, 2))
-    return Artwork(
-        side="top",
-        copper=tuple(Shape(np.asarray(each, np.float64)) for each in corners),
-        mask=(),
-        silk=(),
-        holes=Holes(none, none, np.empty(0), np.empty(0, np.int8)),
-        pads=(),
-        edges=BoardEdges(*([none] * 3), *([np.empty(0)] * 4)),
-        bounds=np.array([[0.0, 0.0], [1e-3, 1e-3]]),
-    )
-
-
 @pytest.fixture(scope="module")
 def pads() -> ReflectanceMap:
     """Return two pads that are slanted and straight, 1 mm x 1 mm."""
     slanted = 1e-3 * np.array([[0.3, 0.4], [0.5, 0.3], [0.65, 0.5], [0.4, 0.62]])
     straight = 1e-3 * np.array([[0.55, 0.55], [0.8, 0.55], [0.8, 0.8], [0.55, 0.8]])
-    return ReflectanceMap.of(board(slanted, straight), pixel=PIXEL)
+    return ReflectanceMap.of(board_of(slanted, straight, size=1e-3), pixel=PIXEL)
 
 
 def motion(count: int) -> np.ndarray:
@@ -162,7 +144,7 @@ def test_edges_lie_where_the_artwork_and_the_pose_put_them(device: Device, dtype
     point = centre + offset
     half_plane = [point + a * along - b * normal for a, b in ((-0.01, 0.0), (0.01, 0.0), (0.01, 0.01), (-0.01, 0.01))]
     board_map = ReflectanceMap.of(
-        board(half_plane), pixel=PIXEL, region=(centre - 0.5e-3, centre + 0.5e-3), blur_px=blur
+        board_of(half_plane), pixel=PIXEL, region=(centre - 0.5e-3, centre + 0.5e-3), blur_px=blur
     )
     op = RenderBoard(board=board_map, shape=SHAPE)
     rng = np.random.default_rng(1)

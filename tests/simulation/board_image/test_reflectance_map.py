@@ -8,27 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gpuvision.matching.artwork.artwork import Artwork
-from gpuvision.matching.artwork.board_artwork import Holes
-from gpuvision.matching.artwork.edges import BoardEdges
+from bare_boards import board_of
+from gpuvision.matching.artwork.board_reflectance import BoardReflectance
 from gpuvision.matching.artwork.shapes import Shape
 from gpuvision.reference.board_image import edge_response
-from gpuvision.simulation.board_image.reflectance_map import WHITE, BoardReflectance, ReflectanceMap
+from gpuvision.simulation.board_image.reflectance_map import WHITE, ReflectanceMap
 
 PIXEL = 20e-6
-NO_EDGES = BoardEdges(*([np.empty((0, 2))] * 3), *([np.empty(0)] * 4))
 MATERIALS = BoardReflectance(laminate_masked=0.1, copper_masked=0.3, laminate=0.2, copper=0.8, silk=0.9, hole=0.05)
 
 
 def box(x0: float, y0: float, x1: float, y1: float, dark: bool = True) -> Shape:
     """Return a rectangle from millimetres."""
     return Shape(1e-3 * np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), dark)
-
-
-def board(**layers: Any) -> Artwork:
-    holes = Holes(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty(0, np.int8))
-    given = {"copper": (), "mask": (), "silk": (), "holes": holes, **layers}
-    return Artwork(side="top", pads=(), edges=NO_EDGES, bounds=np.array([[0.0, 0.0], [2e-3, 2e-3]]), **given)
 
 
 def value_at(board_map: ReflectanceMap, x: float, y: float) -> float:
@@ -38,14 +30,11 @@ def value_at(board_map: ReflectanceMap, x: float, y: float) -> float:
 
 
 def test_each_material_lies_where_the_layers_put_it() -> None:
-    holes = Holes(
-        1e-3 * np.array([[0.5, 0.5]]), 1e-3 * np.array([[0.5, 0.5]]), np.array([0.2e-3]), np.zeros(1, np.int8)
-    )
-    artwork = board(
+    artwork = board_of(
         copper=(box(0.2, 0.2, 1.2, 1.2), box(0.8, 0.8, 1.0, 1.0, dark=False)),
         mask=(box(0.3, 0.3, 1.8, 0.7),),
         silk=(box(0.2, 0.6, 0.6, 1.8),),
-        holes=holes,
+        holes=((0.5e-3, 0.5e-3, 0.2e-3),),
     )
     found = ReflectanceMap.of(artwork, pixel=PIXEL, reflectance=MATERIALS)
     expected = {
@@ -70,25 +59,25 @@ def test_each_material_lies_where_the_layers_put_it() -> None:
 
 
 def test_without_a_mask_all_copper_is_bare() -> None:
-    found = ReflectanceMap.of(board(copper=(box(0.5, 0.5, 1.5, 1.5),)), pixel=PIXEL, reflectance=MATERIALS)
+    found = ReflectanceMap.of(board_of(copper=(box(0.5, 0.5, 1.5, 1.5),)), pixel=PIXEL, reflectance=MATERIALS)
     assert (value_at(found, 1.0, 1.0), value_at(found, 0.2, 0.2)) == pytest.approx((0.8, 0.2), abs=1e-4)
 
 
 def test_shapes_that_touch_and_overlap_have_no_seam() -> None:
     """Coverages of overlapping shapes that were added or multiplied would leave a seam along common borders."""
     parts = (box(0.2, 0.2, 1.003, 1.8), box(1.003, 0.2, 1.8, 1.8), box(0.7, 0.2, 1.4, 1.8))
-    whole = ReflectanceMap.of(board(copper=(box(0.2, 0.2, 1.8, 1.8),)), pixel=PIXEL)
-    pieces = ReflectanceMap.of(board(copper=parts), pixel=PIXEL)
+    whole = ReflectanceMap.of(board_of(copper=(box(0.2, 0.2, 1.8, 1.8),)), pixel=PIXEL)
+    pieces = ReflectanceMap.of(board_of(copper=parts), pixel=PIXEL)
     assert np.abs(whole.values.astype(int) - pieces.values).max() <= 1
     crossed = Shape(1e-3 * np.array([[0.2, 0.2], [1.8, 1.8], [1.8, 0.2], [0.2, 1.8]]))  # even-odd: a bow tie
-    tie = ReflectanceMap.of(board(copper=(crossed,)), pixel=PIXEL, reflectance=MATERIALS)
+    tie = ReflectanceMap.of(board_of(copper=(crossed,)), pixel=PIXEL, reflectance=MATERIALS)
     found = [value_at(tie, *place) for place in ((0.4, 1.0), (1.6, 1.0), (1.0, 0.4))]
     assert found == pytest.approx([0.8, 0.8, 0.2], abs=1e-4)
 
 
 @pytest.mark.parametrize(("blur_px", "fine"), [(0.5, 4), (1.0, 3), (0.25, 8)])
 def test_an_edge_has_the_blur_of_lens_and_pixel(blur_px: float, fine: int) -> None:
-    artwork = board(copper=(box(-5.0, -5.0, 1.0, 5.0),))
+    artwork = board_of(copper=(box(-5.0, -5.0, 1.0, 5.0),))
     found = ReflectanceMap.of(
         artwork,
         pixel=PIXEL,
@@ -105,7 +94,7 @@ def test_an_edge_has_the_blur_of_lens_and_pixel(blur_px: float, fine: int) -> No
 
 
 def test_the_etch_bias_moves_the_edges_of_the_copper() -> None:
-    artwork = board(copper=(box(0.5, 0.5, 1.5, 1.5), box(0.9, 0.9, 1.1, 1.1, dark=False)))
+    artwork = board_of(copper=(box(0.5, 0.5, 1.5, 1.5), box(0.9, 0.9, 1.1, 1.1, dark=False)))
     for bias in (-17e-6, 0.0, 23e-6):
         found = ReflectanceMap.of(artwork, pixel=PIXEL, reflectance=MATERIALS, etch_bias=bias)
         light = (found.values[1:-1, 1:-1] / WHITE - 0.2).sum() * found.cell**2 / 0.6
@@ -124,6 +113,6 @@ def test_the_etch_bias_moves_the_edges_of_the_copper() -> None:
 )
 def test_wrong_parameters_are_refused(change: dict[str, Any], match: str) -> None:
     with pytest.raises(ValueError, match=match):
-        ReflectanceMap.of(board(), **{"pixel": PIXEL, **change})
+        ReflectanceMap.of(board_of(), **{"pixel": PIXEL, **change})
     with pytest.raises(ValueError, match="silk"):
         replace(MATERIALS, silk=1.1)

@@ -65,6 +65,21 @@ def test_a_disc(device: Device, dtype: Any, variant: Any) -> None:
 
 
 @VARIANTS
+def test_centre_of_gravity_of_a_noisy_image(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    """The grey levels up to 2.5 blurs and 1 px beyond the contour, less their mean in the next 2 px."""
+    image = image_of(a_disc() + rng.normal(0.0, 5.0, SHAPE), np.float32)
+    blobs = replace(PLAIN, variant=variant)(image, place(), device=device)
+    (x, y), reach = centre(blobs), blobs.size[0] + 2.5 * blobs.blur[0] + 1.0
+    rows, columns = np.indices(SHAPE)
+    distance = np.hypot(columns - x, rows - y)
+    inside, ring = distance <= reach, (distance > reach) & (distance <= reach + 2.0)
+    assert np.min(np.abs(distance[..., None] - [reach, reach + 2.0])) > 1e-4
+    light = (image.astype(np.float64) - image[ring].mean(dtype=np.float64)) * inside
+    expected = [np.sum(light * each) / np.sum(light) for each in (columns, rows)]
+    np.testing.assert_allclose([blobs.gravity_x[0], blobs.gravity_y[0]], expected, rtol=0, atol=2e-4)
+
+
+@VARIANTS
 @pytest.mark.parametrize("shape", ["circle", "ring", "square", "cross"])
 def test_every_shape_without_noise(device: Device, variant: Any, shape: Any) -> None:
     """Exact except for the edge profile (2.4e-4 of the contrast) and the first-order curvature of a disc."""

@@ -68,3 +68,12 @@ def test_few_positions_have_no_jitter() -> None:
     one, two = (EncoderStatistics.from_positions(np.arange(float(n))) for n in (1, 2))
     assert np.isnan([one.step_mean, one.jitter, two.jitter]).all()
     assert two.step_mean == two.step_largest == 1.0
+
+
+def test_steps_of_few_positions() -> None:
+    """Steps of 1, 3 and -1: their standard deviation is sqrt(8 / 3), the second differences are 2 and -4."""
+    statistics = EncoderStatistics.from_positions([0.0, 1.0, 4.0, 3.0])
+    assert (statistics.profiles, statistics.not_advancing) == (4, 1)
+    assert (statistics.step_mean, statistics.step_smallest, statistics.step_largest) == (1.0, -1.0, 3.0)
+    assert statistics.step_std == pytest.approx(np.sqrt(8.0 / 3.0))
+    assert statistics.jitter == pytest.approx(np.sqrt(10.0 / 6.0))

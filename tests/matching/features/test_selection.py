@@ -301,3 +301,25 @@ def test_finds_rulers_on_the_boards_of_three_tools(data: Path, name: str, rng: n
     assert (found.sigmas < np.median(others, axis=0)).all()
     assert found.sigmas[:2].max() < 2e-6
     assert found.condition < 100
+
+
+def test_error_of_an_edge_in_closed_form() -> None:
+    """The bound of a Gaussian edge in white noise is 1.883 sqrt(blur) / (contrast sqrt(width)) [px].
+
+    Smoothing by sqrt(5) blurs is the best one: it costs a factor of 1.2 (6^3 / 5^2.5 times 3/8 is 1.449, its root 1.2).
+    """
+    imaging = Imaging(pixel=20e-6, blur_px=1.5, width_px=4, contrast_bare=50.0, contrast_masked=25.0)
+    bound = 1.88279 * np.sqrt(1.5) / (50.0 * 2.0)
+    best = np.sqrt(3.0 / 8.0 * 6.0**3 / 5.0**2.5)
+    assert imaging.sigma(True) == pytest.approx(best * bound * 20e-6, rel=1e-5)
+    assert imaging.sigma(False) == pytest.approx(2.0 * best * bound * 20e-6, rel=1e-5)
+    assert imaging.smoothing_px == pytest.approx(np.sqrt(5.0) * 1.5)
+    assert imaging.room_px == pytest.approx(3.0 * imaging.smoothing_px)
+    assert imaging.max_blur_px == pytest.approx(1.5)
+    # Motion by sqrt(12) times 2 px along x adds a standard deviation of 2 px to the blur of edges across x only.
+    moving = replace(imaging, motion_px=(2.0 * np.sqrt(12.0), 0.0))
+    assert moving.max_blur_px == pytest.approx(2.5)
+    blur, smoothing = 2.5, np.sqrt(5.0) * 1.5
+    worse = np.sqrt(3.0 / 8.0 * (smoothing**2 + blur**2) ** 3 / (smoothing**5 * blur))
+    assert moving.sigma(True, (1.0, 0.0)) == pytest.approx(worse * bound * np.sqrt(2.5 / 1.5) * 20e-6, rel=1e-5)
+    assert moving.sigma(True, (0.0, 1.0)) == pytest.approx(float(imaging.sigma(True)), rel=1e-12)

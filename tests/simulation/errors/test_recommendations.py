@@ -183,6 +183,7 @@ def test_agreeing_readings_are_weighed_by_their_noise() -> None:
     np.testing.assert_allclose(fused.h, [0.8e-3 + 0.2 * 1.003e-3, 1e-3], rtol=1e-12)
     np.testing.assert_allclose(fused.sigma, [2e-6 / np.sqrt(5.0), 0.0], rtol=1e-12)
     assert (fused.source == BOTH).all()
+    assert fused.first_weight.tolist() == pytest.approx([0.8, 0.5], rel=1e-12)
     assert not fused.status.any()
     assert np.isnan(SensorFusion(max_sigmas=1.0).fuse(one, other).h).tolist() == [True, False]
     assert np.isfinite(SensorFusion(max_sigmas=0.0, tolerance=4e-6).fuse(one, other).h).all()
@@ -192,6 +193,7 @@ def test_one_reading_alone() -> None:
     one, other = reading([1e-3, np.nan, np.nan]), reading([np.nan, 2e-3, np.nan])
     fused = SensorFusion().fuse(one, other)
     assert fused.source.tolist() == [FIRST, SECOND, NONE]
+    np.testing.assert_array_equal(fused.first_weight, [1.0, 0.0, np.nan])
     np.testing.assert_array_equal(fused.h, [1e-3, 2e-3, np.nan])
     assert fused.status.tolist() == [0, 0, Status.LOW_SIGNAL]
     strict = SensorFusion(accept_single=False).fuse(one, other)

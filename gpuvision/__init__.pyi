@@ -216,6 +216,15 @@ from .matching.pose.board_pose import (
 from .matching.pose.board_pose import (
     place_rulers as place_rulers,
 )
+from .matching.pose.bound_features import (
+    BoundFeatures as BoundFeatures,
+)
+from .matching.pose.feature_pose import (
+    EstimateFeaturePose as EstimateFeaturePose,
+)
+from .matching.pose.feature_pose import (
+    FeaturePose as FeaturePose,
+)
 from .matching.pose.pose import (
     BoardPose as BoardPose,
 )

@@ -16,7 +16,7 @@ from gpuvision.host.errors import (
     RecordingError,
     StreamError,
 )
-from gpuvision.host.launch import Launch, Precision, Spec, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host.launch import Launch, Precision, Spec, Specs, Variant, real_defines, real_of, uses_vectors
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, table_offsets, type_defines
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Pipeline, PipelineLimits
@@ -26,6 +26,7 @@ from gpuvision.host.reading import FileLimit
 from gpuvision.host.recordings import open_recording
 from gpuvision.host.report import StreamReport
 from gpuvision.host.ring import Step
+from gpuvision.host.sequence import BoundSequence, Layout, OperationSequence, Stage
 from gpuvision.host.sources import ArraySource, PacedSource, Source
 from gpuvision.host.stalls import Stall
 from gpuvision.host.trace import Trace
@@ -46,6 +47,7 @@ __all__ = [
     "ArraySource",
     "Batch",
     "Bound",
+    "BoundSequence",
     "BuildError",
     "Define",
     "Device",
@@ -58,8 +60,10 @@ __all__ = [
     "IntArray",
     "Launch",
     "LaunchBuilder",
+    "Layout",
     "NoDeviceError",
     "Operation",
+    "OperationSequence",
     "PacedSource",
     "Pipeline",
     "PipelineLimits",
@@ -70,6 +74,8 @@ __all__ = [
     "RecordingError",
     "Source",
     "Spec",
+    "Specs",
+    "Stage",
     "Stall",
     "StatusArray",
     "Step",

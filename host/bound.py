@@ -14,7 +14,7 @@ import pyopencl.array
 
 from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
 from gpuvision.host.device import Device
-from gpuvision.host.launch import Launchable
+from gpuvision.host.launch import Launchable, Spec
 from gpuvision.host.program import build
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -44,13 +44,20 @@ class Bound(Generic[R]):
     Attributes
     ----------
     inputs : tuple of pyopencl.array.Array
-        Input arrays of the instance: fill them (with `host_view` where memory is shared) and call without arguments.
+        Input arrays of the instance, or the arrays that `Operation.bind` was given: fill them (with `host_view` where
+        memory is shared) and call without arguments.
     outputs : Result of pyopencl.array.Array
         Arrays that calls without ``out`` write; ``None`` for fields that the operation does not compute.
     """
 
     def __init__(
-        self, operation: Launchable, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any], queue: Any
+        self,
+        operation: Launchable,
+        device: Device,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        queue: Any,
+        inputs: Sequence[DeviceArray] = (),
     ) -> None:
         launch = operation.launch(device, shape, dtype)
         self.operation, self.device = operation, device
@@ -62,7 +69,7 @@ class Bound(Generic[R]):
         # total.
         self._wait: Callable[[Any], object] = device.wait if device.kind == "pocl" else cl.Event.wait
         self._empty = not all(launch.global_size)
-        self.inputs = tuple(device.empty(shape, dtype, self.queue) for shape, dtype in launch.inputs)
+        self.inputs = tuple(inputs) or self._new_inputs(launch.inputs)
         count, kind = len(self.inputs), type(operation).__name__
         self._input_names = [f"{kind}: input {number} of {count}" for number in range(1, count + 1)]
         self.outputs = self.allocate()
@@ -81,8 +88,6 @@ class Bound(Generic[R]):
         if not self._queue_is_inline and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
             inline_queue = device.inline_queue(self.queue, groups=launch.groups)
             self._inline_site = None if inline_queue is None else self._site_on(inline_queue)
-        for array in self.inputs:
-            self._clear(array)
         self().wait()
 
     @functools.cached_property
@@ -95,6 +100,13 @@ class Bound(Generic[R]):
         if self._inline_site is not None and not self._empty:
             self._set_arrays(self._queue_site, self._own)
             cl.enqueue_nd_range_kernel(self.queue, self._queue_site.kernel, self._global, self._local).wait()
+
+    def _new_inputs(self, specs: Sequence[Spec]) -> tuple[DeviceArray, ...]:
+        """Return new input arrays, filled with zeros."""
+        arrays = tuple(self.device.empty(shape, dtype, self.queue) for shape, dtype in specs)
+        for array in arrays:
+            self._clear(array)
+        return arrays
 
     @property
     def inline(self) -> bool:

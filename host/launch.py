@@ -66,6 +66,24 @@ class Launch:
         return nbytes_of((*self.inputs, *self.outputs.values()))
 
 
+@dataclass(frozen=True)
+class Specs:
+    """Inputs and outputs of an operation for a first input of one shape, and its memory.
+
+    Attributes
+    ----------
+    inputs : sequence of (shape, dtype)
+    outputs : mapping of str to (shape, dtype) or None
+        By the names of the result's fields; ``None``: not computed.
+    nbytes : int
+        Bytes of all arrays.
+    """
+
+    inputs: Sequence[Spec]
+    outputs: Mapping[str, Spec | None]
+    nbytes: int
+
+
 def nbytes_of(specs: Iterable[Spec | None]) -> int:
     """Return the bytes of arrays of these shapes and dtypes; ``None`` counts as 0 bytes."""
     return sum(math.prod(spec[0]) * spec[1].itemsize for spec in specs if spec is not None)

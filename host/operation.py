@@ -21,7 +21,7 @@ from numpy.typing import DTypeLike
 from gpuvision.host.arrays import DeviceArray, HostArray
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
-from gpuvision.host.launch import Launch
+from gpuvision.host.launch import Launch, Specs
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -71,7 +71,27 @@ class Operation(Generic[R]):
         """
         raise NotImplementedError
 
-    def bind(self, device: Device | None, shape: tuple[int, ...], dtype: DTypeLike, *, queue: Any = None) -> Bound[R]:
+    def specs(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Specs:
+        """Return the inputs, outputs and memory for a first input of one shape.
+
+        Raises
+        ------
+        TypeError, ValueError
+            The operation does not take such input.
+        """
+        launch = self.launch(device, shape, dtype)
+        inputs = tuple((tuple(each), np.dtype(of)) for each, of in launch.inputs)
+        return Specs(inputs, launch.outputs, launch.nbytes)
+
+    def bind(
+        self,
+        device: Device | None,
+        shape: tuple[int, ...],
+        dtype: DTypeLike,
+        *,
+        queue: Any = None,
+        inputs: Sequence[DeviceArray] = (),
+    ) -> Bound[R]:
         """Prepare the operation for inputs of one shape: build the program, allocate arrays, launch once.
 
         Parameters
@@ -84,6 +104,8 @@ class Operation(Generic[R]):
             Dtype of the (first) input, in native byte order.
         queue : pyopencl.CommandQueue, optional
             Queue to run in; the device's default queue otherwise.
+        inputs : sequence of pyopencl.array.Array
+            Arrays that calls without arguments read, such as results of another operation; by default new arrays.
 
         Returns
         -------
@@ -97,18 +119,35 @@ class Operation(Generic[R]):
         BuildError
             The kernel does not compile on this device.
         """
-        bound = self._bind(device, shape, dtype, queue)
+        bound = self._bind(device, shape, dtype, queue, inputs)
         bound.prepare_queue()
         return bound
 
-    def _bind(self, device: Device | None, shape: tuple[int, ...], dtype: DTypeLike, queue: Any) -> Bound[R]:
+    def _bind(
+        self,
+        device: Device | None,
+        shape: tuple[int, ...],
+        dtype: DTypeLike,
+        queue: Any,
+        inputs: Sequence[DeviceArray] = (),
+    ) -> Bound[R]:
         """Return a bound instance; a short launch is built for the queue only when it first waits for an event."""
         device, dtype = _device(device), np.dtype(dtype)
         if not dtype.isnative:
             raise TypeError(
                 f"expected native byte order, got {dtype.str}; convert it with .astype(dtype.newbyteorder('='))"
             )
-        return Bound(self, device, tuple(map(operator.index, shape)), dtype, queue)
+        return self._bound_to(device, tuple(map(operator.index, shape)), dtype, queue, inputs)
+
+    def _bound_to(
+        self,
+        device: Device,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        queue: Any,
+        inputs: Sequence[DeviceArray],
+    ) -> Bound[R]:
+        return Bound(self, device, shape, dtype, queue, inputs)
 
     def __call__(self, *inputs: Any, device: Device | None = None, out: R | None = None) -> R:
         """Run once: on NumPy arrays and wait, or on device arrays and return without waiting.

@@ -179,6 +179,7 @@ FLOORS = (
     ("matching.features",),
     ("matching.field",),
     ("matching.pose",),
+    ("matching.features.feature_set",),
     ("matching.board",),
     ("inspection",),
     ("simulation.scene",),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gpuvision.matching.pose import board_pose, pose
+from gpuvision.matching.pose import board_pose, feature_pose, pose
 from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.ranging.line import LineTable
 from gpuvision.ranging.psd import PsdTable
@@ -67,6 +67,9 @@ def test_range_table_has_the_limits_and_the_fields_of_the_geometry() -> None:
         ("board_pose/board_pose.cl", "BoardRuler", board_pose.RULER),
         ("board_pose/board_pose.cl", "BoardLine", board_pose.LINE),
         ("pose/pose.cl", "PoseRow", (*pose.ROW, "etch_factor")),
+        ("feature_pose/feature_view.h", "FeatureRuler", feature_pose.RULER_FEATURE),
+        ("feature_pose/feature_view.h", "FeatureFiducial", feature_pose.FIDUCIAL_FEATURE),
+        ("feature_pose/feature_view.h", "FeatureView", feature_pose.VIEW),
     ],
 )
 def test_struct_has_the_columns_of_the_rows(file: str, struct: str, columns: tuple[str, ...]) -> None:

@@ -13,7 +13,7 @@ typedef struct {
     real x, y, size, per_size;
 } pose_frame;
 
-// Output arrays of the kernels, in the order of the fields of BoardPose (pose.py).
+// Output arrays of the kernels, in the order of the fields of BoardPose (pose.py); deformation and placement may be null.
 typedef struct {
     global real *pose;
     global real *deformation;
@@ -100,11 +100,15 @@ static inline void store_pose(solved_pose fit, pose_rows all, pose_frame frame, 
     to.pose[3 * item] = bad ? REAL_NAN : move_x - ((axx - 1) * frame.x + axy * frame.y);
     to.pose[3 * item + 1] = bad ? REAL_NAN : move_y - (ayx * frame.x + (ayy - 1) * frame.y);
     to.pose[3 * item + 2] = bad ? REAL_NAN : turn;
-    to.deformation[3 * item] = bad ? REAL_NAN : POSE_PARAMETERS > 3 ? length - 1 : 0;
-    to.deformation[3 * item + 1] = bad ? REAL_NAN : POSE_PARAMETERS > 3 ? c * ayy - s * axy - 1 : 0;
-    to.deformation[3 * item + 2] = bad ? REAL_NAN : POSE_PARAMETERS == 6 ? c * axy + s * ayy : 0;
-    to.placement[2 * item] = bad ? REAL_NAN : place_x + shift_x;
-    to.placement[2 * item + 1] = bad ? REAL_NAN : place_y + shift_y;
+    if (to.deformation) {
+        to.deformation[3 * item] = bad ? REAL_NAN : POSE_PARAMETERS > 3 ? length - 1 : 0;
+        to.deformation[3 * item + 1] = bad ? REAL_NAN : POSE_PARAMETERS > 3 ? c * ayy - s * axy - 1 : 0;
+        to.deformation[3 * item + 2] = bad ? REAL_NAN : POSE_PARAMETERS == 6 ? c * axy + s * ayy : 0;
+    }
+    if (to.placement) {
+        to.placement[2 * item] = bad ? REAL_NAN : place_x + shift_x;
+        to.placement[2 * item + 1] = bad ? REAL_NAN : place_y + shift_y;
+    }
     real lever[POSE_PARAMETERS][POSE_PARAMETERS];
     for (int i = 0; i < POSE_PARAMETERS; i++) {
         const real along_x = i == 0 ? 1 : i == 2 ? -at_y : 0, along_y = i == 1 ? 1 : i == 2 ? at_x : 0;

@@ -1,6 +1,7 @@
 // Edges along calipers (rulers): position, amplitude, width, sigma, spacing and status of each ruler.
 //
-// Inputs:  image (rows, columns), type CODE; rulers (count, 4): x, y [px], cos, sin of the direction.
+// Inputs:  image (rows, columns), type CODE; rulers (count, RULER_INPUTS): x, y [px], cos, sin of the direction; with
+//          PER_RULER also the polarity, and least and greatest spacing of a pair [px].
 // Outputs: position, width, sigma, spacing [px], amplitude [grey levels], status: (count,) or (count, MAX_EDGES).
 // Tables:  table, parameters (ruler.h); model, lens or camera (LENS, CAMERA).
 // Variants: vector: a work-item processes `each` rulers, with vectors of 16 samples; work-item: a group of RULER_GROUP
@@ -35,14 +36,21 @@ kernel void ruler_edges(global const CODE *restrict image, global const real *re
 #ifdef VECTOR_VARIANT
     const uint first = get_global_id(0) * each, end = min(first + each, count);
     for (uint ruler = first; ruler < end; ruler += LANES) {
-        ruler_measure(image, rows, columns, rulers + 4 * (ulong)ruler, 4, count - ruler, table, model, edges);
+        ruler_measure(image, rows, columns, rulers + RULER_INPUTS * (ulong)ruler, RULER_INPUTS, count - ruler, table,
+                      model, edges);
         store_edges(edges, ruler, count, position, amplitude, width, sigma, spacing, status);
     }
 #else
     local real profile[LENGTH], slopes[RULER_SLOPES];
     local int flags;
     const uint ruler = get_group_id(0);
-    ruler_measure(image, rows, columns, vload4(ruler, rulers), table, model, profile, slopes, &flags, edges);
+    global const real *of = rulers + RULER_INPUTS * (ulong)ruler;
+    ruler_place place;
+    const int out = ruler_layout(rows, columns, of[0], of[1], of[2], of[3], table, &place);
+#ifdef PER_RULER
+    ruler_set_kind(of[4], of[5], of[6], table, &place);
+#endif
+    ruler_measure_placed(image, columns, &place, out, table, model, profile, slopes, &flags, edges);
     if (get_local_id(0) == 0)
         store_edges(edges, ruler, count, position, amplitude, width, sigma, spacing, status);
 #endif

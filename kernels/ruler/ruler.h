@@ -10,6 +10,7 @@
 //     CODE, and CODE_uchar, CODE_ushort or CODE_float   type of the pixels
 //     RISING, FALLING    polarity of the edges (of the first edge of a pair); neither: both
 //     PAIRS              an edge is a pair of edges of opposite polarity: a stripe
+//     PER_RULER (with PAIRS, without RISING and FALLING)   each ruler has its own ruler_kind: single edge or pair
 //     CHOOSE_STRONGEST, CHOOSE_FIRST, CHOOSE_LAST, CHOOSE_ALL (up to MAX_EDGES edges)   edge selection
 //     SATURATION, AMBIGUITY   flag saturated samples, and edges with a comparable second edge
 //     CURVED             correct the position for a curved edge
@@ -27,6 +28,12 @@
 #define RULER_SLOPES (LENGTH - 2 * TAPS)
 #define RULER_MIDDLE ((real)0.5f * (LENGTH - 1))
 #define RULER_LARGEST 1e37f  // largest sum over lines; gradients of larger ones could overflow
+// Numbers of a ruler in memory: x, y, cos, sin, and with PER_RULER polarity, least and greatest spacing of a pair.
+#ifdef PER_RULER
+#define RULER_INPUTS 7
+#else
+#define RULER_INPUTS 4
+#endif
 // Flags of a ruler on which no edge can be measured.
 #define RULER_USELESS (STATUS_NOT_FINITE | STATUS_OUT_OF_RANGE | STATUS_NOT_INVERTIBLE)
 
@@ -36,7 +43,13 @@ typedef struct {
     reals x, y;                               // first sample of the first line, from `pixel`
     reals along_x, along_y, across_x, across_y; // steps to the next sample and to the next line
     masks last_column, last_row;              // last column and row that have a right and a lower neighbour, from `pixel`
+#ifdef PER_RULER
+    reals polarity, nearest, farthest; // sign of the (first) edge; least and greatest spacing of a pair [samples]
+    masks is_pair;
+#endif
 } ruler_place;
+
+#include "ruler/ruler_refine.h"
 
 // Compute the layout of rulers; return their flags. Flagged rulers get a valid place at the first pixel.
 static inline masks ruler_layout(int rows, int columns, reals x, reals y, reals cosine, reals sine, constant real *table,
@@ -70,6 +83,16 @@ static inline masks ruler_layout(int rows, int columns, reals x, reals y, reals 
     place->last_row = (rows - 2) - row;
     return bad ? (masks)STATUS_NOT_FINITE : away & STATUS_OUT_OF_RANGE;
 }
+
+#ifdef PER_RULER
+// Set what rulers look for: sign of the (first) edge; least and greatest spacing [px], 0 and 0 for a single edge.
+static inline void ruler_set_kind(reals polarity, reals nearest, reals farthest, constant real *table, ruler_place *place) {
+    place->polarity = polarity;
+    place->nearest = ruler_nearest(nearest / table[RULER_STEP]);
+    place->farthest = ruler_nearest(farthest / table[RULER_STEP]);
+    place->is_pair = mask_of(farthest > 0);
+}
+#endif
 
 // Map (x, y) from the undistorted to the distorted image. Return the flags of lanes outside it; their position becomes 0.
 #if defined(LENS) || defined(CAMERA)
@@ -105,15 +128,18 @@ static inline masks ruler_sum_flags(reals sum) {
 }
 
 // Strength of an edge of the wanted polarity; the polarity of pairs is checked later.
-#if defined(RISING) && !defined(PAIRS)
-static inline reals ruler_strength(reals slope) { return slope; }
+#if defined(PER_RULER)
+static inline reals ruler_strength(reals slope, private const ruler_place *place) {
+    return place->is_pair ? fabs(slope) : slope * place->polarity;
+}
+#elif defined(RISING) && !defined(PAIRS)
+static inline reals ruler_strength(reals slope, private const ruler_place *place) { return slope; }
 #elif defined(FALLING) && !defined(PAIRS)
-static inline reals ruler_strength(reals slope) { return -slope; }
+static inline reals ruler_strength(reals slope, private const ruler_place *place) { return -slope; }
 #else
-static inline reals ruler_strength(reals slope) { return fabs(slope); }
+static inline reals ruler_strength(reals slope, private const ruler_place *place) { return fabs(slope); }
 #endif
 
-#include "ruler/ruler_refine.h"
 
 #ifdef VECTOR_VARIANT
 static inline reals ruler_slope(private const reals *profile, int i, constant real *table) {
@@ -162,13 +188,20 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
     for (int i = 1; i < RULER_SLOPES - 1; i++) {
         peak.after = ruler_gradient(values, i + 1, table);
         peak.at = i;
-        reals strength = ruler_strength(peak.here);
-        const masks is_peak = mask_of(strength >= threshold) & mask_of(strength > ruler_strength(peak.before)) &
-                              mask_of(strength >= ruler_strength(peak.after));
+        reals strength = ruler_strength(peak.here, place);
+        const masks is_peak = mask_of(strength >= threshold) & mask_of(strength > ruler_strength(peak.before, place)) &
+                              mask_of(strength >= ruler_strength(peak.after, place));
         if (any_compared(is_peak)) {
             masks candidate = is_peak;
 #ifdef PAIRS
-            const reals gap = peak.at - other.at;
+            const reals gap = peak.at - other.at, weaker = fabs(other.here);
+#ifdef PER_RULER
+            const masks fits = has_other & mask_of(other.here * place->polarity > 0) &
+                               mask_of(peak.here * place->polarity < 0) & mask_of(gap >= place->nearest) &
+                               mask_of(gap <= place->farthest);
+            candidate &= ~place->is_pair | fits;
+            strength = place->is_pair & mask_of(weaker < strength) ? weaker : strength;
+#else
             candidate &= has_other & (mask_of(other.here > 0) ^ mask_of(peak.here > 0)) &
                          mask_of(gap >= table[RULER_NEAREST]) & mask_of(gap <= table[RULER_FARTHEST]);
 #if defined(RISING)
@@ -176,8 +209,8 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
 #elif defined(FALLING)
             candidate &= mask_of(other.here < 0);
 #endif
-            const reals weaker = fabs(other.here);
             strength = strength < weaker ? strength : weaker;
+#endif
             const ruler_peak from = other;
             other = ruler_either(is_peak, peak, other);
             has_other |= is_peak;
@@ -230,29 +263,35 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
 #ifdef VECTOR_VARIANT
 #include "ruler/ruler_lanes.h"
 
+// Measure 16 rulers of a given layout with its flags, one in each lane; fills edges[MAX_EDGES].
+static inline void ruler_measure_placed(global const CODE *image, int columns, private const ruler_place *place, masks flags,
+                                 constant real *table, constant real *model, private ruler_edge *edges) {
+    reals profile[LENGTH];
+    flags |= ruler_sums(image, place, columns, table, model, profile);
+    ruler_find(profile, place, flags, table, edges);
+}
+
 // Measure 16 rulers, one in each lane; fills edges[MAX_EDGES].
 static inline void ruler_measure_lanes(global const CODE *image, int rows, int columns, reals x, reals y, reals cosine,
                                 reals sine, constant real *table, constant real *model, private ruler_edge *edges) {
     ruler_place place;
-    masks flags = ruler_layout(rows, columns, x, y, cosine, sine, table, &place);
-    reals profile[LENGTH];
-    flags |= ruler_sums(image, &place, columns, table, model, profile);
-    ruler_find(profile, &place, flags, table, edges);
+    const masks flags = ruler_layout(rows, columns, x, y, cosine, sine, table, &place);
+    ruler_measure_placed(image, columns, &place, flags, table, model, edges);
 }
 
 // Measure up to 16 rulers in memory, `stride` numbers apart; lanes beyond `count` repeat the last ruler.
 static inline void ruler_measure(global const CODE *image, int rows, int columns, global const real *rulers, uint stride,
                           uint count, constant real *table, constant real *model, private ruler_edge *edges) {
-    real given[4][LANES];
-    for (uint lane = 0; lane < LANES; lane++) {
-        const real4 one = vload4(0, rulers + stride * (ulong)min(lane, count - 1));
-        given[0][lane] = one.x;
-        given[1][lane] = one.y;
-        given[2][lane] = one.z;
-        given[3][lane] = one.w;
-    }
-    ruler_measure_lanes(image, rows, columns, vload16(0, given[0]), vload16(0, given[1]), vload16(0, given[2]),
-                        vload16(0, given[3]), table, model, edges);
+    real given[RULER_INPUTS][LANES];
+    for (uint lane = 0; lane < LANES; lane++)
+        for (int k = 0; k < RULER_INPUTS; k++) given[k][lane] = rulers[stride * (ulong)min(lane, count - 1) + k];
+    ruler_place place;
+    const masks flags = ruler_layout(rows, columns, vload16(0, given[0]), vload16(0, given[1]), vload16(0, given[2]),
+                                     vload16(0, given[3]), table, &place);
+#ifdef PER_RULER
+    ruler_set_kind(vload16(0, given[4]), vload16(0, given[5]), vload16(0, given[6]), table, &place);
+#endif
+    ruler_measure_placed(image, columns, &place, flags, table, model, edges);
 }
 #else
 // Split (x, y) into a pixel that has neighbours and the fraction within it.
@@ -289,22 +328,29 @@ static inline real ruler_sum(global const CODE *image, const ruler_place *place,
     return sum;
 }
 
-// Measure one ruler by a work-group; edges[MAX_EDGES] are valid for its first item.
-static inline void ruler_measure(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
-                          constant real *model, local real *profile, local real *slopes, local int *shared_flags,
-                          private ruler_edge *edges) {
+// Measure one ruler of a given layout with its flags by a work-group; edges[MAX_EDGES] are valid for its first item.
+static inline void ruler_measure_placed(global const CODE *image, int columns, private const ruler_place *place, int flags,
+                                 constant real *table, constant real *model, local real *profile, local real *slopes,
+                                 local int *shared_flags, private ruler_edge *edges) {
     const int item = get_local_id(0);
-    ruler_place place;
-    int flags = ruler_layout(rows, columns, ruler.x, ruler.y, ruler.z, ruler.w, table, &place);
     if (item == 0) *shared_flags = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int i = item; i < LENGTH; i += RULER_GROUP)
-        profile[i] = ruler_sum(image, &place, columns, i, table, model, &flags);
+        profile[i] = ruler_sum(image, place, columns, i, table, model, &flags);
     if (flags) atomic_or(shared_flags, flags);
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int i = item; i < RULER_SLOPES; i += RULER_GROUP) slopes[i] = ruler_slope(profile, i, table);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0) ruler_find(slopes, &place, *shared_flags, table, edges);
+    if (item == 0) ruler_find(slopes, place, *shared_flags, table, edges);
+}
+
+// Measure one ruler (x, y, cos, sin) by a work-group; edges[MAX_EDGES] are valid for its first item.
+static inline void ruler_measure(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
+                          constant real *model, local real *profile, local real *slopes, local int *shared_flags,
+                          private ruler_edge *edges) {
+    ruler_place place;
+    const int flags = ruler_layout(rows, columns, ruler.x, ruler.y, ruler.z, ruler.w, table, &place);
+    ruler_measure_placed(image, columns, &place, flags, table, model, profile, slopes, shared_flags, edges);
 }
 #endif
 #endif

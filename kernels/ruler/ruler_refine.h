@@ -115,7 +115,14 @@ static inline ruler_edge ruler_pair(ruler_peak first, ruler_peak second, private
 // Edge, or pair of edges, at a peak.
 static inline ruler_edge ruler_edge_at(ruler_peak first, ruler_peak second, private const ruler_place *place,
                                        constant real *table) {
-#ifdef PAIRS
+#ifdef PER_RULER
+    const ruler_edge pair = ruler_pair(first, second, place, table), edge = ruler_refine(second, place, table);
+    const masks is_pair = place->is_pair;
+    const ruler_edge either = {is_pair ? pair.position : edge.position, is_pair ? pair.amplitude : edge.amplitude,
+                               is_pair ? pair.width : edge.width, is_pair ? pair.sigma : edge.sigma,
+                               is_pair ? pair.spacing : edge.spacing, 0};
+    return either;
+#elif defined(PAIRS)
     return ruler_pair(first, second, place, table);
 #else
     return ruler_refine(second, place, table);

@@ -22,7 +22,7 @@ from gpuvision.host import Device, to_numpy
 from gpuvision.matching.board.fiducial_detection import MIN_WEIGHT, FoundFiducials, find_fiducials
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.fiducials import search_distance
-from gpuvision.matching.features.ruler import MAX_LENGTH, RulerEdges
+from gpuvision.matching.features.ruler import MAX_LENGTH, SAMPLING_SIGMA_PX, RulerEdges
 from gpuvision.matching.pose.pose import BoardPose, SolvePose, Transform, line_rows
 from gpuvision.status import Status
 
@@ -67,7 +67,7 @@ class MeasurementLimits:
     """
 
     second_range_px: float = 4.0
-    sampling_sigma_px: float = 0.02
+    sampling_sigma_px: float = SAMPLING_SIGMA_PX
     min_share: float = 0.3
     min_count: int = 3
     max_residual_px: float = 0.5

@@ -8,7 +8,6 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ import numpy.typing as npt
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.blob import Blobs, FindBlobs
-from gpuvision.matching.features.fiducials import SPOKES, Fiducials, fiducial_smoothing
+from gpuvision.matching.features.fiducials import SPOKES, FiducialLimits, Fiducials, fiducial_smoothing
 from gpuvision.matching.pose.pose import line_rows
 from gpuvision.status import Status
 
@@ -25,26 +24,6 @@ Float64 = npt.NDArray[np.float64]
 
 # Least weight in the pose of a ruler or fiducial that counts as agreeing with it (chosen).
 MIN_WEIGHT = 0.05
-
-
-@dataclass(frozen=True, kw_only=True)
-class FiducialLimits:
-    """Thresholds of the detection of fiducials.
-
-    Parameters
-    ----------
-    matched_sigma_px, edges_sigma_px
-        Standard deviation of the error that remains without noise [px], of matched pixels, and of a fit to edges, which
-        a trace that ends at the contour disturbs (measured).
-    size_tolerance_px, size_sigmas
-        Largest difference between the measured and the drawn radius: pixels, plus this multiple of the etch bias'
-        standard deviation (chosen).
-    """
-
-    matched_sigma_px: float = 0.003
-    edges_sigma_px: float = 0.02
-    size_tolerance_px: float = 1.0
-    size_sigmas: float = 4.0
 
 
 class FoundFiducials(NamedTuple):

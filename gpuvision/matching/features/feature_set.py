@@ -9,25 +9,43 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
+from numpy.typing import DTypeLike
 
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, Side
+from gpuvision.matching.features.blob import FindBlobs
 from gpuvision.matching.features.candidates import FeatureCandidates, find_ruler_candidates
-from gpuvision.matching.features.fiducials import SPOKES, Fiducials, append_fiducials, select_fiducials
+from gpuvision.matching.features.fiducials import (
+    SPOKES,
+    FiducialLimits,
+    Fiducials,
+    append_fiducials,
+    fiducial_smoothing,
+    search_distance,
+    select_fiducials,
+)
 from gpuvision.matching.features.imaging import Imaging
-from gpuvision.matching.features.ruler import MAX_LENGTH, RulerEdges
+from gpuvision.matching.features.ruler import MAX_LENGTH, SAMPLING_SIGMA_PX, RulerEdges
 from gpuvision.matching.features.selection import Selection, select_rulers
+from gpuvision.matching.pose.bound_features import BoundFeatures
+from gpuvision.matching.pose.feature_pose import CameraFeatures, EstimateFeaturePose
+from gpuvision.matching.pose.pose import SolvePose
 
 Float64 = npt.NDArray[np.float64]
+Copper = Literal["bright", "dark"]
 BudgetUnit = Literal["rulers", "px", "us"]
 UNITS: tuple[str, ...] = get_args(BudgetUnit)
 _TIMED_RULERS, _TIMED_CALLS = 256, 20
 _PER_SOURCE = 4  # default of `select_rulers`
 _FREE_COST = 1e-9  # cost of a free fiducial relative to the budget: costs must be positive
+# Largest accepted pose, in search ranges, and least angle of this limit [rad]: as in `MeasurementLimits`.
+_RANGE_FACTOR, _MIN_ANGLE = 2.0, 5e-3
+_MAX_FIDUCIAL_SEARCH_PX = 190.0  # the rulers of fiducials fit into `MAX_LENGTH` samples
+_FIDUCIAL_SLACK_PX, _FIDUCIAL_SIGMAS = 1.0, 3.0  # search beyond the range: pixels, and sigmas of the etch bias
 MAX_ROWS = 1000
 """Largest number of rows of one pose: one of a ruler, two of a fiducial (`SolvePose` takes 1024)."""
 
@@ -132,6 +150,166 @@ class FeatureSet:
 
     def _pixels(self) -> Float64:
         return np.asarray(np.ceil(self.length / self.imaging.pixel) * self.imaging.width_px)
+
+    def bind(
+        self,
+        device: Device | None,
+        shape: tuple[int, int],
+        dtype: DTypeLike,
+        *,
+        copper: Copper,
+        threshold: float,
+        noise: float,
+        pixel_size: float | None = None,
+        frame_shape: tuple[int, int] | None = None,
+        blur_px: float | None = None,
+        etch_bias_sigma: float | None = None,
+        search_px: float | None = None,
+        solver: SolvePose | None = None,
+        queue: Any = None,
+    ) -> BoundFeatures:
+        """Bind the features to a device and a frame size: ``bound(frame, predicted_pose) -> FeaturePose``.
+
+        Rulers across single edges and across traces, and fiducials, are placed where a camera at the predicted pose
+        sees them, measured, and solved for the pose of the camera. The parameters are checked and the kernels are built
+        now; calls only enqueue launches.
+
+        Parameters
+        ----------
+        device : Device or None
+            None: `Device.best`.
+        shape : (int, int)
+            Rows and columns of a frame.
+        dtype : dtype
+            Dtype of a frame: uint8, uint16 or float32.
+        copper : {"bright", "dark"}
+            Grey level of copper relative to its surroundings.
+        threshold, noise : float
+            Least height of an edge, above 0, and standard deviation of a pixel, 0 or more [grey levels].
+        pixel_size : float, optional
+            Size of a pixel on the board [m]; None: ``imaging.pixel``.
+        frame_shape : (int, int), optional
+            Rows and columns of the full image, of which the frame is a region; None: the frame is the full image.
+        blur_px : float, optional
+            Standard deviation of the blur of edges [px]; None: ``imaging.blur_px``.
+        etch_bias_sigma : float, optional
+            Standard deviation of the etch bias [m]; 0: edges are where they are drawn. None:
+            ``imaging.etch_bias_sigma``.
+        search_px : float, optional
+            Largest distance of a feature from its predicted place [px], above 0. None: the search range for which the
+            features were selected. A loop that follows the board needs a few pixels only; shorter rulers are faster.
+        solver : SolvePose, optional
+            None: Tukey's loss with the scale from the residuals, 64 start candidates, an unknown etch bias where there
+            are single edges, and twice the search range as limit.
+        queue : pyopencl.CommandQueue, optional
+            Queue to run in; see `BoundFeatures`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            A parameter is out of its range, or the features do not determine a pose.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import gpuvision as gv
+        >>> def follow(features: gv.FeatureSet, frames, pose):
+        ...     bound = features.bind(None, (256, 256), np.uint8, copper="bright", threshold=20.0, noise=2.0)
+        ...     for frame in frames:
+        ...         found = bound(frame, pose)
+        ...         if found.status == 0:
+        ...             pose = found.pose.copy()
+        ...     return pose
+        """
+        scale = self.imaging.pixel if pixel_size is None else pixel_size
+        blur = self.imaging.blur_px if blur_px is None else blur_px
+        etch = self.imaging.etch_bias_sigma if etch_bias_sigma is None else etch_bias_sigma
+        device = Device.best() if device is None else device
+        limits = FiducialLimits()
+        drilled = self.fiducials.hole > 0
+        levels: dict[str, Any] = {"threshold": threshold, "noise": noise}
+        blobs: dict[str, Any] = levels | {
+            "polarity": copper,
+            "search_px": self._fiducial_search_px(scale, etch) if search_px is None else search_px,
+            "spokes": SPOKES,
+        }
+        has_etch = etch > 0 and bool(np.any(self.spacing == 0)) and len(self.spacing) > 0
+        operation = EstimateFeaturePose(
+            features=self._camera_features(copper, scale, shape if frame_shape is None else frame_shape),
+            ruler=RulerEdges(
+                per_ruler=True,
+                length=self._ruler_length(scale, blur, search_px),
+                width=self.imaging.width_px,
+                smoothing_px=self.imaging.smoothing_ratio * blur,
+                **levels,
+            ),
+            matched=FindBlobs(smoothing_px=self._fiducial_smoothing(~drilled, scale, blur), **blobs),
+            drilled=FindBlobs(smoothing_px=self._fiducial_smoothing(drilled, scale, blur), match=False, **blobs),
+            solver=self._solver(etch if has_etch else None, scale, search_px) if solver is None else solver,
+            ruler_sigma_px=SAMPLING_SIGMA_PX,
+            matched_sigma_px=limits.matched_sigma_px,
+            drilled_sigma_px=limits.edges_sigma_px,
+            size_tolerance=limits.size_tolerance_px * scale + limits.size_sigmas * etch,
+        )
+        return BoundFeatures(operation, device, shape, dtype, queue)
+
+    def _camera_features(self, copper: Copper, scale: float, frame_shape: tuple[int, int]) -> CameraFeatures:
+        spacing = self.spacing / scale
+        is_pair = spacing > 0
+        # The normal points out of the copper: bright copper falls along it, a bright trace begins with a rising edge.
+        polarity = np.where(is_pair, 1.0, -1.0) * (1.0 if copper == "bright" else -1.0)
+        least, greatest = np.maximum(0.6 * spacing - 2.0, 1.0), 1.4 * spacing + 2.0
+        columns = [
+            polarity,
+            np.where(is_pair, least, 0.0),
+            np.where(is_pair, greatest, 0.0),
+            np.where(is_pair, 0.0, 1.0),
+        ]
+        rulers = np.column_stack([self.point - self.placement, self.normal, *columns])
+        of = self.fiducials
+        fiducials, drilled = np.column_stack([of.point - self.placement, of.radius]), of.hole > 0
+        return CameraFeatures(
+            rulers=_tuples(rulers),
+            matched=_tuples(fiducials[~drilled]),
+            drilled=_tuples(fiducials[drilled]),
+            placement=(float(self.placement[0]), float(self.placement[1])),
+            pixel_size=scale,
+            frame_shape=frame_shape,
+            mirrored=self.side == "bottom",
+        )
+
+    def _ruler_length(self, scale: float, blur_px: float, search_px: float | None) -> int:
+        """Return the number of samples of all rulers: a multiple of 16, so that few lengths are built."""
+        smoothing = self.imaging.smoothing_ratio * blur_px
+        if search_px is None:
+            lengths = self.length / scale
+        else:
+            lengths = 2 * (search_px + 3 * smoothing) + 3 + self.spacing / scale
+        longest = max(float(lengths.max(initial=0.0)), 2 * math.ceil(3 * smoothing) + 3)
+        return min(16 * math.ceil(longest / 16), MAX_LENGTH)
+
+    def _fiducial_search_px(self, scale: float, etch_bias_sigma: float) -> float:
+        distance = float(search_distance(self.fiducials.point, self.placement, self.imaging).max(initial=0.0))
+        return min(
+            (distance + _FIDUCIAL_SIGMAS * etch_bias_sigma) / scale + _FIDUCIAL_SLACK_PX, _MAX_FIDUCIAL_SEARCH_PX
+        )
+
+    def _fiducial_smoothing(self, which: npt.NDArray[np.bool_], scale: float, blur_px: float) -> float:
+        smallest = float(self.fiducials.radius[which].min(initial=math.inf)) / scale
+        return min(fiducial_smoothing(blur_px), smallest / 2.5)
+
+    def _solver(self, etch_bias_sigma: float | None, scale: float, search_px: float | None) -> SolvePose:
+        shift = self.imaging.shift if search_px is None else search_px * scale
+        return SolvePose(
+            scale=None,
+            min_scale=1.0,
+            etch_bias_sigma=etch_bias_sigma,
+            search_range=(_RANGE_FACTOR * shift, _RANGE_FACTOR * max(self.imaging.angle, _MIN_ANGLE)),
+        )
+
+
+def _tuples(rows: Float64) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, rows.tolist()))
 
 
 def edge_clearance(imaging: Imaging) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,26 @@ _CLEAR_BLURS, _CLEAR_PX = 5.0, 2.0  # free distance around the contour: `FindBlo
 # Standard deviation over the Cramer-Rao bound: of matched pixels, and of edges at this smoothing (measured).
 _MATCHED_RATIO, _EDGES_RATIO = 1.1, 1.3
 _FIRST_SOURCE = -(10**6)  # `FeatureCandidates.source` of the first fiducial: rulers have greater numbers
+
+
+@dataclass(frozen=True, kw_only=True)
+class FiducialLimits:
+    """Thresholds of the detection of fiducials.
+
+    Parameters
+    ----------
+    matched_sigma_px, edges_sigma_px
+        Standard deviation of the error that remains without noise [px], of matched pixels, and of a fit to edges, which
+        a trace that ends at the contour disturbs (measured).
+    size_tolerance_px, size_sigmas
+        Largest difference between the measured and the drawn radius: pixels, plus this multiple of the etch bias'
+        standard deviation (chosen).
+    """
+
+    matched_sigma_px: float = 0.003
+    edges_sigma_px: float = 0.02
+    size_tolerance_px: float = 1.0
+    size_sigmas: float = 4.0
 
 
 class Fiducials(NamedTuple):

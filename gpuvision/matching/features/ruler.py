@@ -37,8 +37,12 @@ EdgeSelection = Literal["strongest", "first", "last", "all"]
 
 POLARITIES = ("any", "rising", "falling")
 EDGE_SELECTIONS = ("strongest", "first", "last", "all")
+RULER_COLUMNS = ("x_px", "y_px", "cosine", "sine", "polarity", "least_spacing_px", "greatest_spacing_px")
+"""Columns of the rulers with ``RulerEdges.per_ruler``; without it the first four."""
 MAX_LENGTH = 512
 """Largest number of samples: the kernel has one bit of 32 for each 16 gradients."""
+SAMPLING_SIGMA_PX = 0.02
+"""Standard deviation of the error that bilinear sampling adds to an edge [px]; neighbours share a part (measured)."""
 MAX_WIDTH = 255
 MAX_EDGES = 64
 _LANES, _GROUP = 16, 64
@@ -114,7 +118,7 @@ class Edges(NamedTuple):
         the ruler reached ``saturation``; the edge may be displaced), AMBIGUOUS (a second edge is comparable; with
         ``edge_selection="all"`` in the last column: there are more edges than ``max_edges``).
     spacing : float32, optional
-        Distance between the two edges of a pair [px]; None without ``pairs``.
+        Distance between the two edges of a pair [px]; None without ``pairs`` and ``per_ruler``. NaN for a single edge.
     """
 
     position: FloatArray
@@ -152,7 +156,8 @@ class RulerEdges(VisionOperation[Edges]):
     """Caliper (ruler), a 1-D edge measurement: ``op(image, rulers) -> Edges``.
 
     The image is uint8, uint16 or float32 of shape (rows, columns). The rulers are float32 of shape (n, 4): centre x, y
-    [px], and cosine and sine of the direction along which the edge is measured (a unit vector).
+    [px], and cosine and sine of the direction along which the edge is measured (a unit vector). With ``per_ruler`` they
+    are (n, 7): three more columns state the edge that each ruler looks for.
 
     Parameters
     ----------
@@ -179,6 +184,11 @@ class RulerEdges(VisionOperation[Edges]):
         does not depend on the etch bias.
     spacing_px : (float, float), optional
         Least and greatest distance between the edges of a pair [px], rounded to whole samples. None: any distance.
+    per_ruler : bool
+        Whether three more columns of the rulers state polarity and spacing of each ruler: sign of the step (of the
+        first edge of a pair), -1 or 1; least and greatest spacing of the edges of a pair [px], 0 and 0 for a single
+        edge. Single edges and pairs are then measured in one launch. With the default ``polarity``, ``pairs``,
+        ``spacing_px`` and ``edge_selection`` only.
     ambiguity : float, optional
         Ratio of the second strongest to the strongest gradient from which on the edge is flagged AMBIGUOUS, above 0 to
         1, with ``edge_selection="strongest"`` only. None: no check.
@@ -244,6 +254,7 @@ class RulerEdges(VisionOperation[Edges]):
     max_edges: int = 8
     pairs: bool = False
     spacing_px: tuple[float, float] | None = None
+    per_ruler: bool = False
     ambiguity: float | None = None
     saturation: float | None = None
     noise: float = 1.0
@@ -289,6 +300,11 @@ class RulerEdges(VisionOperation[Edges]):
             low, high = (finite(each, "RulerEdges.spacing_px") for each in self.spacing_px)
             if not 0.0 <= low <= high:
                 raise ValueError(f"RulerEdges.spacing_px is {self.spacing_px}, expected 0 <= least <= greatest")
+        if self.per_ruler and (self.pairs or self.polarity != "any" or self.edge_selection != "strongest"):
+            raise ValueError(
+                "RulerEdges.per_ruler takes polarity and spacing from the rulers; leave out polarity, pairs and "
+                "edge_selection"
+            )
         if self.radius_px is not None and finite(self.radius_px, "RulerEdges.radius_px") == 0.0:
             raise ValueError("RulerEdges.radius_px is 0, expected a radius, or None for straight edges")
         if self.model is not None and not isinstance(self.model, Lens | Camera):
@@ -309,6 +325,10 @@ class RulerEdges(VisionOperation[Edges]):
             return _LEAST_BITS
         extent = (self.length - 1) * self.step_px + self.width + 2
         return min(max(30 - math.ceil(math.log2(extent)), _LEAST_BITS), _MOST_BITS)
+
+    @property
+    def _measures_pairs(self) -> bool:
+        return self.pairs or self.per_ruler
 
     @property
     def _places(self) -> int:
@@ -339,8 +359,8 @@ class RulerEdges(VisionOperation[Edges]):
             "ruler/ruler.cl",
             "ruler_edges",
             work=work,
-            more_inputs=[((self.count, 4), build.real)],
-            outputs=build.outputs({**shapes, "spacing": found if self.pairs else None, "status": found}),
+            more_inputs=[((self.count, len(RULER_COLUMNS) if self.per_ruler else 4), build.real)],
+            outputs=build.outputs({**shapes, "spacing": found if self._measures_pairs else None, "status": found}),
             defines=self._defines(dtype),
             arguments=[
                 self._packed(dtype),
@@ -367,7 +387,8 @@ class RulerEdges(VisionOperation[Edges]):
             "RULER_BITS": self._binary_places,
             **dict.fromkeys(chosen),
             **flags(
-                PAIRS=self.pairs,
+                PAIRS=self._measures_pairs,
+                PER_RULER=self.per_ruler,
                 AMBIGUITY=self.ambiguity is not None,
                 SATURATION=self.saturation is not None,
                 CURVED=self.radius_px is not None,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pyopencl as cl
 import pyopencl.array
@@ -462,3 +464,32 @@ def test_the_recommended_smoothing() -> None:
     """The recommended smoothing minimises the variance of the gradient peak, (a^2 + s^2)^3 / (a^5 s), over a."""
     a = np.linspace(0.5, 5.0, 4501)
     assert abs(a[np.argmin((a**2 + 1.0) ** 3 / a**5)] - best_smoothing(1.0)) < 1e-3
+
+
+@VARIANTS
+def test_each_ruler_looks_for_its_edge(variant: Any, rng: np.random.Generator, device: Device) -> None:
+    """Single edges and pairs of either polarity in one launch are the edges of four operations, bit by bit."""
+    image = np.full(SHAPE, 60.0)
+    for left in range(8, 130, 30):
+        image[:, left : left + 11 + left % 3] = 160.0
+    image = np.rint(cv2.GaussianBlur(image, (0, 0), 1.1) + rng.normal(0.0, 2.0, SHAPE)).astype(np.uint8)
+    count = 48
+    angle = rng.uniform(-0.6, 0.6, count) + np.pi * (rng.random(count) < 0.5)
+    places = [rng.uniform(35, 115, count), rng.uniform(35, 85, count), np.cos(angle), np.sin(angle)]
+    sign, is_pair = np.where(rng.random(count) < 0.5, 1.0, -1.0), rng.random(count) < 0.5
+    limits = np.where(is_pair[:, None], (6.0, 24.0), 0.0)
+    rulers = np.column_stack([*places, sign, limits]).astype(np.float32)
+    base = RulerEdges(threshold=20.0, length=48, noise=2.0, variant=variant)
+    found = replace(base, per_ruler=True)(image, rulers, device=device)
+    for polarity, pairs in itertools.product((1.0, -1.0), (False, True)):
+        which = (sign == polarity) & (is_pair == pairs)
+        kind: dict[str, Any] = {"polarity": "rising" if polarity > 0 else "falling", "pairs": pairs}
+        alone = replace(base, spacing_px=(6.0, 24.0) if pairs else None, **kind)
+        expected = alone(image, np.ascontiguousarray(rulers[which, :4]), device=device)
+        assert (expected.status == 0).sum() > 5
+        for name, values in expected._asdict().items():
+            if values is not None:
+                np.testing.assert_array_equal(getattr(found, name)[which], values, err_msg=name)
+    assert np.isnan(found.spacing[~is_pair]).all()
+    with pytest.raises(ValueError, match="per_ruler takes polarity and spacing from the rulers"):
+        replace(base, per_ruler=True, pairs=True)

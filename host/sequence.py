@@ -1,0 +1,215 @@
+"""Sequences of operations that run as one operation: they are enqueued together, without work of the host in between.
+
+The stages of a sequence pass arrays on in device memory. The inputs of a stage are inputs of the sequence or outputs of
+any earlier stage, so that several stages read the same frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import pyopencl as cl
+
+from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
+from gpuvision.host.bound import Bound
+from gpuvision.host.device import Device
+from gpuvision.host.launch import Spec, Specs, nbytes_of
+from gpuvision.host.operation import Operation
+
+R = TypeVar("R", bound=tuple[Any, ...])
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Operation of a sequence, and the arrays that it reads.
+
+    Attributes
+    ----------
+    name : str
+        Name of the stage; its outputs are the arrays ``NAME.FIELD``.
+    operation : Operation
+    takes : tuple of str
+        Arrays in the order of the operation's inputs: inputs of the sequence by their names, or ``NAME.FIELD`` of an
+        earlier stage.
+    """
+
+    name: str
+    operation: Operation[Any]
+    takes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Stages of a sequence for inputs of one shape.
+
+    Attributes
+    ----------
+    inputs : mapping of str to (shape, dtype)
+        Inputs of the sequence by name; the first one is the frame.
+    stages : sequence of Stage
+        In the order in which they run.
+    outputs : mapping of str to str or None
+        Array ``NAME.FIELD`` of each field of the result; ``None`` for a field that is not computed.
+    """
+
+    inputs: Mapping[str, Spec]
+    stages: Sequence[Stage]
+    outputs: Mapping[str, str | None]
+
+
+class OperationSequence(Operation[R]):
+    """Base class of operations that consist of several launches.
+
+    A subclass sets `Result` and describes in `layout` its inputs, its stages, and where its results come from. It is
+    called and bound like any other operation.
+    """
+
+    def layout(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Layout:
+        """Check shape and dtype of the first input, and return the stages for it.
+
+        Raises
+        ------
+        TypeError, ValueError
+            The sequence does not take such input.
+        """
+        raise NotImplementedError
+
+    def specs(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Specs:
+        """Return the inputs and outputs, and the memory of all stages; see `Operation.specs`."""
+        layout = self.layout(device, shape, dtype)
+        arrays: dict[str, Spec | None] = dict(layout.inputs)
+        for stage in layout.stages:
+            found = stage.operation.specs(device, *_first(stage, arrays))
+            given = tuple(arrays.get(name) for name in stage.takes)
+            if given != tuple(found.inputs):
+                raise ValueError(f"stage {stage.name!r} expects {found.inputs}, is given {given}")
+            arrays |= {f"{stage.name}.{field}": spec for field, spec in found.outputs.items()}
+        outputs = {field: None if name is None else arrays[name] for field, name in layout.outputs.items()}
+        return Specs(tuple(layout.inputs.values()), outputs, nbytes_of(arrays.values()))
+
+    def _bound_to(
+        self,
+        device: Device,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        queue: Any,
+        inputs: Sequence[DeviceArray],
+    ) -> BoundSequence[R]:
+        return BoundSequence(self, device, shape, dtype, queue, inputs)
+
+
+class BoundSequence(Bound[R]):
+    """Sequence bound to a device, a queue and a shape; a call enqueues all launches and allocates nothing.
+
+    Attributes
+    ----------
+    inputs, outputs
+        As in `Bound`, of the whole sequence.
+    stages : mapping of str to Bound
+        Bound operation of each stage, by name.
+    """
+
+    def __init__(
+        self,
+        operation: OperationSequence[R],
+        device: Device,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        queue: Any,
+        inputs: Sequence[DeviceArray] = (),
+    ) -> None:
+        layout = operation.layout(device, shape, dtype)
+        specs = operation.specs(device, shape, dtype)
+        self.operation, self.device = operation, device
+        self.queue = device.queue if queue is None else queue
+        self._layout = layout
+        self._input_specs = specs.inputs
+        self._computed_specs = {field: spec for field, spec in specs.outputs.items() if spec is not None}
+        self.inputs = tuple(inputs) or self._new_inputs(specs.inputs)
+        arrays: dict[str, Any] = dict(zip(layout.inputs, self.inputs, strict=True))
+        self.stages: dict[str, Bound[Any]] = {}
+        for stage in layout.stages:
+            given = tuple(arrays[name] for name in stage.takes)
+            first = _first(stage, {stage.takes[0]: (given[0].shape, given[0].dtype)})
+            bound = stage.operation.bind(device, *first, queue=self.queue, inputs=given)
+            self.stages[stage.name] = bound
+            arrays |= {f"{stage.name}.{field}": array for field, array in bound.outputs._asdict().items()}
+        self._bounds = tuple(self.stages.values())
+        self.outputs = self._result({field: arrays[name] for field, name in layout.outputs.items() if name is not None})
+
+    def prepare_queue(self) -> None:
+        """Do nothing: `Operation.bind` has prepared the stages."""
+
+    @property
+    def inline(self) -> bool:
+        """Whether all stages run in the calling thread."""
+        return all(bound.inline for bound in self._bounds)
+
+    @property
+    def enqueue_arguments(self) -> tuple[Any, Any, tuple[int, ...], tuple[int, ...] | None]:
+        """Raise an error: a sequence has several launches; see `stages`."""
+        raise TypeError("a sequence is enqueued by several launches; take those of its stages")
+
+    def __call__(self, *frames: DeviceArray, out: R | None = None, wait_for: Sequence[Any] | None = None) -> Any:
+        """Enqueue all stages and return the event of the last one; arguments as in `Bound`."""
+        if frames or out is not None:
+            return self._with(frames or self.inputs, self.outputs if out is None else out, wait_for)
+        first, *rest = self._bounds
+        event = first(wait_for=wait_for)
+        for bound in rest:
+            event = bound()
+        return event
+
+    def _with(self, frames: tuple[DeviceArray, ...], out: R, wait_for: Sequence[Any] | None) -> Any:
+        """Enqueue all stages on arrays of the caller."""
+        if len(frames) != len(self.inputs):
+            raise self._wrong_count(len(frames))
+        self._check_fields(out)
+        arrays: dict[str, Any] = dict(zip(self._layout.inputs, frames, strict=True))
+        wanted = {name: getattr(out, field) for field, name in self._layout.outputs.items() if name is not None}
+        event = None
+        for stage, bound in zip(self._layout.stages, self._bounds, strict=True):
+            own = bound.outputs._asdict()
+            result = type(bound.outputs)(
+                **{field: wanted.get(f"{stage.name}.{field}", array) for field, array in own.items()}
+            )
+            given = tuple(arrays[name] for name in stage.takes)
+            event = bound(*given, out=result, wait_for=wait_for if event is None else None)
+            arrays |= {f"{stage.name}.{field}": array for field, array in result._asdict().items()}
+        return event
+
+    def run(self, *frames: DeviceArray, out: R | None = None) -> R:
+        """Enqueue all stages, wait, and return the written arrays: `out` or `outputs`."""
+        event = self(*frames, out=out)
+        self.device.wait(event)
+        return self.outputs if out is None else out
+
+    def on_host(self, frames: Sequence[HostArray], out: R | None = None) -> R:
+        """Copy NumPy arrays to the inputs, run, and copy the outputs to NumPy arrays."""
+        if len(frames) != len(self.inputs):
+            raise self._wrong_count(len(frames))
+        for number, (frame, spec, array) in enumerate(zip(frames, self._input_specs, self.inputs, strict=True), 1):
+            check_host(frame, *spec, f"{type(self.operation).__name__}: input {number} of {len(frames)}")
+            if self.device.shares_memory:
+                host_view(array)[...] = frame
+            else:
+                cl.enqueue_copy(self.queue, memory_of(array), frame, is_blocking=False)
+        self.device.wait(self())
+        if out is None:
+            out = self._result({k: np.empty(shape, dtype) for k, (shape, dtype) in self._computed_specs.items()})
+        self._check_fields(out)
+        for name, (shape, dtype) in self._computed_specs.items():
+            check_host(getattr(out, name), shape, dtype, f"out.{name}")
+            getattr(out, name)[...] = getattr(self.outputs, name).get(queue=self.queue)
+        return out
+
+
+def _first(stage: Stage, arrays: Mapping[str, Spec | None]) -> Spec:
+    """Return shape and dtype of the first input of a stage."""
+    spec = arrays.get(stage.takes[0])
+    if spec is None:
+        raise ValueError(f"stage {stage.name!r} takes {stage.takes[0]!r}, which no earlier stage computes")
+    return spec

@@ -1,0 +1,301 @@
+"""FeatureSet.bind: rulers, pairs and fiducials in one enqueued sequence give the pose of the operations one by one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from boards import BOARD_MIDDLE
+from gpuvision.camera.orthographic import BoardView
+from gpuvision.host import Device
+from gpuvision.matching.artwork.artwork import Artwork
+from gpuvision.matching.board.edge_measurement import move_view
+from gpuvision.matching.features.blob import FindBlobs
+from gpuvision.matching.features.feature_set import FeatureSet, choose_features
+from gpuvision.matching.features.fiducials import SPOKES, Fiducials, fiducial_smoothing
+from gpuvision.matching.features.imaging import Imaging
+from gpuvision.matching.features.ruler import RulerEdges
+from gpuvision.matching.pose.bound_features import BoundFeatures
+from gpuvision.matching.pose.pose import SolvePose, line_rows
+from gpuvision.reference import robust
+from gpuvision.status import Status
+from round_boards import NOISE, PIXEL, SHAPE, TRACES, moved_picture, round_artwork, round_board, round_picture
+
+NEAR = np.array([*BOARD_MIDDLE, 0.0])
+BLUR, THRESHOLD = 1.04, 12.0
+IMAGING = Imaging(pixel=PIXEL, blur_px=BLUR, contrast_bare=110 / NOISE, contrast_masked=50 / NOISE, angle=5.3e-3)
+
+
+@pytest.fixture(scope="module")
+def artwork(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
+    """Return a board with traces, fiducials and pads."""
+    return round_artwork(round_board(tmp_path_factory.mktemp("board"), traces=TRACES))
+
+
+@pytest.fixture(scope="module")
+def features(artwork: Artwork) -> FeatureSet:
+    """Return pairs, single edges (one side of every third trace), and fiducials, two of them for the contour only."""
+    chosen = choose_features(artwork, ((2e-3, 2e-3), (18e-3, 14e-3)), IMAGING, budget=200)
+    is_single = np.arange(len(chosen.spacing)) % 3 == 0
+    edge = chosen.point + chosen.normal * chosen.spacing[:, None] / 2
+    found = replace(
+        chosen,
+        point=np.where(is_single[:, None], edge, chosen.point),
+        spacing=np.where(is_single, 0.0, chosen.spacing),
+        fiducials=chosen.fiducials._replace(hole=np.where(np.arange(len(chosen.fiducials.hole)) < 2, 1e-4, 0.0)),
+    )
+    assert is_single.sum() >= 5
+    return found
+
+
+@pytest.fixture(scope="module")
+def seen(artwork: Artwork) -> tuple[np.ndarray, np.ndarray]:
+    """Return an image and the true pose of the camera."""
+    return moved_picture(round_picture(artwork), np.random.default_rng(5))
+
+
+def bind(features: FeatureSet, device: Device, shape: tuple[int, int] = SHAPE, **more: Any) -> BoundFeatures:
+    return features.bind(device, shape, np.uint8, **{"copper": "bright", "threshold": THRESHOLD, "noise": NOISE} | more)
+
+
+def one_by_one(features: FeatureSet, image: np.ndarray, view: BoardView, device: Device, length: int) -> np.ndarray:
+    """Return the feature rows (n, 8) about the placement point from the existing operations, and float64 geometry."""
+    matrix, smoothing = view.matrix, IMAGING.smoothing_ratio * BLUR
+    direction = features.normal @ matrix[:2, :2].T * PIXEL
+    placed = np.concatenate([view.to_pixels(features.point), direction], axis=1).astype(np.float32)
+    position, sigma = np.empty((2, len(placed)))
+    for number, spacing in enumerate(features.spacing / PIXEL):
+        kind: dict[str, Any] = {"polarity": "falling"}
+        if spacing > 0:
+            limits = (max(0.6 * spacing - 2, 1.0), 1.4 * spacing + 2)
+            kind = {"polarity": "rising", "pairs": True, "spacing_px": limits}
+        edges = RulerEdges(threshold=THRESHOLD, length=length, smoothing_px=smoothing, noise=NOISE, **kind)
+        found = edges(image, placed[number : number + 1], device=device)
+        position[number], sigma[number] = found.position[0], found.sigma[0]
+    measured = features.point + features.normal * (position * PIXEL)[:, None] - features.placement
+    factor = np.where(features.spacing == 0, 1.0, 0.0)
+    all_sigma = np.hypot(sigma, 0.02) * PIXEL
+    rows = [line_rows(features.normal, features.point - features.placement, measured, all_sigma, factor)]
+    of = features.fiducials
+    for is_drilled in (False, True):
+        which = np.flatnonzero((of.hole > 0) == is_drilled)
+        reach = math.sqrt(2) * IMAGING.shift + IMAGING.angle * np.hypot(*(of.point - features.placement).T).max()
+        blobs = FindBlobs(
+            threshold=THRESHOLD,
+            polarity="bright",
+            search_px=(reach + 3 * IMAGING.etch_bias_sigma) / PIXEL + 1,
+            spokes=SPOKES,
+            smoothing_px=min(fiducial_smoothing(BLUR), of.radius[which].min() / PIXEL / 2.5),
+            match=not is_drilled,
+            noise=NOISE,
+        )
+        places = np.concatenate([view.to_pixels(of.point[which]), of.radius[which, None] / PIXEL], axis=1)
+        found = blobs(image, places.astype(np.float32), device=device)
+        back = np.linalg.inv(matrix[:2, :2])
+        covariance = found.covariance[:, :2, :2] + (0.02 if is_drilled else 0.003) ** 2 * np.eye(2)
+        variance, columns = np.linalg.eigh(back @ covariance.astype(np.float64) @ back.T)
+        axes = np.swapaxes(columns, 1, 2)
+        point = (of.point[which] - features.placement)[:, None]
+        shifted = point + (found.shift.astype(np.float64) @ back.T)[:, None]
+        rows.append(line_rows(axes, point, shifted, np.sqrt(variance), 0.0))
+    return np.concatenate(rows)
+
+
+def assert_near(pose: np.ndarray, expected: Any, tolerance: Any) -> None:
+    assert (np.abs(pose - expected) <= tolerance).all(), (pose - expected, tolerance)
+
+
+def length_of(bound: BoundFeatures) -> int:
+    return bound.operation.ruler.length
+
+
+def test_pose_is_that_of_the_operations_one_by_one(
+    features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
+) -> None:
+    image, _ = seen
+    bound = bind(features, device)
+    expected = NEAR + np.array([20e-6, -30e-6, 1e-3])
+    found = bound(image, expected)
+    view = BoardView(scale=PIXEL, shape=SHAPE, pose=tuple(expected))
+    rows = one_by_one(features, image, view, device, length_of(bound))
+    assert np.isfinite(rows).all()
+    offset = tuple(expected[:2] - features.placement)
+    solver = replace(bound.operation.solver, precision="double", placement=offset)
+    parts = solver(np.ascontiguousarray(rows), device=device)
+    cosine, sine = math.cos(parts.pose[2]), math.sin(parts.pose[2])
+    turned = np.array([[cosine, -sine], [sine, cosine]])
+    shift = parts.pose[:2] + features.placement - turned @ features.placement
+    camera = np.array(move_view(view, (*shift, parts.pose[2])).pose)
+    assert_near(found.pose, camera, (1e-9, 1e-9, 2e-7))
+    rulers = len(features.spacing)
+    np.testing.assert_allclose(found.residuals[:rulers], parts.residuals[:rulers], atol=2e-9)
+    assert found.status == 0
+    assert int(found.inliers) == int(parts.inliers)
+    np.testing.assert_allclose(found.etch_bias, parts.etch_bias, atol=2e-9)
+    # Covariance of the camera from the covariance of the board's motion at the image centre, by differences.
+    scale = min(float(parts.residual_scale), 1.0) ** 2
+
+    def camera_of(state: np.ndarray) -> np.ndarray:
+        """Camera for a measured place of the expected image centre and a turn of the board."""
+        c, s = math.cos(state[2]), math.sin(state[2])
+        turn = np.array([[c, -s], [s, c]])
+        return np.array(move_view(view, (*(state[:2] - turn @ expected[:2]), state[2])).pose)
+
+    place = parts.placement + features.placement
+    state, steps = np.array([*place, parts.pose[2]]), np.array([1e-6, 1e-6, 1e-5])
+    jacobian = np.stack(
+        [
+            (camera_of(state + e * h) - camera_of(state - e * h)) / (2 * h)
+            for e, h in zip(np.eye(3), steps, strict=True)
+        ],
+        1,
+    )
+    np.testing.assert_allclose(
+        found.covariance, jacobian @ parts.covariance @ jacobian.T / scale, rtol=2e-3, atol=1e-18
+    )
+
+
+def test_pose_is_the_least_squares_minimum(
+    features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
+) -> None:
+    """SciPy minimises the same loss in float64, without an etch bias and with trusted sigmas."""
+    image, _ = seen
+    bound = bind(features, device, etch_bias_sigma=0.0, solver=SolvePose(scale=1.0, max_iterations=30))
+    found = bound(image, NEAR)
+    view = BoardView(scale=PIXEL, shape=SHAPE, pose=tuple(NEAR))
+    rows = one_by_one(features, image, view, device, length_of(bound))
+    pose = robust.solve_pose(rows[:, :7], 3, 1.0, "tukey", 4.685, found.motion.astype(np.float64))
+    assert_near(found.motion, pose, (3e-9, 3e-9, 3e-7))
+
+
+def test_errors_are_as_predicted(artwork: Artwork, features: FeatureSet, device: Device) -> None:
+    """Squared Mahalanobis distances of 12 random motions: chi square of 36 degrees of freedom, between 15 and 70."""
+    rng, picture, bound = np.random.default_rng(8), round_picture(artwork), bind(features, device)
+    total, pose = 0.0, NEAR
+    for _ in range(12):
+        image, true = moved_picture(picture, rng)
+        found = bound(image, pose)
+        error = found.pose - true
+        total += error @ np.linalg.solve(found.covariance, error)
+        pose = found.pose.copy()  # the rulers follow the board
+    assert 15 < total < 70
+
+
+def test_a_region_of_the_image_gives_the_pose_of_the_image(
+    features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
+) -> None:
+    image, _ = seen
+    whole = bind(features, device)(image, NEAR).pose.copy()
+    top, left = 3, 4
+    cut = np.ascontiguousarray(image[top:-2, left:-2])
+    bound = bind(features, device, cut.shape, frame_shape=SHAPE)
+    found = bound(cut, NEAR, corner=(left, top))
+    assert_near(found.pose, whole, (3e-8, 3e-8, 3e-6))
+    # Another corner is an argument, not a new build: the same pixels, stated to lie elsewhere, are another pose.
+    moved = bound(cut, NEAR + np.array([PIXEL, -2 * PIXEL, 0.0]), corner=(left - 1, top - 2))
+    assert_near(moved.pose - whole, (PIXEL, -2 * PIXEL, 0.0), (3e-8, 3e-8, 3e-6))
+
+
+def test_a_mirrored_side_is_seen_from_behind(
+    features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
+) -> None:
+    """The mirrored image shows the same board at the same pose to a camera below it, whose columns run backwards."""
+    image, _ = seen
+    front = bind(features, device)(image, NEAR).pose.copy()
+    mirrored = np.ascontiguousarray(image[:, ::-1])
+    found = bind(replace(features, side="bottom"), device)(mirrored, NEAR)
+    assert_near(found.pose, front, (3e-8, 3e-8, 3e-6))
+
+
+def test_search_distance_shortens_the_rulers(
+    features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
+) -> None:
+    image, true = seen
+    long, short = bind(features, device), bind(features, device, search_px=1.0)
+    assert length_of(short) < length_of(long)
+    found = short(image, true)
+    assert found.status == 0
+    assert_near(found.pose, true, 5 * np.sqrt(np.diag(found.covariance)))
+
+
+def test_frames_of_a_camera_need_no_copy(
+    features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
+) -> None:
+    image, _ = seen
+    bound = bind(features, device)
+    result = bound(image, NEAR)
+    pose = result.pose.copy()
+    bound.frame[...] = 0
+    assert bound(None, NEAR).status == Status.NO_DATA
+    bound.frame[...] = image
+    again = bound(None, NEAR)
+    np.testing.assert_array_equal(again.pose, pose)
+    # The same arrays in every call: nothing is allocated.
+    assert all(a is b for a, b in zip(again, result, strict=True))
+
+
+def test_a_board_that_is_not_there_is_refused(features: FeatureSet, device: Device) -> None:
+    bound = bind(features, device)
+    found = bound(np.full(SHAPE, 80, np.uint8), NEAR)
+    assert found.status == Status.NO_DATA
+    assert np.isnan(found.pose).all()
+    assert np.isnan(found.covariance).all()
+    assert (found.feature_status & Status.LOW_SIGNAL).all()
+    lost = bound(np.full(SHAPE, 80, np.uint8), (np.nan, 0.0, 0.0))
+    assert lost.status & Status.NOT_FINITE
+    assert np.isnan(lost.pose).all()
+
+
+def test_a_blob_of_another_size_is_not_the_fiducial(
+    features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
+) -> None:
+    image, _ = seen
+    of = features.fiducials
+    matched = np.flatnonzero(of.hole == 0)
+    radius = of.radius.copy()
+    radius[matched[0]] += 3 * PIXEL
+    found = bind(replace(features, fiducials=of._replace(radius=radius)), device)(image, NEAR)
+    count = len(features.spacing)
+    assert found.feature_status[count] == Status.AMBIGUOUS
+    assert not found.feature_status[count + 1 : count + 3].any()
+    assert (found.weights[count : count + 2] == 0).all()
+    assert np.isnan(found.residuals[count : count + 2]).all()
+    assert found.status == 0
+
+
+@pytest.mark.parametrize("kind", ["rulers", "fiducials"])
+def test_one_kind_of_features_is_enough(
+    kind: str, features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
+) -> None:
+    image, true = seen
+    if kind == "rulers":
+        some = replace(features, fiducials=Fiducials.empty())
+    else:
+        fiducials = features.fiducials.subset(features.fiducials.hole == 0)
+        empty = {name: getattr(features, name)[:0] for name in ("point", "normal", "spacing", "length", "sigma")}
+        some = replace(features, fiducials=fiducials, **empty)
+    found = bind(some, device)(image, NEAR)
+    assert found.status == 0
+    assert_near(found.pose, true, 5 * np.sqrt(np.diag(found.covariance)))
+
+
+def test_wrong_frames_and_options_are_refused(features: FeatureSet, device: Device) -> None:
+    bound = bind(features, device)
+    with pytest.raises(TypeError, match="frame: expected dtype uint8, got uint16"):
+        bound(np.zeros(SHAPE, np.uint16), NEAR)
+    with pytest.raises(ValueError, match="frame: expected shape"):
+        bound(np.zeros((10, 10), np.uint8), NEAR)
+    with pytest.raises(ValueError, match="rigid transform"):
+        bind(features, device, solver=SolvePose(transform="similarity"))
+    with pytest.raises(ValueError, match="threshold"):
+        bind(features, device, threshold=0.0)
+    with pytest.raises(ValueError, match="pixel_size"):
+        bind(features, device, pixel_size=-1.0)
+    two = {name: getattr(features, name)[:2] for name in ("point", "normal", "spacing", "length", "sigma")}
+    few = replace(features, fiducials=Fiducials.empty(), **two)
+    with pytest.raises(ValueError, match="2 rows"):
+        bind(few, device)

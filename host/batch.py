@@ -37,6 +37,8 @@ class Batch(Generic[R]):
         Times of the launch, and of the arrival of the results in host memory.
     started, ended : int or None
         Start and end of the computation on the device, on the host's clock, where the stream profiles.
+    exposure_delay : int
+        Time from the middle of the exposure of a frame to its arrival, as the source states it.
     """
 
     number: int
@@ -47,6 +49,17 @@ class Batch(Generic[R]):
     started: int | None
     ended: int | None
     delivered: int
+    exposure_delay: int = 0
+
+    @property
+    def exposed(self) -> HostArray:
+        """(count,) int64 middle of the exposure of each frame [ns]."""
+        return np.asarray(self.arrived - self.exposure_delay)
+
+    @property
+    def latency(self) -> HostArray:
+        """(count,) int64 time from the middle of the exposure of each frame to its results in host memory [ns]."""
+        return np.asarray(self.delivered - self.exposed)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -54,7 +67,7 @@ class Batch(Generic[R]):
     def copy(self) -> Batch[R]:
         """Return a copy of the batch that stays valid."""
         result = map_arrays(self.result, np.copy)
-        times = (self.launched, self.started, self.ended, self.delivered)
+        times = (self.launched, self.started, self.ended, self.delivered, self.exposure_delay)
         return Batch(self.number, self.frames.copy(), result, self.arrived.copy(), *times)
 
 

@@ -42,11 +42,15 @@ class Operation(Generic[R]):
         Folder of the kernel sources.
     include_folders : tuple of pathlib.Path
         More folders that are searched for headers, such as ``gpuvision.operation.KERNEL_FOLDER``.
+    takes_single_frames : bool
+        Whether the first input is one frame, without an axis for a batch; default False. A stream then has batches of
+        one frame.
     """
 
     Result: ClassVar[type[Any]]
     kernel_folder: ClassVar[Path | None] = None
     include_folders: ClassVar[tuple[Path, ...]] = ()
+    takes_single_frames: ClassVar[bool] = False
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Check shape and dtype of the first input and describe the kernel launch for it.

@@ -28,7 +28,17 @@ from gpuvision.host.errors import StreamError
 from gpuvision.host.memory import free_bytes, size_in_words
 from gpuvision.host.operation import Operation
 from gpuvision.host.report import StreamReport, StreamStatistics
-from gpuvision.host.ring import SharedSlot, Slot, StagedSlot, Step, check_chain, queues_of, slot_bytes, steps_of
+from gpuvision.host.ring import (
+    SharedSlot,
+    Slot,
+    StagedSlot,
+    Step,
+    check_chain,
+    queues_of,
+    slot_bytes,
+    steps_of,
+    takes_single_frames,
+)
 from gpuvision.host.sources import ArraySource, Clock, Source
 from gpuvision.host.stalls import StallRecorder
 from gpuvision.host.trace import Trace
@@ -57,13 +67,16 @@ class Pipeline(Generic[R]):
     ----------
     source : Source or array
         An array holds frames along its first axis. The stream closes the source.
-    operation : Operation or sequence of Operation and Step
+    operation : Operation, Step, or sequence of both
         Operations of a chain pass their arrays on in device memory; the stream delivers the result of the last one.
-        Each result must have the batch as its first axis.
+        Each result must have the batch as its first axis. Operations of one frame, such as `RulerEdges`, run with a
+        batch of 1; their results are delivered with a first axis of length 1. `Step` gives an operation further inputs
+        that are the same for all frames.
     device : Device, optional
         `Device.best` by default.
     batch : int, optional
-        Frames per launch, see `plan_stream`. Default: about 4 MB of frames, for recordings without a rate.
+        Frames per launch, see `plan_stream`. Default: about 4 MB of frames, for recordings without a rate; 1 where an
+        operation takes single frames.
     ring : int
         Number of slots, at least 2: the consumer holds one, the others are filled, computed, or wait. Under
         ``"drop_oldest"`` the ring bounds the age of the delivered frames.
@@ -99,7 +112,7 @@ class Pipeline(Generic[R]):
     def __init__(
         self,
         source: Source | HostArray,
-        operation: Operation[R] | Sequence[Operation[Any] | Step],
+        operation: Operation[R] | Step | Sequence[Operation[Any] | Step],
         *,
         device: Device | None = None,
         batch: int | None = None,
@@ -116,12 +129,13 @@ class Pipeline(Generic[R]):
         self._limits = limits
         self.source = _source(source)
         self.ring, self.policy, self.trace = _whole(ring, "ring", 2, " slots"), policy, trace
-        self.batch = default_batch(self.source, self.ring) if batch is None else _whole(batch, "batch", 1)
         self.device = Device.best() if device is None else device
         self.zero_copy = self.device.shares_memory if zero_copy is None else zero_copy
         self.inline = inline
         self.profile = profile or trace is not None
         self._steps = steps_of(operation)
+        usual = 1 if takes_single_frames(self._steps) else default_batch(self.source, self.ring)
+        self.batch = usual if batch is None else _whole(batch, "batch", 1)
         self._clock = clock
         self._check()
         self._statistics = StreamStatistics(self.ring if warm_up is None else warm_up)
@@ -358,7 +372,8 @@ class Pipeline(Generic[R]):
         self._held_spans = spans
         slot.delivered = delivered
         frames = slot.frames if slot.count == self.batch else slot.frames[: slot.count]
-        return Batch(slot.number, frames, slot.trimmed_result(), arrived, slot.filled, started, ended, delivered)
+        times = (arrived, slot.filled, started, ended, delivered)
+        return Batch(slot.number, frames, slot.trimmed_result(), *times, round(1e9 * self.source.exposure_delay))
 
     def _release(self, now: int) -> None:
         """Give the slot that the consumer holds back to the producer."""

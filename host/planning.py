@@ -21,7 +21,7 @@ from gpuvision.host.errors import StreamError
 from gpuvision.host.memory import free_bytes, size_in_words
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Pipeline
-from gpuvision.host.ring import Step, slot_bytes, steps_of
+from gpuvision.host.ring import Step, slot_bytes, steps_of, takes_single_frames
 from gpuvision.host.sources import ArraySource, Source
 
 # Default batch sizes [frames] that are tried, doubling: the chosen one is at most twice the smallest that suffices.
@@ -173,7 +173,7 @@ class Plan:
 
 def plan_stream(
     source: Source,
-    operation: Operation[Any] | Sequence[Operation[Any] | Step],
+    operation: Operation[Any] | Step | Sequence[Operation[Any] | Step],
     *,
     rate: float | None = None,
     latency: float | None = None,
@@ -192,7 +192,7 @@ def plan_stream(
     ----------
     source : Source
         Gives shape, dtype and rate; no frame is read.
-    operation : Operation or sequence of Operation and Step
+    operation : Operation, Step, or sequence of both
     rate : float, optional
         Frame rate [1/s]; the rate of the source by default.
     latency : float, optional
@@ -209,7 +209,7 @@ def plan_stream(
     device, zero_copy
         As for `Pipeline`.
     batches : sequence of int
-        Batch sizes to try, ascending.
+        Batch sizes to try, ascending; 1 only where an operation takes single frames.
     measure : callable, optional
         Function that takes a batch size and whether kernels run inline, and returns a `Cost`; it replaces the
         measurement on the device.
@@ -245,7 +245,7 @@ def plan_stream(
     measure = _Measurement(source, steps, device, zero_copy, limits) if measure is None else measure
     max_bytes = free_bytes(device) // 2 if limits.max_bytes is None else limits.max_bytes
     trials: list[Trial] = []
-    for batch in batches:
+    for batch in (1,) if takes_single_frames(steps) else batches:
         ring = _ring_for(stall, rate, batch, source, limits)
         ring_bytes = ring * slot_bytes(steps, device, batch, source.shape, source.dtype, zero_copy=zero_copy)
         if ring_bytes > max_bytes and not trials:

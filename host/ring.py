@@ -12,31 +12,35 @@ import pyopencl as cl
 from gpuvision.host.arrays import HostArray, host_view
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
-from gpuvision.host.launch import Launch, Spec, nbytes_of
+from gpuvision.host.launch import Spec, Specs, nbytes_of
 from gpuvision.host.operation import Operation
+from gpuvision.host.sequence import BoundSequence
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
 
 @dataclass(frozen=True)
 class Step:
-    """Operation of a chain, and the fields of the previous result that are its inputs.
+    """Operation of a chain, and its inputs: fields of the previous result, then fixed arrays.
 
     Attributes
     ----------
     operation : Operation
     takes : tuple of str
-        Fields of the previous result, in the order of the operation's inputs. Default: an operation of one input takes
-        the first computed field.
+        Fields of the previous result, in the order of the operation's inputs. Default: the first computed field. The
+        first step of a chain takes the frames of the source.
+    fixed : tuple of numpy.ndarray
+        Values of the inputs after those: the same for all frames of the stream, such as the rulers of a `RulerEdges`.
     """
 
     operation: Operation[Any]
     takes: tuple[str, ...] = ()
+    fixed: tuple[HostArray, ...] = ()
 
 
-def steps_of(operation: Operation[Any] | Sequence[Operation[Any] | Step]) -> list[Step]:
+def steps_of(operation: Operation[Any] | Step | Sequence[Operation[Any] | Step]) -> list[Step]:
     """Return the steps of an operation or a chain."""
-    given = [operation] if isinstance(operation, Operation) else list(operation)
+    given = [operation] if isinstance(operation, Operation | Step) else list(operation)
     if not given:
         raise ValueError("expected an operation, or a chain of at least one")
     return [each if isinstance(each, Step) else Step(each) for each in given]
@@ -77,19 +81,30 @@ def queues_of(device: Device, ring: int, *, zero_copy: bool, profiling: bool, in
     return [new() for _ in range(ring)] if separate else [new()] * ring
 
 
+def takes_single_frames(steps: Sequence[Step]) -> bool:
+    """Return whether an operation of a chain takes one frame instead of a batch of frames."""
+    return any(step.operation.takes_single_frames for step in steps)
+
+
 def check_chain(steps: Sequence[Step], device: Device, batch: int, shape: tuple[int, ...], dtype: Any) -> None:
     """Check that a chain takes such frames and that its results have the batch as their first axis.
 
     The last batch of a recording may be short: the slot computes the whole batch and trims the results. So results
-    must grow with the batch.
+    must grow with the batch. Results of a chain that takes single frames get the first axis when they are delivered.
 
     Raises
     ------
     TypeError, ValueError
         An operation does not take its input, or a result has another first axis.
     """
+    if takes_single_frames(steps):
+        if batch != 1:
+            names = ", ".join(_named(step) for step in steps if step.operation.takes_single_frames)
+            raise ValueError(f"{names} takes one frame at a time; use batch=1, not {batch}")
+        _chain(steps, device, (1, *shape), np.dtype(dtype))
+        return
     for size in (batch, batch + 1):
-        for name, spec in _specs(steps, device, (size, *shape), np.dtype(dtype)).items():
+        for name, spec in _chain(steps, device, (size, *shape), np.dtype(dtype))[-1].outputs.items():
             if spec is not None and (not spec[0] or spec[0][0] != size):
                 raise ValueError(
                     f"{_named(steps[-1])}: {name} has shape {spec[0]} for a batch of {size} frames; "
@@ -101,33 +116,37 @@ def slot_bytes(
     steps: Sequence[Step], device: Device, batch: int, shape: tuple[int, ...], dtype: Any, *, zero_copy: bool
 ) -> int:
     """Return the memory of one slot on host and device together [bytes]."""
-    launches = _launches(steps, device, (batch, *shape), np.dtype(dtype))
-    arrays = sum(launch.nbytes for launch in launches)
-    copies = 0 if zero_copy else nbytes_of((*launches[0].inputs, *launches[-1].outputs.values()))
+    chain = _chain(steps, device, (batch, *shape), np.dtype(dtype))
+    arrays = sum(specs.nbytes for specs in chain)
+    copies = 0 if zero_copy else nbytes_of((*chain[0].inputs, *chain[-1].outputs.values()))
     return arrays + copies + batch * np.dtype(np.int64).itemsize
 
 
-def _specs(
-    steps: Sequence[Step], device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]
-) -> Mapping[str, Spec | None]:
-    return _launches(steps, device, shape, dtype)[-1].outputs
-
-
-def _launches(steps: Sequence[Step], device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> list[Launch]:
-    launch = steps[0].operation.launch(device, shape, dtype)
-    if len(launch.inputs) != 1:
-        raise ValueError(f"{_named(steps[0])} takes {len(launch.inputs)} arrays, a stream's source gives one")
-    launches = [launch]
-    for step in steps[1:]:
-        given = _taken(step, dict(launch.outputs))
-        launch = step.operation.launch(device, *given[0])
-        launches.append(launch)
-        expected = [(tuple(shape), np.dtype(dtype)) for shape, dtype in launch.inputs]
-        if expected != [(tuple(shape), np.dtype(dtype)) for shape, dtype in given]:
+def _chain(steps: Sequence[Step], device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> list[Specs]:
+    """Return inputs and outputs of each step of a chain for batches of frames of one shape."""
+    chain: list[Specs] = []
+    for step in steps:
+        taken = [(shape, dtype)] if not chain else _taken(step, dict(chain[-1].outputs))
+        given = [_frame_spec(step, tuple(taken[0][0]), taken[0][1]), *taken[1:]]
+        given += [(each.shape, each.dtype) for each in step.fixed]
+        specs = step.operation.specs(device, *given[0])
+        if not chain and len(specs.inputs) != len(given):
             raise ValueError(
-                f"{_named(step)} expects {expected}, is given {given}; name what it takes: Step(operation, takes=(...))"
+                f"{_named(step)} takes {len(specs.inputs)} arrays, a stream's source gives one; give the others: "
+                "Step(operation, fixed=(...))"
             )
-    return launches
+        if list(specs.inputs) != [(tuple(shape), np.dtype(dtype)) for shape, dtype in given]:
+            raise ValueError(
+                f"{_named(step)} expects {list(specs.inputs)}, is given {given}; name what it takes: "
+                "Step(operation, takes=(...))"
+            )
+        chain.append(specs)
+    return chain
+
+
+def _frame_spec(step: Step, shape: tuple[int, ...], dtype: Any) -> Spec:
+    """Return the first input of a step: without the axis of the batch where the operation takes single frames."""
+    return (shape[1:] if step.operation.takes_single_frames and shape[:1] == (1,) else shape), np.dtype(dtype)
 
 
 def _taken(step: Step, fields: Mapping[str, Any]) -> list[Any]:
@@ -142,6 +161,12 @@ def _taken(step: Step, fields: Mapping[str, Any]) -> list[Any]:
 
 def _named(step: Step) -> str:
     return type(step.operation).__name__
+
+
+def _set_fixed(step: Step, bound: Bound[Any]) -> None:
+    """Copy the fixed arrays of a step to the last inputs of its bound operation."""
+    for array, values in zip(bound.inputs[len(bound.inputs) - len(step.fixed) :], step.fixed, strict=True):
+        array.set(np.ascontiguousarray(values), queue=bound.queue)
 
 
 def map_arrays(result: R, change: Callable[[Any], Any]) -> R:
@@ -173,20 +198,28 @@ class Slot(Generic[R]):
         self, steps: Sequence[Step], device: Device, queues: Queues, batch: int, shape: tuple[int, ...], dtype: Any
     ) -> None:
         self._queues = queues
-        self._first: Bound[Any] = steps[0].operation.bind(device, (batch, *shape), dtype, queue=queues.compute)
+        frame = _frame_spec(steps[0], (batch, *shape), dtype)
+        self._first: Bound[Any] = steps[0].operation.bind(device, *frame, queue=queues.compute)
+        _set_fixed(steps[0], self._first)
         self._rest: list[tuple[Bound[Any], tuple[Any, ...]]] = []
         last = self._first
         for step in steps[1:]:
             arrays = tuple(_taken(step, last.outputs._asdict()))
-            last = step.operation.bind(device, arrays[0].shape, arrays[0].dtype, queue=queues.compute)
-            self._rest.append((last, arrays))
+            first = _frame_spec(step, arrays[0].shape, arrays[0].dtype)
+            last = step.operation.bind(device, *first, queue=queues.compute)
+            _set_fixed(step, last)
+            given = (arrays[0].reshape(first[0]), *arrays[1:], *last.inputs[len(arrays) :])
+            self._rest.append((last, given))
         self._outputs: R = last.outputs
         self.arrived = np.zeros(batch, np.int64)
         self.number = self.count = 0
         self.asked = self.taken = self.filled = self.enqueued = self.delivered = 0
         self._begun: Any = None
         self._done: Any = None
-        self.frames, self.result = self._host_side()
+        self.frames, self._host_result = self._host_side()
+        self.frames = self.frames.reshape(batch, *shape)
+        with_axis = takes_single_frames(steps)
+        self.result: R = map_arrays(self._host_result, lambda each: each[None]) if with_axis else self._host_result
 
     def _host_side(self) -> tuple[HostArray, R]:
         raise NotImplementedError
@@ -201,7 +234,8 @@ class Slot(Generic[R]):
         raise NotImplementedError
 
     def _compute(self, wait_for: Sequence[Any] | None = None) -> None:
-        self._begun = event = self._first(wait_for=wait_for)
+        event = self._first(wait_for=wait_for)
+        self._begun = self._first.begun if isinstance(self._first, BoundSequence) else event
         for bound, arrays in self._rest:
             event = bound(*arrays)
         self._done = event
@@ -266,7 +300,7 @@ class StagedSlot(Slot[R]):
         after = [self._done]
         self._downloaded = [
             cl.enqueue_copy(queues.download, host, array.base_data, is_blocking=False, wait_for=after)
-            for host, array in zip(self.result, self._outputs, strict=True)
+            for host, array in zip(self._host_result, self._outputs, strict=True)
             if array is not None
         ]
         queues.download.flush()

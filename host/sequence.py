@@ -110,6 +110,8 @@ class BoundSequence(Bound[R]):
         As in `Bound`, of the whole sequence.
     stages : mapping of str to Bound
         Bound operation of each stage, by name.
+    begun : pyopencl.Event
+        Event of the first launch of the last call.
     """
 
     def __init__(
@@ -138,6 +140,7 @@ class BoundSequence(Bound[R]):
             self.stages[stage.name] = bound
             arrays |= {f"{stage.name}.{field}": array for field, array in bound.outputs._asdict().items()}
         self._bounds = tuple(self.stages.values())
+        self.begun: Any = None
         self.outputs = self._result({field: arrays[name] for field, name in layout.outputs.items() if name is not None})
 
     def prepare_queue(self) -> None:
@@ -157,9 +160,8 @@ class BoundSequence(Bound[R]):
         """Enqueue all stages and return the event of the last one; arguments as in `Bound`."""
         if frames or out is not None:
             return self._with(frames or self.inputs, self.outputs if out is None else out, wait_for)
-        first, *rest = self._bounds
-        event = first(wait_for=wait_for)
-        for bound in rest:
+        self.begun = event = self._bounds[0](wait_for=wait_for)
+        for bound in self._bounds[1:]:
             event = bound()
         return event
 
@@ -177,7 +179,9 @@ class BoundSequence(Bound[R]):
                 **{field: wanted.get(f"{stage.name}.{field}", array) for field, array in own.items()}
             )
             given = tuple(arrays[name] for name in stage.takes)
-            event = bound(*given, out=result, wait_for=wait_for if event is None else None)
+            is_first = event is None
+            event = bound(*given, out=result, wait_for=wait_for if is_first else None)
+            self.begun = event if is_first else self.begun
             arrays |= {f"{stage.name}.{field}": array for field, array in result._asdict().items()}
         return event
 

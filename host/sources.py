@@ -43,12 +43,16 @@ class Source:
         Number of frames in all; ``None`` where it is not known beforehand.
     rate : float or None
         Frame rate [1/s]; ``None`` where the source has none.
+    exposure_delay : float
+        Time from the middle of the exposure of a frame to its arrival [s]: half of the exposure, readout and transfer.
+        Default 0.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     length: int | None = None
     rate: float | None = None
+    exposure_delay: float = 0.0
 
     def wait(self) -> bool:
         """Wait until a frame has arrived.
@@ -303,6 +307,7 @@ class PacedSource(Source):
         if not 0.0 < rate < 1e9:
             raise ValueError(f"rate is {rate}, expected frames per second between 0 and 1e9")
         self.shape, self.dtype, self.length, self.rate = source.shape, source.dtype, source.length, rate
+        self.exposure_delay = source.exposure_delay
         self.late = 0
         self._source, self._clock = source, clock
         self._stopped = threading.Event()

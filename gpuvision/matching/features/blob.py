@@ -194,6 +194,7 @@ class FindBlobs(VisionOperation[Blobs]):
     """
 
     Result: ClassVar[type[Any]] = Blobs
+    takes_single_frames: ClassVar[bool] = True
 
     threshold: float
     shape: Shape = "circle"

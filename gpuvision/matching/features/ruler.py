@@ -243,6 +243,7 @@ class RulerEdges(VisionOperation[Edges]):
     """
 
     Result: ClassVar[type[Any]] = Edges
+    takes_single_frames: ClassVar[bool] = True
 
     threshold: float
     length: int = 64

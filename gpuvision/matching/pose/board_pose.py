@@ -159,6 +159,7 @@ class BoardPoseEstimator(VisionOperation[BoardPoseEstimate]):
     """
 
     Result: ClassVar[type[Any]] = BoardPoseEstimate
+    takes_single_frames: ClassVar[bool] = True
 
     ruler: RulerEdges
     lines: int

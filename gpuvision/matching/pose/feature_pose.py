@@ -310,6 +310,7 @@ class EstimateFeaturePose(OperationSequence[FeaturePose]):
     """
 
     Result: ClassVar[type[Any]] = FeaturePose
+    takes_single_frames: ClassVar[bool] = True
 
     features: CameraFeatures
     ruler: RulerEdges

@@ -16,7 +16,7 @@ from gpuvision.workflows.demo import SENSORS, make_scan_task
 from gpuvision.workflows.scanning import scan
 from gpuvision.workflows.simulating import simulate, simulate_recording
 
-PROFILES = 72  # the middle of the part: a half of the box, the cylinder and the steps
+PROFILES = 40  # the middle of the part, 10 mm: a tenth of the box, a half of the cylinder, most of the steps
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_a_scan_of_the_recording_is_what_was_predicted(name: str, light: Path, d
 def test_a_camera_finds_the_part_again(light: Path) -> None:
     attribution = simulate(make_scan_task("camera_line", PROFILES), light, seed=7).attribution
     smooth = away_from_edges(attribution.truth.h) & np.isfinite(attribution.error)
-    assert smooth.sum() > 15_000
+    assert smooth.sum() > 8000
     # 0.03 pixel at 0.24 mm per pixel; a windowed centre of gravity of this line reaches 0.01 to 0.02.
     assert np.sqrt(np.mean(attribution.error[smooth] ** 2)) < 0.03 * 0.24e-3
 
@@ -57,7 +57,7 @@ def test_the_noise_is_what_the_sensor_predicts(light: Path) -> None:
     attribution = simulate(make_scan_task("psd_line", PROFILES), light, seed=7).attribution
     noise, sigma = attribution.causes["noise"], attribution.reading.sigma
     known = np.isfinite(noise) & np.isfinite(sigma) & away_from_edges(attribution.truth.h)
-    assert known.sum() > 2000
+    assert known.sum() > 1100
     assert np.sqrt(np.mean((noise[known] / sigma[known]) ** 2)) == pytest.approx(1.0, abs=0.1)
 
 

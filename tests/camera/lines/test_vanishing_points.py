@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -75,14 +76,14 @@ def coverage(rng: np.random.Generator, draws: int, cases: list[tuple[float, floa
     return np.array(found)
 
 
-def test_errors_are_as_predicted(rng: np.random.Generator) -> None:
+def test_errors_are_as_predicted(rng: np.random.Generator, draws: Callable[[int, int], int]) -> None:
     """No cold start fails: every error is within six standard deviations, and the mean square is 1."""
     cases = [
         (tilt, border, sigma) for tilt in (0.0, 20.0, 45.0) for border, sigma in ((0.3, 0.02), (3.0, 0.2), (20.0, 0.2))
     ]
-    found = coverage(rng, 180, cases)
+    found = coverage(rng, draws(108, 180), cases)
     assert np.all(np.abs(found) < 6.0)
-    # 720 errors: the mean of their squares has a standard deviation of sqrt(2/720) = 0.053 if they were independent,
+    # 432 errors: the mean of their squares has a standard deviation of sqrt(2/432) = 0.068 if they were independent,
     # and about twice that because the four errors of a fit are correlated.
     assert abs(np.mean(found**2) - 1.0) < 0.4
 
@@ -98,12 +99,12 @@ def test_uncertainties_cover_the_truth(rng: np.random.Generator) -> None:
     assert np.all(np.abs(found) < 6.0)
 
 
-def test_vanishing_points_have_errors_as_predicted(rng: np.random.Generator) -> None:
+def test_vanishing_points_have_errors_as_predicted(rng: np.random.Generator, draws: Callable[[int, int], int]) -> None:
     """The three components have a singular covariance, so a draw has two degrees of freedom per point."""
     ideal, lens = plane_grid(rng, 30.0), radial_lens(10.0)
     exact = fit_lens(grid_lines(lens.distort(ideal)), model="k1,k2", lines="vanishing").values
     squares = []
-    for _ in range(100):
+    for _ in range(draws(60, 100)):
         points = lens.distort(ideal) + rng.normal(0.0, 0.1, ideal.shape)
         fit = fit_lens(grid_lines(points), model="k1,k2", lines="vanishing")
         for first in (4, 7):
@@ -113,7 +114,7 @@ def test_vanishing_points_have_errors_as_predicted(rng: np.random.Generator) -> 
             values, vectors = np.linalg.eigh(fit.covariance[part, part])
             assert values[0] < 1e-9 * values[2]
             squares += list((vectors[:, 1:].T @ wrong) ** 2 / values[1:])
-    # 400 squares: standard deviation of the mean 0.07 to 0.14.
+    # 240 squares: standard deviation of the mean 0.09 to 0.18.
     assert abs(np.mean(squares) - 1.0) < 0.45
 
 
@@ -180,34 +181,36 @@ def test_exact_lines_give_a_wide_angle_lens(rng: np.random.Generator, order: int
 
 
 @pytest.mark.parametrize("order", [3, 4])
-def test_a_wide_angle_lens_gets_the_coefficients_it_needs(order: int) -> None:
+def test_a_wide_angle_lens_gets_the_coefficients_it_needs(order: int, draws: Callable[[int, int], int]) -> None:
     """The residual is the noise; k1 and k2 alone leave more."""
     rng, lens, chosen = np.random.default_rng(11), wide_angle_lens(order), []
-    for _ in range(10):
+    for _ in range(draws(5, 10)):
         ideal = plane_grid(rng, 20.0, rows=31, columns=41)
         points = lens.distort(ideal) + rng.normal(0.0, 0.02, ideal.shape)
         fit = fit_lens(grid_lines(points))
         chosen.append(len(fit.lens.coefficients))
         assert fit.sigma_px == pytest.approx(0.02, rel=0.1)
         assert fit_lens(grid_lines(points), model="k1,k2").sigma_px > 1.08 * fit.sigma_px
-    assert chosen.count(order) >= 7
+    assert chosen.count(order) >= 0.7 * len(chosen)
 
 
 @pytest.mark.parametrize(
     ("border", "k2_part", "sigma", "model"),
     [(0.0, 0.0, 0.05, "none"), (5.0, 0.0, 0.05, "k1"), (5.0, -0.6, 0.02, "k1,k2"), (5.0, -0.6, 0.0, "k1,k2")],
 )
-def test_the_smallest_sufficient_model(border: float, k2_part: float, sigma: float, model: str) -> None:
+def test_the_smallest_sufficient_model(
+    border: float, k2_part: float, sigma: float, model: str, draws: Callable[[int, int], int]
+) -> None:
     rng = np.random.default_rng(7)
     lens = radial_lens(border, k2_part=k2_part)
     chosen = []
-    for _ in range(20):
+    for _ in range(draws(10, 20)):
         points = lens.distort(plane_grid(rng, 20.0))
         fit = fit_lens(grid_lines(points + rng.normal(0.0, sigma, points.shape)))
         chosen.append(fit.model)
         assert {(fit.model, fit.lines)}.isdisjoint((other.model, other.lines) for other in fit.alternatives)
     # At a significance of 0.05, one model in twenty may be larger than needed.
-    assert chosen.count(model) >= 16
+    assert chosen.count(model) >= 0.8 * len(chosen)
     assert "none" not in chosen or model == "none"
 
 
@@ -256,9 +259,11 @@ def test_no_distortion_leaves_no_centre(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize(("sigma", "faint"), [(0.2, True), (0.01, False)])
-def test_a_faint_distortion_is_said_to_be_faint(rng: np.random.Generator, sigma: float, faint: bool) -> None:
+def test_a_faint_distortion_is_said_to_be_faint(
+    rng: np.random.Generator, sigma: float, faint: bool, draws: Callable[[int, int], int]
+) -> None:
     """0.3 pixels of distortion under 0.2 pixels of noise: the linear uncertainty is not valid, and each fit warns."""
-    for _ in range(20):
+    for _ in range(draws(8, 20)):
         points, _ = noisy_grid(rng, 20.0, 0.3, sigma)
         fit = fit_lens(grid_lines(points), model="k1,k2")
         assert any("faint" in each or "as straight" in each for each in fit.warnings) is faint
@@ -331,11 +336,11 @@ def test_one_family_of_parallel_lines(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("loss", ["huber", "tukey"])
-def test_outliers(loss: str) -> None:
+def test_outliers(loss: str, draws: Callable[[int, int], int]) -> None:
     """Two in a hundred points are 5 to 50 pixels off; the errors stay near the errors of clean data."""
     rng = np.random.default_rng(3)
     squares = []
-    for _ in range(30):
+    for _ in range(draws(15, 30)):
         points, lens = noisy_grid(rng, 20.0, 20.0, 0.1)
         wrong = rng.random(points.shape[:2]) < 0.02
         angle = rng.uniform(0.0, 2.0 * np.pi, np.count_nonzero(wrong))

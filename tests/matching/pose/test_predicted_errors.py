@@ -77,11 +77,14 @@ def assert_as_promised(ratios: np.ndarray, limits: np.ndarray) -> None:
     assert (ratios < limits[1]).all(), ratios
 
 
-def test_errors_are_those_promised(drawn: BoardFix, device: Device, rng: np.random.Generator) -> None:
-    fixes = drawn.fixes(drawn.sharp(2, rng), 100, device, rng)
+def test_errors_are_those_promised(
+    drawn: BoardFix, device: Device, rng: np.random.Generator, draws: Callable[[int, int], int]
+) -> None:
+    count = draws(60, 100)
+    fixes = drawn.fixes(drawn.sharp(draws(1, 2), rng), count, device, rng)
     assert fixes.good.all()
-    assert_as_promised(fixes.scatter / drawn.chosen.sigmas, band(100))
-    assert_as_promised(fixes.scatter / fixes.predicted, band(100))
+    assert_as_promised(fixes.scatter / drawn.chosen.sigmas, band(count))
+    assert_as_promised(fixes.scatter / fixes.predicted, band(count))
     assert fixes.squares.max() < GROSS
 
 
@@ -91,7 +94,7 @@ def test_no_wrong_pose_of_a_disturbed_board(
 ) -> None:
     count = draws(30, 60)
     board = replace(drawn, motion_px=5.0 if kind == "motion" else 0.0)
-    pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else 4)]
+    pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else draws(2, 4))]
     fixes = board.fixes(pictures, count, device, rng)
     if kind == "reversed":
         # Dark copper: no pose if bright copper is searched, all poses if dark copper is searched.

@@ -72,6 +72,12 @@ from .camera.polynomial import (
 from .camera.scheimpflug import (
     TiltedSensor as TiltedSensor,
 )
+from .camera.sensor_fit import (
+    SensorFit as SensorFit,
+)
+from .camera.sensor_fit import (
+    fit_sensor as fit_sensor,
+)
 from .camera.undistort_image import (
     UndistortedImage as UndistortedImage,
 )

@@ -72,6 +72,7 @@ MODULES = (
     "gpuvision.ranging.polygon_scan",
     "gpuvision.ranging.encoder",
     "gpuvision.camera.calibration",
+    "gpuvision.camera.photon_transfer",
     "gpuvision.camera.photons",
     "gpuvision.camera.sensor_readout",
     "gpuvision.camera.ground_plane",

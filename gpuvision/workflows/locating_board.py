@@ -25,6 +25,7 @@ from gpuvision.camera.orthographic import BoardView
 from gpuvision.camera.undistort_image import UndistortImage
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.artwork.artwork import Artwork
+from gpuvision.matching.board.copper_support import find_other_pose
 from gpuvision.matching.board.edge_measurement import (
     BoardMeasurement,
     BoardMeasurer,
@@ -63,6 +64,12 @@ class LocalizationLimits:
         Search range [m], [rad] after a coarse registration (chosen: several times its error).
     registered_range_px
         The same shift in pixels, where that is more [px].
+    support_range
+        Largest shift of a second pose that is compared with the found one, as a multiple of the search range (chosen:
+        rulers accept poses up to twice the search range off; as far on the other side lies the right one).
+    min_preference
+        Preference of the image for the found pose over a second one that decides [standard deviations] (3: one error in
+        700 for normal errors).
     max_other_share
         The second best pose of an ambiguous coarse registration is excluded if its number of agreeing rulers and
         fiducials is at most this fraction of the number for the best pose (chosen).
@@ -75,6 +82,8 @@ class LocalizationLimits:
     ruler_range_px: float = 10.0
     registered_range: tuple[float, float] = (6e-5, 2e-3)
     registered_range_px: float = 3.0
+    support_range: float = 4.0
+    min_preference: float = 3.0
     max_other_share: float = 0.6
 
 
@@ -256,11 +265,7 @@ class _Job:
             threshold=self.threshold,
         )
         self.clock.record("prepare registration")
-        undistorted = self.grey
-        if view.model is not None:
-            undistort = UndistortImage(model=view.model, border="replicate")
-            undistorted = to_numpy(undistort(self.grey, device=self.device).image)
-        found = search(undistorted, device=self.device)
+        found = search(self._undistorted(view.model), device=self.device)
         self.clock.record("registration")
         shift = max(limits.registered_range[0], limits.registered_range_px * view.scale)
         left = (shift, limits.registered_range[1])
@@ -275,6 +280,13 @@ class _Job:
             return _ExpectedPose(view, left, found, reason)
         other = move_view(view, found.runner_up_pose) if found.status & Status.AMBIGUOUS else None
         return _ExpectedPose(move_view(view, found.pose), left, found, other=other)
+
+    def _undistorted(self, model: Lens | Camera | None) -> npt.NDArray[Any]:
+        """Return the image without the distortion of a lens."""
+        if model is None:
+            return self.grey
+        undistort = UndistortImage(model=model, border="replicate")
+        return np.asarray(to_numpy(undistort(self.grey, device=self.device).image))
 
     def select_features(self, expected: _ExpectedPose, budget: int) -> FeatureSet:
         """Select the features of the view at the expected pose."""
@@ -309,7 +321,33 @@ class _Job:
             other = measurer.measure(expected.other, kind)
             reason = _reason_of_ambiguity(expected, measurement, other, self.limits.max_other_share)
         self.clock.record("rulers")
+        if not reason:
+            reason = self._test_support(expected.view, measurement.view, kind, imaging.shift)
+            self.clock.record("support")
         return self._result(measurement, kind, features, expected.found, reason)
+
+    def _test_support(self, expected: BoardView, found: BoardView, copper: Copper, shift: float) -> str:
+        """Return why the image does not support the found pose against a second one; empty where it does."""
+        other = find_other_pose(
+            self._undistorted(found.model),
+            self.artwork,
+            found,
+            self.limits.support_range * shift,
+            self.blur_px,
+            is_bright=copper == "bright",
+        )
+        if other is None or other.preference > self.limits.min_preference:
+            return ""
+        x, y, _ = other.view.pose
+        kind = "bright" if other.is_bright else "dark"
+        place = f"{1e3 * other.distance:.2f} mm away (x {1e3 * x:.2f} mm, y {1e3 * y:.2f} mm), with {kind} copper"
+        if other.preference < -self.limits.min_preference:
+            return f"the copper in the image fits better {place}; check the initial pose and --copper"
+        # The image shows no end of the repetition: the search range and the given polarity decide.
+        found_off, other_off = (_distance(expected, each) for each in (found, other.view))
+        if found_off <= shift and (other_off > shift or kind != copper):
+            return ""
+        return f"the copper in the image fits as well {place}; show the end of the repeated copper or a fiducial"
 
     def _result(
         self,
@@ -347,6 +385,11 @@ class _Job:
             warnings=(*self.artwork.warnings, *solution.warnings),
             scale_error=solution.scale_error,
         )
+
+
+def _distance(one: BoardView, other: BoardView) -> float:
+    """Return the larger of the distances along x and y [m] between the centres of two views."""
+    return float(np.max(np.abs(np.subtract(one.pose[:2], other.pose[:2]))))
 
 
 def _reason_of_ambiguity(

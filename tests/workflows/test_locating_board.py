@@ -179,6 +179,31 @@ def test_dense_copper_may_be_bright_or_dark(tmp_path: Path) -> None:
     assert np.all(np.isnan(located.covariance))
 
 
+def test_copper_that_repeats_is_not_mistaken_by_half_a_pitch(tmp_path: Path) -> None:
+    """56 of 60 rulers find edges 0.2 mm off with the wrong polarity of copper, and 0.4 mm off with the right one."""
+    dense = dense_board(tmp_path)
+    image = camera_image(dense, (9.53e-3, 3.97e-3, 1e-3), 35e-6)
+    half = locate_board(image, dense, scale=35e-6, initial_pose=(9.4e-3, 4.1e-3, 0.0), copper="dark")
+    assert half.rulers.used.mean() > 0.9
+    better = "the copper in the image fits better "
+    assert half.reason.startswith(better + "0.30 mm away (x 9.54 mm, y 3.96 mm), with bright copper")
+    assert np.all(np.isnan(half.covariance))
+    pitch = locate_board(image, dense, scale=35e-6, initial_pose=(9.13e-3, 4.37e-3, 0.0), copper="bright")
+    assert pitch.rulers.used.mean() > 0.9
+    assert re.match(better + r"0.5\d mm away \(x 9.5\d mm, y 3.9\d mm\)", pitch.reason)
+
+
+def test_the_search_range_decides_where_no_end_of_the_copper_is_in_view(tmp_path: Path) -> None:
+    """Inside a repetition poses a pitch apart look the same: one is accepted within the search range, none beyond."""
+    dense, pose = dense_board(tmp_path, 60), (9.53e-3, 11.97e-3, 1e-3)
+    image = camera_image(dense, pose, 35e-6, (128, 160))
+    near = locate_board(image, dense, scale=35e-6, initial_pose=(9.5e-3, 12e-3, 0.0), copper="bright")
+    assert near.reason == ""
+    between, reach = (9.5e-3, 12.17e-3, 0.0), (0.13e-3, 5e-3)  # 0.2 mm from two poses
+    far = locate_board(image, dense, scale=35e-6, initial_pose=between, search_range=reach, copper="bright")
+    assert "the copper in the image fits as well 0.38 mm away" in far.reason
+
+
 def test_a_dense_board_names_a_pixel_that_would_do(tmp_path: Path) -> None:
     """Traces 0.2 mm wide and apart: at 60 um per pixel no edge has room, at the proposed pixel rulers have."""
     dense = dense_board(tmp_path, 10)

@@ -137,8 +137,10 @@ def test_an_existing_file_is_replaced_only_on_request(tmp_path: Path) -> None:
 def test_a_failure_while_files_move_restores_the_replaced_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
     (out / "b").mkdir(parents=True)
-    for name in ("a", "b/2", "c"):
+    for name in ("b/2", "c"):
         (out / name).write_text("old")
+    (tmp_path / "elsewhere").write_text("old")
+    (out / "a").symlink_to(tmp_path / "elsewhere")
     moved, replace = [], os.replace
 
     def fail_at_the_third(source: Path, target: Path) -> None:
@@ -164,6 +166,7 @@ def test_a_failure_while_files_move_restores_the_replaced_ones(tmp_path: Path, m
         "c": "old",
     }
     assert sorted(each.name for each in out.iterdir()) == ["a", "b", "c"]
+    assert (out / "a").is_symlink()
 
 
 KILLED = """

@@ -270,6 +270,23 @@ def test_sigma_with_background_light(device, rng, ambient):
             assert mean == pytest.approx(place, abs=4 * np.mean(reading.sigma) / np.sqrt(draws)), (place, gain)
 
 
+@pytest.mark.parametrize("load", [0.0, 2e3])
+def test_sigma_by_background_in_closed_form(device, load):
+    """An electron anywhere on the strip moves the position by its distance: variance L^2 / 12 + u^2, with and without
+    a load, which shrinks the recorded position to R / (R + 2 R_L)."""
+    resistance, bandwidth, background, total = 1e4, 1e6, 1e-6, 5e-6
+    noise = PsdNoise(bandwidth=bandwidth, background=background)
+    loaded = {"interelectrode_resistance": resistance, "load_resistance": load} if load else {}
+    readout = PsdReadout(strip_length=LENGTH, noise=noise, margin=0.0, **loaded)
+    place = np.linspace(-2.5e-3, 2.5e-3, 21)
+    balance = place / (0.5 * LENGTH) * resistance / (resistance + 2.0 * load)
+    currents = 0.5 * total * np.stack([1.0 - balance, 1.0 + balance], axis=-1)
+    reading = readout(currents.astype(np.float32), device=device)
+    np.testing.assert_allclose(reading.position, place, rtol=0, atol=1e-8)
+    variance = 2.0 * reference.ELECTRON * bandwidth * background / total**2 * (LENGTH**2 / 12.0 + place**2)
+    np.testing.assert_allclose(reading.sigma, np.sqrt(variance), rtol=1e-5)
+
+
 def test_shot_noise_needs_a_bandwidth():
     for name in ("background", "dark_current"):
         with pytest.raises(ValueError, match=rf"{name} needs bandwidth \[Hz\]"):

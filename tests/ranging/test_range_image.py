@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from contextlib import nullcontext
 
 import hypothesis
 import hypothesis.strategies as st
@@ -15,7 +16,7 @@ from gpuvision import Device, Status
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
-from gpuvision.ranging.sheet import BentSheet
+from gpuvision.ranging.sheet import BentSheet, check_orthonormal
 from gpuvision.reference import range_image as reference
 
 VARIANTS = ("vector", "work_item")
@@ -185,6 +186,17 @@ def test_bent_sheets_beyond_the_pinhole_and_saddles(device):
     assert 0.0 < share < 1.0
     assert share == pytest.approx(400.0 * ((0.02 + 0.1 * share) ** 2 - (0.2 * share) ** 2), abs=1e-12)
     assert (made.x[0, 0], made.z[0, 0]) == pytest.approx((0.02 + 0.1 * share, 0.2 * share), abs=1e-15)
+
+
+def test_axes_may_be_off_by_the_rounding_of_six_decimals():
+    """Scalar products up to 1e-6 from 0 or 1 pass, also those of exact axes, which rounding makes nearly 0."""
+    turn = 0.3 + 0.1 * np.arange(20)
+    for c, s in zip(np.cos(turn), np.sin(turn), strict=True):
+        check_orthonormal(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)), "axes")
+    for off, is_refused in ((0.9e-6, False), (1.1e-6, True)):
+        for wrong in (((1.0, 0.0, 0.0), (off, 1.0, 0.0)), ((1.0 + 0.5 * off, 0.0, 0.0), (0.0, 1.0, 0.0))):
+            with pytest.raises(ValueError, match="axes are not two orthonormal") if is_refused else nullcontext():
+                check_orthonormal(wrong, "axes")
 
 
 def test_a_wrong_bent_sheet_is_refused():

@@ -124,6 +124,45 @@ def test_a_key_that_is_left_out_has_its_default(name: str, key: str, value: Any)
     assert sensor_of(without) == sensor_of(changed(name, **{key: value}))
 
 
+@pytest.mark.parametrize(
+    ("name", "key", "accepted", "refused"),
+    [
+        ("psd_line", "triangulation__tilt", [-1.5, 1.5], [-1.6, 1.6]),
+        ("psd_line", "triangulation__baseline", [1e-9], [0.0]),
+        ("psd_line", "triangulation__stand_off", [1e-9], [0.0]),
+        ("psd_line", "triangulation__focal_distance", [1e-9], [0.0]),
+        ("psd_line", "triangulation__horizon", [1e-9, 0.9], [0.0, 1.0]),
+        ("psd_line", "psd__strips", [1], [0]),
+        ("psd_line", "psd__strip_length", [1e-3], [0.0]),
+        ("psd_line", "psd__ampere", [1e-12], [0.0]),
+        ("psd_line", "psd__right_gain", [1e-3], [0.0]),
+        ("psd_line", "psd__minimum_total", [0.0], [-1e-12]),
+        ("psd_line", "transport__jitter", [0.0], [-1e-12]),
+        ("psd_line", "output__cell", [1e-6], [0.0]),
+        ("psd_line", "output__max_gap", [0.25e-3], [0.249e-3]),
+        ("psd_line", "output__fold_tolerance", [0.0], [-1e-12]),
+        ("psd_line", "light__aperture", [1e-6], [0.0]),
+        ("psd_line", "light__blur", [0.0], [-1e-12]),
+        ("psd_line", "light__bins", [2], [1]),
+        ("psd_line", "light__ambient", [0.0], [-1e-12]),
+        ("camera_line", "line__threshold", [0.0], [-1.0]),
+        ("camera_line", "line__window", [1, 180], [0, 181]),
+        ("camera_line", "light__exposure", [1e-9], [-1e-9]),
+        ("camera_line", "light__full_well", [1e-3], [0.0]),
+        ("camera_line", "light__read_noise", [0.0], [-1e-9]),
+        ("corner_scene", "transport__horizon", [1e-9, 0.9], [0.0, 1.0]),
+    ],
+)
+def test_numbers_of_a_file_are_accepted_up_to_their_limits(
+    name: str, key: str, accepted: list[float], refused: list[float]
+) -> None:
+    for value in accepted:
+        sensor_of(changed(name, **{key: value}))
+    for value in refused:
+        with pytest.raises(DescriptionError, match=key.rpartition("__")[2]):
+            sensor_of(changed(name, **{key: value}))
+
+
 def test_background_of_a_psd_is_its_ambient_light() -> None:
     """The photocurrent of the ambient light is the default of the background; margin and background can be stated."""
 

@@ -343,6 +343,9 @@ def test_capsules_have_straight_sides() -> None:
     across = (corners - (1e-3, 2e-3)) @ normal
     assert np.sort(across)[[0, 1, -2, -1]] == pytest.approx([-0.25e-3, -0.25e-3, 0.25e-3, 0.25e-3], rel=1e-9)
     assert area(corners) == pytest.approx(5e-3 * 0.5e-3 + math.pi * 0.25e-3**2, rel=1e-3)
+    # As few corners as keep the sagitta of the chords.
+    chords = math.ceil(math.pi / (2.0 * math.acos(1.0 - SAGITTA / 0.25e-3)))
+    assert len(corners) == 2 * (chords + 1)
 
 
 def test_what_lies_along_a_line_is_what_lies_at_its_points(rng: np.random.Generator) -> None:

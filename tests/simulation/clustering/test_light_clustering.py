@@ -380,6 +380,26 @@ def test_tables_are_padded() -> None:
     assert report["has pairs"] is True
 
 
+def test_position_of_the_direct_light() -> None:
+    """The mean within the limits; the middle of the limits without direct light."""
+    reading = StripErrorModel(
+        power=[2.0, 1.0, 1.0, 0.0], moment=[0.8, 0.9, 0.1, 0.0], slope=[1e-3, 1e-3, -2e-3, 1.0], limits=(0.2, 0.6)
+    )
+    np.testing.assert_allclose(reading.position, [0.4, 0.6, 0.2, 0.4], rtol=1e-15)
+    np.testing.assert_allclose(reading.max_error(), [0.4e-3, 0.4e-3, 0.8e-3, 0.4], rtol=1e-12)
+
+
+def test_error_by_light_at_a_receiver() -> None:
+    """Power 0.1 at u = 0.2 beside power 2 at 0.5: 0.1 (0.2 - x) / 2, with the farthest x that the limits allow."""
+    strip: dict[str, Any] = {"power": [2.0], "moment": [1.0], "slope": [-1e-3], "limits": (-1.0, 1.0)}
+    weights = np.array([[[0.1, 0.02], [0.0, 0.0]]])
+    for more, expected in (({}, 0.12 / 2), ({"max_shift": 0.1}, 0.04 / 2), ({"min_power": 4.0}, 0.12 / 4)):
+        error = StripErrorModel(**strip, **more).error_per_irradiance(weights)
+        np.testing.assert_allclose(error, [[1e-3 * expected, 0.0]], rtol=1e-12)
+    dark = StripErrorModel(**{**strip, "power": [0.0], "moment": [0.0]}).error_per_irradiance(weights)
+    np.testing.assert_array_equal(dark, [[np.inf, 0.0]])
+
+
 def test_worst_is_reached_by_light_at_the_other_limit() -> None:
     reading = StripErrorModel(power=np.ones(1), moment=-np.ones(1), slope=np.full(1, SLOPE), limits=(-1.0, 1.0))
     assert reading.error_bound(0.25)[0] == pytest.approx(SLOPE * 2.0 * 0.25 / 1.25)

@@ -34,6 +34,7 @@ typedef uchar16 bytes;
 #define to_ints convert_int16
 #define to_masks convert_bits16
 #define as_uints as_uint16
+#define as_ints as_int16
 #define convert_bytes convert_uchar16
 #define as_masks as_bits16
 #ifdef REAL_IS_DOUBLE
@@ -57,6 +58,7 @@ typedef uchar bytes;
 #define to_ints (int)
 #define to_masks (bits)
 #define as_uints as_uint
+#define as_ints as_int
 #define convert_bytes convert_uchar
 #define as_masks as_bits
 #define as_reals as_real

@@ -43,6 +43,9 @@ typedef struct {
 #include "line/line_peak.h"
 #include "line/line_centroid.h"
 #include "line/line_window.h"
+#ifdef METHOD_CENTROID
+#include "line/line_noise.h"
+#endif
 #ifdef VECTOR_VARIANT
 #include "line/line_wide_peak.h"
 #endif
@@ -240,7 +243,7 @@ static inline void read_frame(const Profiles *frame, int samples, constant LineT
     const Profiles profiles = profiles_from(frame, sample);
     Centroid centroid = profile_centroid(&profiles);
 #ifdef NOISE
-    set_variance(&centroid, &profiles, table);
+    set_variances(&centroid, &profiles, table);
 #endif
     finish_centroid(&profiles, &centroid, table, to, first + sample, sample);
 }

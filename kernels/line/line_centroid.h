@@ -21,58 +21,11 @@ typedef struct {
     ints not_finite;               // lanes with a sample that is not finite
 #ifdef NOISE
     reals variance;  // of the position [px^2]
+#if CODE_BITS < 32
+    reals per_light;  // 1 / total, 1 for no light
+#endif
 #endif
 } Centroid;
-
-#ifdef NOISE
-// Add the terms of the samples v of light at distances d from the centroid to the sum of lit_variance + gain v times
-// d^2 over the samples above the threshold; the sum over the square of the total light is the variance of the centroid
-// (centroid_variance() in line_window.h).
-static inline reals add_noise(reals sum, reals v, reals d, constant LineTable *table) {
-    const reals noise = table->lit_variance + table->gain * v;
-    return sum + choose_reals(int_mask(v > 0), noise * d * d, 0);
-}
-
-// Fraction of the light at which the search for it ends. Integer samples sum to the total exactly. A float sample that
-// exceeds the threshold by less than 4e-6 of the total counts as dark: the sums differ by rounding.
-#if CODE_BITS == 32
-#define NEARLY_ALL ((real)0.999996)
-#else
-#define NEARLY_ALL 1
-#endif
-#define NOISE_MARGIN 6  // samples on either side of the centroids that are read first: about the half width of a line
-#define NOISE_STEP 4    // growth of the range on either side, in samples
-
-// Add the samples begin <= k < end of every lane to the sum of the noise (add_noise) and to the light found.
-static inline void add_noises(const Centroid *centroid, const Profiles *profiles, int begin, int end, reals *sum,
-                              reals *found, constant LineTable *table) {
-    for (int k = begin; k < end; k++) {
-        const reals v = over_threshold(sample_of(profiles, k), profiles->threshold);
-        *sum = add_noise(*sum, v, (real)k - centroid->position, table);
-        *found += v;
-    }
-}
-
-// Set the variance of the centroid of every lane: read outwards from the centroids until all light is found, so that
-// the cost depends on the width of the line, not on the length of the profile.
-static inline void set_variance(Centroid *centroid, const Profiles *profiles, constant LineTable *table) {
-    const int length = profiles->length;
-    // The position of a sum that overflows is not finite.
-    const ints lit = int_mask(centroid->total > 0), at = clamp(to_ints(centroid->position), (ints)0, (ints)(length - 1));
-    int low = max(lowest_lane(choose_ints(lit, at, length)) - NOISE_MARGIN, 0);
-    int high = min(-lowest_lane(-choose_ints(lit, at, -length)) + NOISE_MARGIN + 1, length);
-    reals sum = 0, found = 0;
-    add_noises(centroid, profiles, low, high, &sum, &found, table);
-    while ((low > 0 || high < length) && any_lane(mask_of(found < centroid->total * NEARLY_ALL))) {
-        const int before = max(low - NOISE_STEP, 0), after = min(high + NOISE_STEP, length);
-        add_noises(centroid, profiles, before, low, &sum, &found, table);
-        add_noises(centroid, profiles, high, after, &sum, &found, table);
-        low = before;
-        high = after;
-    }
-    centroid->variance = sum / centroid->total / centroid->total;
-}
-#endif
 
 #if CODE_BITS == 32
 
@@ -184,6 +137,9 @@ static inline Centroid centroid_of_integers(uints total, bigs moment, uints widt
     centroid.width = to_reals(width);
     centroid.peak = peak;
     centroid.not_finite = 0;
+#ifdef NOISE
+    centroid.per_light = per_light;
+#endif
     return centroid;
 }
 

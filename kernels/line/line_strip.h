@@ -40,56 +40,23 @@ static inline void read_strip(const Profiles *frame, int begin, int end, constan
             add_steps(&sums[i], at + group_start(begin, i, columns), columns, steps, row, frame->threshold, &ahead);
         }
     }
-    for (int i = 0; i < groups * QUARTERS; i++) {
-        int sample;
-        const Profiles profiles = profiles_of_quarter(frame, begin, i, &sample);
-        Centroid centroid = wide_centroid(&sums[i / QUARTERS], i % QUARTERS);
+    for (int i = 0; i < groups; i++) {
+        Centroid centroids[QUARTERS];
+        for (int k = 0; k < QUARTERS; k++) centroids[k] = wide_centroid(&sums[i], k);
 #ifdef NOISE
-        set_variance(&centroid, &profiles, table);
+        int from;
+        const Profiles group = profiles_of_quarter(frame, begin, i * QUARTERS, &from);
+        set_variances(centroids, &group, table);
 #endif
-        finish_centroid(&profiles, &centroid, table, to, first + sample, sample);
+        for (int k = 0; k < QUARTERS; k++) {
+            int sample;
+            const Profiles profiles = profiles_of_quarter(frame, begin, i * QUARTERS + k, &sample);
+            finish_centroid(&profiles, &centroids[k], table, to, first + sample, sample);
+        }
     }
 }
 
 #elif defined(METHOD_CENTROID)
-#ifdef NOISE
-// Sum of the noise of a row (add_noise), in vectors of 16 neighbouring samples: outwards from the centroid, until all
-// light is found (set_variance). The last vector of a row is moved back to end with the row; samples before it are not counted again.
-static inline real row_noise(global const CODE *row, int length, CODE threshold, real position, real total,
-                             constant LineTable *table) {
-    const int middle = clamp((int)position / LANES * LANES, 0, length);
-    int left = middle, right = middle;
-    real found = 0;
-    reals sum = 0;
-    while (found < total * NEARLY_ALL && (left > 0 || right < length)) {
-        reals light = 0;
-        for (int side = 0; side < 2; side++) {
-            const int begin = side ? left - LANES : right, at = clamp(begin, 0, length - LANES);
-            const ints counts = int_mask(at + LANE_NUMBERS >= begin) & (ints)(begin >= 0 ? -1 : 0);
-            const reals v = choose_reals(counts, over_threshold(*(global const codes_at *)(row + at), threshold), 0);
-            sum = add_noise(sum, v, to_reals(LANE_NUMBERS) + (at - position), table);
-            light += v;
-        }
-        found += sum_of(light);
-        left = max(left - LANES, 0);
-        right = min(right + LANES, length);
-    }
-    return sum_of(sum);
-}
-
-static inline void set_row_variances(Centroid *centroid, const Profiles *profiles,
-                                     constant LineTable *table) {
-    real position[LANES], total[LANES], noise[LANES];
-    *(reals_at *)position = centroid->position;
-    *(reals_at *)total = centroid->total;
-    for (int i = 0; i < LANES; i++) {
-        global const CODE *row = profiles->first + (long)i * profiles->lane_stride;
-        noise[i] = row_noise(row, profiles->length, profiles->threshold, position[i], total[i], table);
-    }
-    centroid->variance = *(const reals_at *)noise / centroid->total / centroid->total;
-}
-#endif
-
 // Sum a row lane by lane in steps of WIDE samples, then combine the lanes and add the remainder of the row.
 static inline void read_row(global const CODE *row, int length, CODE threshold, RowSums *sums, Ahead *ahead) {
     WideSums wide;

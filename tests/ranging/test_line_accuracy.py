@@ -135,6 +135,7 @@ def test_sigma_is_the_scatter(device, rng, method):
 @pytest.mark.parametrize(
     ("method", "dtype", "along", "variant"),
     [
+        ("centroid", "uint8", "columns", "vector"),
         ("centroid", "uint8", "rows", "vector"),
         ("windowed", "float32", "columns", "vector"),
         ("fir", "float32", "rows", "work_item"),

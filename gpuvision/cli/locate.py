@@ -28,6 +28,14 @@ if TYPE_CHECKING:
     from gpuvision.matching.features.feature_set import FeatureSet
 
 _BUDGET, _BLUR_PX, _ETCH_BIAS = 60, 1.0, "10um"
+_IN_COMMENTS = str.maketrans("()\n\r", "[]  ")  # characters that would end a comment of G-code
+
+
+class GcodeDialect(StrEnum):
+    """Values of ``--gcode-dialect``."""
+
+    linuxcnc = "linuxcnc"
+    fanuc = "fanuc"
 
 
 class Copper(StrEnum):
@@ -101,6 +109,26 @@ Threshold = Annotated[
         min=0.0, help="Smallest height of an edge [grey levels]. Default: from the noise and the range of the image."
     ),
 ]
+GcodeFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        parser=named_path,
+        help="G-code that sets the work offset G54 and the rotation of the board on the machine; with --camera-at.",
+    ),
+]
+CameraAt = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,ANGLE",
+        help="Machine coordinates of the point at the image centre (axes plus offset of the camera from the tool), and "
+        "direction of the image columns, such as 120mm,80mm,0deg; with --gcode.",
+    ),
+]
+GcodeDialectChoice = Annotated[
+    GcodeDialect | None,
+    typer.Option(help="linuxcnc: G10 L2 with R; fanuc: G10 L2, then G68 (Fanuc, Mach3, Mach4). Default: linuxcnc."),
+]
 CopperChoice = Annotated[
     Copper, typer.Option(help="Copper is brighter or darker than its surroundings; auto: the better fit of both.")
 ]
@@ -123,6 +151,9 @@ def locate(
     etch_bias: EtchBias = _ETCH_BIAS,
     copper: CopperChoice = Copper.auto,
     threshold: Threshold = None,
+    gcode: GcodeFile = None,
+    camera_at: CameraAt = None,
+    gcode_dialect: GcodeDialectChoice = None,
     out: PoseFolder = None,
     as_json: ReportFile = None,
     device: DeviceLabel = None,
@@ -136,6 +167,7 @@ def locate(
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size, read_lens
     from gpuvision.formats.features_file import read_features
+    from gpuvision.formats.gcode_file import work_offset, work_offset_code
     from gpuvision.host import Device
     from gpuvision.host.recordings import read_image
     from gpuvision.plots.board import draw_located_board
@@ -143,6 +175,10 @@ def locate(
 
     check_image(image)
     outputs = claim_outputs("locate", (image, board, camera, features), out, as_json, overwrite)
+    outputs.claim(gcode)
+    if gcode is None:
+        reject_unused("without --gcode", gcode_dialect=gcode_dialect)
+    machine = _camera_at(camera_at, gcode)
     chosen = None if features is None else read_features(features)
     if chosen is not None:
         reject_unused("with --features, a file with a fixed selection of calipers", budget=budget)
@@ -177,6 +213,21 @@ def locate(
     for each in located.warnings:
         echo(f"warning: {each}", err=True)
     report_pose(located, lambda path: draw_located_board(path, picture, artwork, located), out, as_json, outputs)
+    if gcode is not None and machine is not None:
+        offset = work_offset(located.pose, machine, mirrored=artwork.side == "bottom")
+        comment = f"gpuvision locate {image.name}".translate(_IN_COMMENTS)
+        dialect = GcodeDialect.linuxcnc if gcode_dialect is None else gcode_dialect
+        outputs.write_text(gcode, work_offset_code(offset, dialect.value, comment))
+
+
+def _camera_at(text: str | None, gcode: Path | None) -> tuple[float, ...] | None:
+    """Parse ``--camera-at``: x, y [m] and angle [rad]; None without the option."""
+    if gcode is None:
+        reject_unused("without --gcode", camera_at=text)
+        return None
+    if text is None:
+        raise ValueError("--gcode needs --camera-at: where on the machine the image was taken, such as 120mm,80mm,0deg")
+    return quantities(text, "--camera-at", "m,m,rad")
 
 
 def _search_range(text: str | None) -> tuple[float, float] | None:

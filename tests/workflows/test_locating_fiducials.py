@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import cmath
 import json
+import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -248,6 +251,7 @@ def test_the_command_tells_of_marks(
     layers = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]
     initial_pose = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
     where = ["--scale", "40um", f"--initial-pose={initial_pose}", "--out", str(tmp_path / "out")]
+    where += ["--gcode", str(tmp_path / "board.ngc"), "--camera-at=120mm,80mm,90deg"]
     command = ["gpuvision", "locate", str(tmp_path / "board.png"), "--board", str(folder), *layers, *where]
     monkeypatch.setattr("sys.argv", command)
     with pytest.raises(SystemExit) as end:
@@ -260,3 +264,9 @@ def test_the_command_tells_of_marks(
     for name, value in zip(("x", "y", "theta"), true, strict=True):
         assert abs(report["pose"][name] - value) < 4.5 * report["sigmas"][name]
     assert (tmp_path / "out" / "located.png").exists()
+    code = (tmp_path / "board.ngc").read_text()
+    x, y, turn = (float(each) for each in re.search(r"G10 L2 P1 X(\S+) Y(\S+) R(\S+)", code).groups())  # [mm], [deg]
+    # The point at the image centre is at the place of the camera on the machine.
+    centre = complex(x, y) + 1e3 * complex(*true[:2]) * cmath.exp(1j * math.radians(turn))
+    assert centre == pytest.approx(120 + 80j, abs=2e-3)
+    assert turn == pytest.approx(90 - math.degrees(true[2]), abs=0.01)

@@ -12,7 +12,6 @@ The board and its image are made here, so that the pose can be compared with the
 import tempfile
 from pathlib import Path
 
-import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -46,25 +45,18 @@ with tempfile.TemporaryDirectory() as folder:
     artwork = gv.read_artwork(folder, layers=layers)
 
 # %%
-# The image that a camera takes at a known pose: 400 x 300 pixels of 40 µm, blurred, with noise. The pose is the point
-# of the board at the image centre, and the direction in which the image columns increase.
+# The image that a camera takes at a known pose: 400 x 300 pixels of 40 µm, blurred, with the noise of a sensor. The
+# pose is the point of the board at the image centre, and the direction in which the image columns increase.
 pixel, true_pose = 40e-6, (10.05e-3, 7.93e-3, 0.004)
-fine, shape = 8, (300, 400)
-cos, sin = np.cos(true_pose[2]), np.sin(true_pose[2])
-canvas = np.full((fine * shape[0], fine * shape[1]), 60, np.uint8)
-middle = (np.array(canvas.shape[::-1]) - 1) / 2
-for area in artwork.copper:
-    seen = (area.outline - true_pose[:2]) @ np.array([[cos, -sin], [sin, cos]])
-    pixels = middle + seen * (1, -1) * fine / pixel
-    cv2.fillPoly(canvas, [np.rint(pixels * 16).astype(np.int32)], 160 if area.dark else 60, shift=4)
-image = cv2.resize(canvas.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
-image = cv2.GaussianBlur(image, (0, 0), 1.0) + np.random.default_rng(2).normal(0.0, 2.0, shape)
-image = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+sensor, white = gv.read_cmos_sensor("lupa300"), 12e3
+board = gv.ReflectanceMap.of(artwork, pixel=pixel, blur_px=0.95)
+render = gv.RenderBoard(board=board, shape=(300, 400), sensor=sensor, electrons=white)
+image = render(np.array([[true_pose]]), np.array([0], np.uint32)).image[0]
 
 # %%
-# Choose 40 rulers for a camera of this resolution; the board may be 0.2 mm off. The choice predicts the standard
-# deviations of the pose before an image is taken.
-imaging = gv.Imaging(pixel=pixel, shift=200e-6)
+# Choose 40 rulers for a camera of this resolution; the board may be 0.2 mm off. The sensor gives the contrast of the
+# edges. The choice predicts the standard deviations of the pose before an image is taken.
+imaging = gv.sensor_imaging(sensor, pixel=pixel, white_electrons=white, shift=200e-6)
 features = gv.choose_features(artwork, ((4e-3, 3e-3), (16e-3, 13e-3)), imaging, budget=40)
 print(features.summary())
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from bare_boards import board_of
+from board_images import View, board_image
+from gpuvision.matching.artwork.artwork import read_artwork
 from gpuvision.matching.artwork.board_reflectance import BoardReflectance
 from gpuvision.matching.artwork.shapes import Shape
-from gpuvision.reference.board_image import edge_response
+from gpuvision.reference import board_image as reference
 from gpuvision.simulation.board_image.reflectance_map import WHITE, ReflectanceMap
 
 PIXEL = 20e-6
@@ -87,7 +90,7 @@ def test_an_edge_has_the_blur_of_lens_and_pixel(blur_px: float, fine: int) -> No
         reflectance=MATERIALS,
     )
     x = found.origin[0] + found.cell * np.arange(found.values.shape[1])
-    exact = 0.2 + 0.6 * edge_response((1e-3 - x) / PIXEL, 0.0, blur_px)
+    exact = 0.2 + 0.6 * reference.edge_response((1e-3 - x) / PIXEL, 0.0, blur_px)
     # The filter is a sum over the cells: trapezoidal rule at the kinks of an edge's mean over a pixel, and cut tails.
     error = 0.6 / (30.0 * fine**2 * blur_px) + 1e-4
     np.testing.assert_allclose(found.values[found.values.shape[0] // 2] / WHITE, exact, atol=error)
@@ -116,3 +119,39 @@ def test_wrong_parameters_are_refused(change: dict[str, Any], match: str) -> Non
         ReflectanceMap.of(board_of(), **{"pixel": PIXEL, **change})
     with pytest.raises(ValueError, match="silk"):
         replace(MATERIALS, silk=1.1)
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "middle"),
+    [
+        ("upverter", (-50e-3, 10e-3)),
+        pytest.param("fritzing", (20e-3, 25e-3), marks=pytest.mark.slow),
+        pytest.param("kicad-x2-tests/x2ap", (60e-3, -45e-3), marks=pytest.mark.slow),
+    ],
+)
+def test_real_boards_look_as_another_program_draws_them(data: Path, name: str, middle: tuple[float, float]) -> None:
+    """The images of other tests: 64 samples per pixel, filtered, and resampled; shifted mask and silk."""
+    artwork = read_artwork(data / "gerber" / name, clearance=100e-6)
+    shape, pixel = (160, 200), 25e-6
+    corner = (middle[0] - (shape[1] - 1) / 2 * pixel, middle[1] + (shape[0] - 1) / 2 * pixel)
+    shifts: dict[str, Any] = {"mask_shift": (30e-6, -20e-6), "silk_shift": (-40e-6, 10e-6)}
+    levels = (0.1, 0.3, 0.2, 0.8, 0.9, 0.05)
+    view = View(corner=corner, pixel=pixel, shape=shape, blur_px=0.8, levels=levels, **shifts)
+    drawn = board_image(artwork, view)
+    half = np.array(shape[::-1]) / 2 * pixel
+    found = ReflectanceMap.of(
+        artwork,
+        pixel=pixel,
+        region=(middle - half, middle + half),
+        blur_px=0.8,
+        reflectance=MATERIALS,
+        **shifts,
+    )
+    seen = reference.reflectance(
+        found.values, found.origin, found.cell, pixel, reference.centred_pixels(shape), np.array([[*middle, 0.0]])
+    )
+    assert np.ptp(drawn) > 0.19
+    # The samples of the other image leave 1/64 of the area of a pixel open along an edge.
+    assert np.abs(seen - drawn).max() < 0.03
+    assert np.sqrt(np.mean((seen - drawn) ** 2)) < 0.004

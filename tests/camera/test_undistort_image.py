@@ -154,6 +154,19 @@ def test_every_window(device: Device, name: str, channels: int, interpolation: A
     assert_right(op(image, device=device), image, positions, channels=channels, interpolation=interpolation)
 
 
+@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_every_width_of_a_window(device: Device, channels: int, interpolation: Any, rng: np.random.Generator) -> None:
+    """Each row has another scale: the pixels of a run span 10 to 37 columns, one more every few rows."""
+    scale, source = np.linspace(0.6, 2.4, 60), (70, 120)
+    image = pixels(rng, (*source, 3)[: 2 + channels // 3], np.float32)
+    positions = np.empty((60, 48, 2))
+    positions[..., 0] = 2.01 + scale[:, None] * np.arange(48)
+    positions[..., 1] = 3.3 + np.arange(60.0)[:, None]
+    op = UndistortImage(model=positions, interpolation=interpolation, channels=channels, variant="vector")
+    assert_right(op(image, device=device), image, positions, channels=channels, interpolation=interpolation)
+
+
 _PRODUCT = [
     {"dtype": dtype, "variant": variant, "channels": channels, "border": border, "interpolation": interpolation}
     for dtype in DTYPES

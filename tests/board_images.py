@@ -106,15 +106,15 @@ class BoardPicture:
         ]
         copper = painter.painted([*left, *more], (0.0, 0.0))
         opened = painter.painted(artwork.mask, view.mask_shift) if artwork.mask else np.ones_like(copper)
-        fine = np.asarray(view.levels, dtype=np.float32)[copper + 2 * opened]
-        fine[painter.painted(artwork.silk, view.silk_shift)] = view.levels[4]
+        surface = copper.view(np.uint8) + 2 * opened.view(np.uint8)  # index of the grey level
+        surface[painter.painted(artwork.silk, view.silk_shift)] = 4
         holes = zip(artwork.holes.start, artwork.holes.end, artwork.holes.diameter, strict=True)
-        fine[painter.painted([Shape(capsule(start, end, across / 2)) for start, end, across in holes], (0, 0))] = (
-            view.levels[5]
-        )
+        surface[painter.painted([Shape(capsule(start, end, across / 2)) for start, end, across in holes], (0, 0))] = 5
+        levels = np.zeros(256, np.float32)
+        levels[: len(view.levels)] = view.levels
         rows, columns = painter.shape
-        step = SAMPLES // FINE
-        fine = fine.reshape(rows * FINE, step, columns * FINE, step).mean(axis=(1, 3), dtype=np.float32)
+        # The mean of the samples of a stored value.
+        fine = cv2.resize(cv2.LUT(surface, levels), (columns * FINE, rows * FINE), interpolation=cv2.INTER_AREA)
         along, across = (_blurs(view.blur_px, smear) for smear in (view.motion_px, 0.0))
         self._fine = cv2.sepFilter2D(fine, -1, along, across, borderType=cv2.BORDER_REPLICATE)
 

@@ -40,8 +40,8 @@ def floor_image(
         for start, end in itertools.pairwise(seen):
             corners = middle + capsule(start, end, line_width / 2) * (_FINE / scale) * (1, -1)
             cv2.fillPoly(white, [np.rint(corners * 2**_SHIFT).astype(np.int32)], 1, shift=_SHIFT)
-    fine = np.where(white[..., None] > 0, np.array(WHITE), np.array(GREEN)).astype(np.float32)
-    picture = fine.reshape(shape[0], _FINE, shape[1], _FINE, 3).mean(axis=(1, 3))
+    share = cv2.resize(white.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)[..., None]
+    picture = (np.array(GREEN) + share * (np.array(WHITE) - GREEN)).astype(np.float32)
     picture = cv2.GaussianBlur(picture, (0, 0), 0.8) + rng.normal(0, noise, picture.shape)
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 

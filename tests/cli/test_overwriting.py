@@ -54,6 +54,12 @@ def done(picture: Path) -> Calibration:
     return calibrate([picture])
 
 
+@pytest.fixture
+def quick_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write a few bytes instead of the picture, whose drawing takes most of the time of a calibration's files."""
+    monkeypatch.setattr(calibrating, "draw_calibration", lambda path, _: Path(path).write_bytes(b"a picture"))
+
+
 def test_every_command_that_writes_has_the_option() -> None:
     commands: Any = get_command(application())
     for name, command in commands.commands.items():
@@ -70,6 +76,7 @@ def test_the_plot_of_a_calibration_does_not_replace_its_image(image: Path, more:
     assert contents(image.parent) == before
 
 
+@pytest.mark.usefixtures("quick_picture")
 def test_a_calibration_made_in_python_does_not_replace_its_image(done: Calibration, picture: Path) -> None:
     before = contents(picture.parent)
     with pytest.raises(FileExistsError, match="it is the input"):
@@ -77,6 +84,7 @@ def test_a_calibration_made_in_python_does_not_replace_its_image(done: Calibrati
     assert contents(picture.parent) == before
 
 
+@pytest.mark.usefixtures("quick_picture")
 def test_a_calibration_replaces_its_own_files_and_no_edited_one(done: Calibration, tmp_path: Path) -> None:
     file = tmp_path / "lens.toml"
     write_calibration(done, file)
@@ -91,6 +99,7 @@ def test_a_calibration_replaces_its_own_files_and_no_edited_one(done: Calibratio
     assert "[mount]" not in file.read_text()
 
 
+@pytest.mark.usefixtures("quick_picture")
 @pytest.mark.parametrize("broken", ["draw_calibration", "write_lens"])
 def test_a_calibration_writes_all_of_its_files_or_none(
     done: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str

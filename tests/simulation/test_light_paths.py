@@ -174,7 +174,7 @@ def test_bounces_that_are_not_simulated_have_a_bound(device):
     one = sensor_view()
     for albedo in (0.5, 1.0):
         made_of = [Material(diffuse=Lambert(albedo=albedo))]
-        model = paths(corner(), device, paths=(*PATHS, "multi-bounce"), materials=made_of, patch_size=0.02)
+        model = paths(corner(), device, paths=(*PATHS, "multi-bounce"), materials=made_of, patch_size=0.04)
         with_bounces = model.profile(0.0).exposures
         profile = paths(corner(), device, materials=made_of).profile(0.0)
         reading = StripErrorModel.from_exposure(one, profile.exposures["direct"])

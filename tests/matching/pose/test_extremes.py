@@ -96,7 +96,7 @@ def test_a_comb_of_one_pitch_is_not_chosen(tmp_path: Path) -> None:
     artwork = read_artwork(tmp_path, layers={r"copper\.gbr": "top copper"})
     board = BoardFix(artwork=artwork, middle=(8e-3, 6e-3))
     imaging = replace(board.imaging, pixel=10e-6, shift=400e-6)
-    found = find_ruler_candidates(artwork, ((3e-3, 3e-3), (6e-3, 12e-3)), (8e-3, 6e-3), imaging)  # inside the comb
+    found = find_ruler_candidates(artwork, ((3e-3, 3e-3), (6e-3, 7e-3)), (8e-3, 6e-3), imaging)  # inside the comb
     inner = ~found.pair
     assert inner.any()
     assert (found.ambiguity[inner] == 1.0).all()

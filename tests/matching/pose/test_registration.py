@@ -188,7 +188,7 @@ def test_edges_of_a_template_lie_on_its_outline(device: Device, shape: tuple[int
     assert len(crossed & found) > 0.8 * len(crossed)
 
 
-@pytest.mark.parametrize("shape", [(257, 333), (480, 222)])
+@pytest.mark.parametrize("shape", [(257, 333), pytest.param((480, 222), marks=pytest.mark.slow)])
 def test_images_of_any_size_and_type(artwork: Artwork, device: Device, shape: tuple[int, int]) -> None:
     pose = (0.9e-3, -1.3e-3, -0.05)
     fix, image = pictured(artwork, shape, pose)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import cmath
 import math
+import re
+import types
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpuvision.camera.orthographic import BoardView
-from gpuvision.matching.board.edge_measurement import move_view
+from gpuvision.matching.board.edge_measurement import MeasurementLimits, _reason_of, move_view
+from gpuvision.status import Status
 
 LENGTHS = st.floats(-0.2, 0.2)
 ANGLES = st.floats(-math.pi, math.pi)
@@ -35,3 +39,21 @@ def test_pixels_of_a_moved_board_are_those_of_the_board() -> None:
     on_board = np.exp(1j * theta) * (points @ [1.0, 1j]) + complex(x, y)
     pixels = move_view(view, (x, y, theta)).to_pixels(points)
     np.testing.assert_allclose(pixels, view.to_pixels(np.stack([on_board.real, on_board.imag], -1)), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("status", "inlier_fraction", "leverage", "words"),
+    [
+        (Status.OUT_OF_RANGE | Status.AMBIGUOUS, 0.1, 0.9, "outside the search range"),
+        (Status.NO_DATA, 1.0, 0.9, r"^12 edges .* were found, too few for a pose \(NO_DATA\)"),
+        (Status.AMBIGUOUS, 0.29, 0.9, r"^5 of the 12 edges found .* 29% of their information, expected 30% or more"),
+        (Status.AMBIGUOUS, 0.3, 0.9, "a single edge that no other edge checks"),
+        (Status.AMBIGUOUS, np.nan, 0.01, "a single edge that no other edge checks"),
+        (Status.AMBIGUOUS, 0.3, 0.0, "do not determine x, y and theta"),
+        (Status.AMBIGUOUS, np.nan, np.nan, "do not determine x, y and theta"),
+    ],
+)
+def test_reasons_of_a_refused_pose(status: Status, inlier_fraction: float, leverage: float, words: str) -> None:
+    values = {"status": np.uint8(status), "inlier_fraction": inlier_fraction, "leverage": leverage, "inliers": 5}
+    fit: Any = types.SimpleNamespace(**{name: np.array(value) for name, value in values.items()})
+    assert re.search(words, _reason_of(fit, 12, MeasurementLimits()))

@@ -1,14 +1,28 @@
-"""Interfaces of the servo loop: a plant, a sensor of poses and a clock, each simulated or real."""
+"""Servo loop: measured poses, observer, controller and guards steer a plant; plant, sensor and clock real or simulated.
+
+In each frame the loop takes the poses that have arrived, corrects the observer, and commands a velocity until the next
+frame. See `TravelGuard` and `Outcome` for what it does when something fails.
+
+References
+----------
+.. [1] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, sections 5.4.4 and
+   8.7.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import time
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.servoing.observer import PoseMeasurement
+from gpuvision.servoing.controllers import Controller
+from gpuvision.servoing.guard import FaultCounter, LoopLimits, Outcome, TravelGuard, wrapped
+from gpuvision.servoing.observer import MotionEstimate, Observer, PoseMeasurement, Verdict
+from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
 
@@ -56,3 +70,254 @@ class Clock(Protocol):
 
     def wait_until(self, time: float) -> float:
         """Wait until a time [s] and return the time; return at once if it is past."""
+
+
+class SimulatedClock:
+    """Clock that jumps to the time that is waited for."""
+
+    def __init__(self) -> None:
+        self._time = 0.0
+
+    def now(self) -> float:
+        """Return the time [s]; 0 at first."""
+        return self._time
+
+    def wait_until(self, time: float) -> float:
+        """Set the clock to a time [s], unless it is past, and return the time."""
+        self._time = max(self._time, time)
+        return self._time
+
+
+class WallClock:
+    """Time since the clock was made; waits by sleeping, and the last part of the time in a loop.
+
+    Parameters
+    ----------
+    spin : float
+        Time before the end in which the clock does not sleep [s]: the operating system may wake a sleeper late. Default
+        0.2 ms.
+    """
+
+    def __init__(self, spin: float = 2e-4) -> None:
+        self._start, self._spin = time.perf_counter(), finite(spin, "spin", minimum=0.0)
+
+    def now(self) -> float:
+        """Return the time [s]."""
+        return time.perf_counter() - self._start
+
+    def wait_until(self, until: float) -> float:
+        """Wait until a time [s] and return the time; return at once if it is past."""
+        while (left := until - self.now()) > 0.0:
+            if left > self._spin:
+                time.sleep(left - self._spin)
+        return self.now()
+
+
+class SettlingRule(Protocol):
+    """Decision whether the head may place its part; see `gpuvision.servoing.settling`."""
+
+    def __call__(self, time: float, error: Float64, covariance: Float64) -> bool:
+        """Return whether an error (3,) with a covariance (3, 3) at a time [s] allows the placement."""
+
+
+Target = Callable[[float], tuple[Float64, Float64]]
+"""Function of the time [s] that returns the target's pose (3,) and velocity (3,)."""
+
+
+class LoopRecord(NamedTuple):
+    """History of a run of the loop, one row for each frame.
+
+    Attributes
+    ----------
+    outcome : Outcome
+        Reason why the loop ended.
+    time : numpy.ndarray
+        (n,): begin of the frames [s].
+    target, pose, velocity : numpy.ndarray
+        (n, 3): target, and estimated pose and velocity [m], [m], [rad], per second.
+    sigma : numpy.ndarray
+        (n, 3): standard deviations of the estimated pose.
+    command : numpy.ndarray
+        (n, 3): commanded velocities.
+    encoder : numpy.ndarray
+        (n, 3): readings of the encoders.
+    computing : numpy.ndarray
+        (n,): time from the begin of the frame to its command [s]; 0 with a simulated clock.
+    measurements : tuple of (PoseMeasurement, Verdict)
+        Measurements in the order of arrival.
+    missed : int
+        Number of frames that began late by a frame or more.
+    glitches : int
+        Number of readings whose encoders contradicted the commands.
+    """
+
+    outcome: Outcome
+    time: Float64
+    target: Float64
+    pose: Float64
+    velocity: Float64
+    sigma: Float64
+    command: Float64
+    encoder: Float64
+    computing: Float64
+    measurements: tuple[tuple[PoseMeasurement, Verdict], ...]
+    missed: int
+    glitches: int
+
+
+class ServoLoop:
+    """Loop that steers a plant to a target by measured poses.
+
+    Parameters
+    ----------
+    plant : Plant
+        Axes of the machine.
+    sensor : PoseSensor
+        Source of measured poses of the head.
+    observer : Observer
+        Estimate of the pose, such as a `PoseObserver`. The caller resets it to the first known pose.
+    controller : Controller
+        Rule from error to velocity, such as a `PidController`.
+    clock : Clock
+        `WallClock`, or `SimulatedClock` for a simulation.
+    period : float
+        Frame time [s].
+    limits : LoopLimits, optional
+        Thresholds of the guards. None switches them off: the loop may then diverge. Default: `LoopLimits()`.
+
+    Raises
+    ------
+    ValueError
+        The frame time is not above 0.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        sensor: PoseSensor,
+        observer: Observer,
+        controller: Controller,
+        clock: Clock,
+        *,
+        period: float,
+        limits: LoopLimits | None = LoopLimits(),
+    ) -> None:
+        self.plant, self.sensor, self.observer = plant, sensor, observer
+        self.controller, self.clock = controller, clock
+        self.period, self.limits = finite(period, "period", above=0.0), limits
+
+    def run(
+        self,
+        target: npt.ArrayLike | Target,
+        duration: float,
+        *,
+        settling: SettlingRule | None = None,
+    ) -> LoopRecord:
+        """Steer the head to a target until it has settled, the time is over, or a guard gives up; then stop it.
+
+        Parameters
+        ----------
+        target : array_like or function
+            (3,): x [m], y [m], theta [rad]; or a function of the time [s] that returns pose and velocity.
+        duration : float
+            Longest time [s].
+        settling : SettlingRule, optional
+            Rule that ends the loop. Default: the loop runs for the duration.
+        """
+        goal = target if callable(target) else _resting(target)
+        return _Run(self, goal, settling, finite(duration, "duration", above=0.0)).finish()
+
+
+def _resting(target: npt.ArrayLike) -> Target:
+    pose, rest = np.array(numbers(target, (3,), "target")), np.zeros(3)
+    return lambda _: (pose, rest)
+
+
+class _Run:
+    """State of one run of a loop."""
+
+    def __init__(self, loop: ServoLoop, goal: Target, settling: SettlingRule | None, duration: float) -> None:
+        self.loop, self.goal, self.settling = loop, goal, settling
+        self.limits = loop.limits or LoopLimits()
+        self.guard = TravelGuard(self.limits.margin_sigmas, self.limits.lag)
+        self.faults = FaultCounter(self.limits)
+        self.start = loop.clock.now()
+        self.count = max(math.ceil(duration / loop.period - 1e-9), 1)
+        self.columns = np.zeros((6, self.count, 3))  # target, pose, velocity, sigma, command, encoder
+        self.times, self.computing = np.zeros(self.count), np.zeros(self.count)
+        self.measurements: list[tuple[PoseMeasurement, Verdict]] = []
+        self.missed = 0
+        self.commanded, self.last = np.zeros(3), (self.start, np.zeros(3))
+
+    def finish(self) -> LoopRecord:
+        """Run all frames and return the record."""
+        loop, outcome, frame, row = self.loop, None, 0, 0
+        while outcome is None and frame < self.count:
+            due = self.start + frame * loop.period
+            now = loop.clock.wait_until(due)
+            late = max(int((now - due) / loop.period), 0)
+            self.missed += late
+            self.faults.tick(late > 0)
+            outcome = self._frame(row, now)
+            self.computing[row] = loop.clock.now() - now
+            frame, row = frame + 1 + late, row + 1
+        if outcome is not None:  # otherwise the last command lasts for a frame
+            loop.plant.command(loop.clock.now(), np.zeros(3))
+        target, pose, velocity, sigma, command, encoder = self.columns[:, :row]
+        return LoopRecord(
+            outcome or Outcome.TIME_OVER,
+            self.times[:row],
+            target,
+            pose,
+            velocity,
+            sigma,
+            command,
+            encoder,
+            self.computing[:row],
+            tuple(self.measurements),
+            self.missed,
+            self.faults.glitches,
+        )
+
+    def _frame(self, row: int, now: float) -> Outcome | None:
+        """Do one frame; return the reason to end the loop, or None."""
+        loop = self.loop
+        for measurement in loop.sensor(now):
+            verdict = loop.observer.add(measurement)
+            self.measurements.append((measurement, verdict))
+            self.faults.verdict(verdict)
+            if verdict is Verdict.ACCEPTED:
+                self.guard.trust(measurement)
+        reading = loop.plant.read(now)
+        state = loop.observer.estimate(now)
+        target, speed = self.goal(now)
+        error = wrapped(target - state.pose)
+        self.commanded += self.last[1] * (now - self.last[0])
+        self.faults.reading(reading.position, reading.at_limit, self.commanded, error)
+        self._record(row, now, target, state, reading.position)
+        outcome = self.faults.outcome(now - max(self.guard.exposed, self.start)) if loop.limits else None
+        if outcome is None and self.settling is not None and self.settling(now, error, state.covariance):
+            outcome = Outcome.ARRIVED
+        if outcome is None:
+            self._command(row, now, target, error, speed - state.velocity, speed)
+        return outcome
+
+    def _command(
+        self, row: int, now: float, target: Float64, error: Float64, error_velocity: Float64, speed: Float64
+    ) -> None:
+        loop = self.loop
+        velocity = loop.controller(error, error_velocity, loop.period, speed)
+        if loop.limits is not None:
+            if now - self.guard.exposed > self.limits.hold_after:
+                velocity = np.zeros(3)
+            velocity = self.guard.limit(now, velocity, target + loop.period * speed, loop.period)
+        loop.plant.command(now, velocity)
+        loop.observer.command(now, velocity)
+        self.last = now, velocity
+        self.columns[4, row] = velocity
+
+    def _record(self, row: int, now: float, target: Float64, state: MotionEstimate, encoder: Float64) -> None:
+        self.times[row] = now
+        self.columns[0, row], self.columns[1, row], self.columns[2, row] = target, state.pose, state.velocity
+        self.columns[3, row] = np.sqrt(np.diagonal(state.covariance))
+        self.columns[5, row] = encoder

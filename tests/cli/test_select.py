@@ -66,6 +66,9 @@ def test_a_file_holds_what_was_chosen(features: FeatureSet, tmp_path: Path) -> N
         ("blur_px = 1.04", "blur_px = 0.0", "must be positive"),
         ("blur_px = 1.04", "blurr_px = 1.04", "imaging.blur_px"),
         ("[[ruler]]", "[[ruler]]\ncolour = 1", "unknown key 'ruler[0].colour'"),
+        ("\nspacing = ", "\nspacing = -", "ruler[0].spacing is -"),
+        ("\nlength = ", "\nlength = -", "ruler[0].length is -"),
+        ("\nsigma = ", "\nsigma = -", "ruler[0].sigma is -"),
     ],
 )
 def test_a_file_that_says_something_else_is_told(

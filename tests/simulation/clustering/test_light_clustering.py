@@ -216,6 +216,25 @@ def test_far_light_is_one_cluster_for_each_wall(device: Device, variant: Any) ->
 
 
 @TWO_WAYS
+def test_a_strip_that_rises_through_the_plane_of_the_light_is_lit(device: Device, variant: Any) -> None:
+    """Its middle lies behind the plane of the lit segment, its normal is perpendicular to that of the segment."""
+    for axes in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):
+        lit, facing = (np.array([side, 0.0, 1.0])[axes] / np.sqrt(2.0) for side in (1.0, -1.0))
+        along = np.cross(lit, facing)
+        place = 0.1 * -facing + np.linspace(-0.031, 0.02, BLOCK)[:, None] * lit
+        receivers = np.concatenate([place, np.broadcast_to(facing, place.shape)], axis=1)[None]
+        segments = np.concatenate([-0.002 * along, 0.002 * along, lit, [1.0]])[None]
+        weights = np.stack([np.full(BLOCK, 1e-3), np.linspace(0.0, 1e-3, BLOCK)], axis=1)[None]
+        reading = StripErrorModel(power=[1.0], moment=[0.0], slope=[SLOPE], limits=(-1.0, 1.0))
+        cut = LightClustering(tolerance=0.0, variant=variant)(segments, receivers, weights, reading, device=device)
+        light = reference.pair_irradiance(receivers[0], segments)[:, 0]
+        np.testing.assert_array_equal(light > 0.0, place @ lit > 0.0)
+        np.testing.assert_allclose(by_cut(cut, receivers)[0], light, rtol=1e-12)
+        least = reference.mean_position(reading.power, reading.moment, weights, light[None])
+        assert cut.bound_if_omitted[0] >= SLOPE * abs(least[0]) > 0.0
+
+
+@TWO_WAYS
 def test_a_roof_over_an_end_of_a_cluster_is_seen(device: Device, variant: Any) -> None:
     """The edge of the roof, of either winding and on either side, passes over the lit line off its middle."""
     _, _, weights, reading = valley(32, 1, 40)

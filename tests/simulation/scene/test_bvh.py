@@ -87,6 +87,12 @@ def test_a_tree_is_good_where_triangles_are_spread(rng: np.random.Generator) -> 
     assert (tree.members >= 0).mean() > 0.5
 
 
+def test_a_tree_without_triangles_is_empty() -> None:
+    tree = Bvh.build(np.zeros((0, 3, 3)))
+    assert len(tree.numbers) == 0
+    assert (tree.members < 0).all()
+
+
 def test_triangles_of_another_shape() -> None:
     with pytest.raises(ValueError, match=r"\(n, 3, 3\)"):
         Bvh.build(np.zeros((4, 3)))

@@ -56,10 +56,10 @@ typedef struct {
 
 static inline Placed placed(global const POSE *pose, constant POSE *placing, float grow) {
     Placed board;
-    POSE u = (pose[0] - placing[0]) * placing[2], v = (pose[1] - placing[1]) * placing[2];
-    // The comparison is false for NaN, too.
-    if (!(fabs(u) < FARTHEST)) u = FARTHEST;
-    if (!(fabs(v) < FARTHEST)) v = FARTHEST;
+    // fmax() and fmin() replace NaN.
+    const POSE far = FARTHEST;
+    const POSE u = fmin(fmax((pose[0] - placing[0]) * placing[2], -far), far);
+    const POSE v = fmin(fmax((pose[1] - placing[1]) * placing[2], -far), far);
     board.u = convert_int_rtn(u);
     board.v = convert_int_rtn(v);
     board.part_u = (float)(u - board.u);

@@ -83,11 +83,12 @@ def test_noise_and_level_are_those_of_random_pixels(rng: np.random.Generator, el
     assert float(SENSOR.snr(electrons, exposure)) == pytest.approx(electrons / float(SENSOR.noise(electrons, exposure)))
 
 
-def test_coarse_pixels_add_signal_or_leave_it_out(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("mean", [0.0, 600.0])
+def test_coarse_pixels_add_signal_or_leave_it_out(rng: np.random.Generator, mean: float) -> None:
     coarse, exposure = SENSOR.binned(3), 0.05
     assert (coarse.rows, coarse.columns, coarse.pitch) == (33, 43, pytest.approx(15e-6))
     assert coarse.electrons(2.0, exposure) == pytest.approx(9 * SENSOR.electrons(2.0, exposure))
-    mean, count = 600.0, 50_000
+    count = 50_000
     gains, offsets = 1.0 + 0.01 * rng.standard_normal((count, 9)), 4.0 * rng.standard_normal((count, 9))
     charge = (rng.poisson(mean * gains + 2000.0 * exposure) + offsets).sum(axis=1) + 9.0 * rng.standard_normal(count)
     quantised = np.rint(0.2 * charge) / 0.2

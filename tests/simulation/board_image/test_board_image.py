@@ -130,9 +130,14 @@ def test_without_a_sensor_images_are_reflectances(
     for image, pose in zip(images, poses, strict=True):
         exact = expected_reflectance(pads, pose, reference.centred_pixels(SHAPE))
         np.testing.assert_allclose(image, exact, atol=1e-4)
-    # A pose that is not finite, or far away, shows the border.
-    wrong = np.array([[[np.nan, 0.0, 0.0]], [[1e9, -1e9, 0.0]], [[0.0, np.inf, 1.0]]], dtype)
-    assert np.isin(op(wrong, np.zeros(3, np.uint32), device=device).image, pads.values / np.float32(65535.0)).all()
+    # A pose that is not finite, or far away, shows the border of the map: here its corners have own reflectances.
+    values = np.arange(16, dtype=np.uint16).reshape(4, 4) * np.uint16(4000)
+    corners = replace(op, board=replace(pads, values=values))
+    wrong = np.array([[[1e9, -1e9, 0.0]], [[-np.inf, 1e30, 1.0]], [[np.nan, 0.0, 0.0]]], dtype)
+    images = corners(wrong, np.zeros(3, np.uint32), device=device).image
+    np.testing.assert_allclose(images[0], values[0, 3] / 65535.0, rtol=1e-6)
+    np.testing.assert_allclose(images[1], values[3, 0] / 65535.0, rtol=1e-6)
+    assert np.isfinite(images[2]).all()
 
 
 def test_edges_lie_where_the_artwork_and_the_pose_put_them(device: Device) -> None:

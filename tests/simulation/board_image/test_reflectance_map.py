@@ -104,6 +104,17 @@ def test_the_etch_bias_moves_the_edges_of_the_copper() -> None:
         assert light == pytest.approx((1e-3 + 2 * bias) ** 2 - (0.2e-3 - 2 * bias) ** 2, rel=1e-4)
 
 
+def test_copper_beyond_the_region_grows_into_it() -> None:
+    found = ReflectanceMap.of(
+        board_of([[1.2e-3, 0.0], [1.5e-3, 0.0], [1.5e-3, 1e-3], [1.2e-3, 1e-3]]),
+        pixel=PIXEL,
+        region=((0.0, 0.0), (1e-3, 1e-3)),
+        reflectance=MATERIALS,
+        etch_bias=0.3e-3,
+    )
+    assert (value_at(found, 0.95, 0.5), value_at(found, 0.85, 0.5)) == pytest.approx((0.8, 0.2), abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ("change", "match"),
     [

@@ -306,6 +306,9 @@ from .ranging.regrid import (
 from .ranging.regrid import (
     Regrid as Regrid,
 )
+from .ranging.rotating_sigma import (
+    RotatingSheetSigma as RotatingSheetSigma,
+)
 from .ranging.sensor_geometry import (
     SensorGeometry as SensorGeometry,
 )

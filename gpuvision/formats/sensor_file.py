@@ -89,6 +89,11 @@ def _transport(geometry: SensorGeometry) -> dict[str, Any]:
         "origin": to_scene @ (sheet.origin - geometry.scene_origin),
     }
     # Adding 0.0 turns -0.0 into 0.0.
-    return {"kind": "straight", "step": geometry.step} | {
+    table = {"kind": "straight", "step": geometry.step} | {
         key: (np.where(np.abs(value) < _ROUNDING, 0.0, value) + 0.0).tolist() for key, value in vectors.items()
     }
+    if geometry.transport is not None:
+        step = geometry.transport.covariance(geometry.camera_covariance)
+        per_metre = to_scene @ step @ to_scene.T / geometry.step**2
+        table["covariance"] = (0.5 * (per_metre + per_metre.T)).tolist()
+    return table

@@ -90,6 +90,15 @@ def _unit(value: Any, what: str) -> Vector:
     return x, y, z
 
 
+def _covariance(value: Any, what: str) -> tuple[Vector, Vector, Vector]:
+    rows = numbers(value, (3, 3), what)
+    matrix = np.array(rows)
+    if not np.allclose(matrix, matrix.T, rtol=1e-6, atol=0.0) or np.any(np.diag(matrix) < 0.0):
+        raise ValueError(f"{what} is {matrix.tolist()}, expected a symmetric matrix with variances of 0 or more")
+    a, b, c = rows
+    return a, b, c
+
+
 def _check_jitter(transport: StraightTransport | RotatingSheet) -> None:
     what = f"{type(transport).__name__}.jitter"
     object.__setattr__(transport, "jitter", finite(transport.jitter, what))
@@ -157,12 +166,16 @@ class StraightTransport:
     bend : BentSheet, optional
         Deviation of the light from the mean plane of the sheet, to which G and H refer; ``g_axis`` and ``h_axis`` must
         then be orthonormal. Default: a flat sheet.
+    covariance : (3, 3) array_like, optional
+        Covariance of the displacement in the scene per metre of transport, symmetric: along ``direction`` the squared
+        relative error of the step, across it that of the direction [rad^2]. Part of the predicted systematic errors,
+        which are 0 at L = 0. Default: not known.
 
     Raises
     ------
     ValueError
-        A number is not finite, the step is 0, the three directions lie in one plane, or the axes of a bent sheet are
-        not orthonormal.
+        A number is not finite, the step is 0, the three directions lie in one plane, the axes of a bent sheet are not
+        orthonormal, or a covariance is not symmetric with variances >= 0.
 
     References
     ----------
@@ -177,6 +190,7 @@ class StraightTransport:
     origin: Vector = (0.0, 0.0, 0.0)
     jitter: float = 0.0
     bend: BentSheet | None = None
+    covariance: tuple[Vector, Vector, Vector] | None = None
 
     def __post_init__(self) -> None:
         _check_jitter(self)
@@ -193,6 +207,8 @@ class StraightTransport:
             raise ValueError("StraightTransport: g_axis, h_axis and direction lie in one plane; expected a volume")
         if self.bend is not None:
             check_orthonormal((self.g_axis, self.h_axis), "StraightTransport: g_axis and h_axis of a bent sheet")
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", _covariance(self.covariance, "StraightTransport.covariance"))
 
     def transport(self, profiles: int, first: int = 0) -> npt.NDArray[np.float64]:
         """Return the transport of the profiles ``first``, ``first + 1``, ... for a uniform step [m], shape (profiles,).
@@ -236,6 +252,8 @@ class StraightTransport:
         table: dict[str, Any] = {} if self.step is None else {"step": self.step}
         table |= {"start": self.start} | ({"jitter": self.jitter} if self.jitter else {})
         table |= {name: list(getattr(self, name)) for name in ("g_axis", "h_axis", "direction", "origin")}
+        if self.covariance is not None:
+            table["covariance"] = [list(row) for row in self.covariance]
         return table if self.bend is None else {**table, "bend": self.bend.to_dict()}
 
     @classmethod

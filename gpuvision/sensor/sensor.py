@@ -22,7 +22,8 @@ Tables of the file (the files in ``gpuvision/presets/sensors`` are commented exa
                       or without it with ``focal_length_px`` and ``principal_point_px``; or ``homography``; or
                       ``constants`` (`Triangulation.from_constants`); or ``points``: calibration points (u, v, G, H) to
                       fit; or ``p`` and ``q`` of a `PlanePolynomial` from (v, u). ``covariance``: see `Triangulation`
-``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`;
+``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`, and
+                      ``[transport.sigma]``, fields of `RotatingSheetSigma`;
                       with an encoder ``encoder``, a file with a count for each profile, and ``metres_per_count`` or
                       ``radians_per_count`` instead of a step
 ``[polygon]``         a point sensor behind a polygon mirror: fields of `PolygonMirror`, ``first_rotation``,
@@ -52,6 +53,7 @@ from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
 from gpuvision.ranging.polygon_scan import PolygonScan
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.range_image import Limits, StraightTransport
+from gpuvision.ranging.rotating_sigma import RotatingSheetSigma
 from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Along, Triangulation
 from gpuvision.schema import DescriptionError, Section, read_toml
@@ -156,6 +158,8 @@ class Sensor:
     noise_known
         Whether the file gives the noise of the readout, so that a scan predicts its errors: ``read_noise``, ``gain`` or
         ``speckle`` of a camera, ``[psd.noise]`` of a PSD.
+    rotating_sigma
+        Standard deviations of the calibration of a rotating sheet, if the file has them (``[transport.sigma]``).
     files
         Files that the sensor file names: background image, camera or lens, encoder. No command replaces one of them.
     """
@@ -171,6 +175,7 @@ class Sensor:
     encoder: Encoder | None = None
     polygon: PolygonScan | None = None
     noise_known: bool = False
+    rotating_sigma: RotatingSheetSigma | None = None
     files: tuple[Path, ...] = field(default=(), compare=False)
 
     @classmethod
@@ -232,7 +237,7 @@ class Sensor:
         )
         axes = SampleAxes() if is_rotating else _axes(top.optional_section("axes"))
         optics = read_optics(top, kind, frame, along, axes)
-        transport, encoder = read_transport(moving, optics, along, is_rotating=is_rotating)
+        transport, encoder, rotating_sigma = read_transport(moving, optics, along, is_rotating=is_rotating)
         if not is_rotating:
             region = _region(kind, top, frame, along, axes, readout)
             sheet, bend = read_triangulation(top.section("triangulation"), optics, region, along)
@@ -258,6 +263,7 @@ class Sensor:
             encoder=encoder,
             polygon=polygon,
             noise_known=noise_known,
+            rotating_sigma=rotating_sigma,
             files=top.files,
         )
 

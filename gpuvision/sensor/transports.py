@@ -13,6 +13,7 @@ import numpy.typing as npt
 from gpuvision.formats.encoder_file import read_encoder
 from gpuvision.ranging.encoder import EncoderStatistics, not_advancing
 from gpuvision.ranging.range_image import RotatingSheet, StraightTransport, Vector
+from gpuvision.ranging.rotating_sigma import RotatingSheetSigma
 from gpuvision.ranging.triangulation import Along
 from gpuvision.schema import Section
 from gpuvision.sensor.optics import Optics
@@ -60,7 +61,7 @@ class Encoder:
 
 def read_transport(
     table: Section, optics: Optics, along: Along, *, is_rotating: bool
-) -> tuple[Transport, Encoder | None]:
+) -> tuple[Transport, Encoder | None, RotatingSheetSigma | None]:
     """Read the table ``[transport]``.
 
     Parameters
@@ -79,6 +80,8 @@ def read_transport(
     StraightTransport or RotatingSheet
         Without a step if an encoder measures the transport.
     Encoder or None
+    RotatingSheetSigma or None
+        Standard deviations of a rotating sheet, if the file gives them.
 
     Raises
     ------
@@ -87,9 +90,15 @@ def read_transport(
     RecordingError
         The encoder file cannot be read.
     """
-    made = _rotating(table, optics, along) if is_rotating else _straight(table)
+    transport: Transport
+    sigma = None
+    if is_rotating:
+        transport, encoder = _rotating(table, optics, along)
+        sigma = _rotating_sigma(table.optional_section("sigma"))
+    else:
+        transport, encoder = _straight(table)
     table.finish()
-    return made
+    return transport, encoder, sigma
 
 
 def read_vector(table: Section, key: str, unit: str, default: tuple[float, ...] | None = None) -> Vector:
@@ -110,6 +119,7 @@ def _straight(table: Section) -> tuple[StraightTransport, Encoder | None]:
         h_axis=read_vector(table, "h_axis", "", default.h_axis),
         direction=read_vector(table, "direction", "", default.direction),
         origin=read_vector(table, "origin", "m", default.origin),
+        covariance=table.rows("covariance", "", 3, None),
     )
     return transport, encoder
 
@@ -140,6 +150,17 @@ def _rotating(table: Section, optics: Optics, along: Along) -> tuple[RotatingShe
         horizon=table.number("horizon", "", 1e-4, above=0.0, below=1.0),
     )
     return sheet, encoder
+
+
+def _rotating_sigma(table: Section | None) -> RotatingSheetSigma | None:
+    """Read the standard deviations of a rotating sheet, ``[transport.sigma]``; errors as for `Section.number`."""
+    if table is None:
+        return None
+    units = {"focal_length_px": "pixel", "principal_point_px": "pixel", "axis_point": "m", "sheet_offset": "m"}
+    units |= {"axis_direction": "rad", "sheet_normal": "rad", "first_angle": "rad", "angle_scale": ""}
+    sigma = RotatingSheetSigma(**{name: table.number(name, unit, 0.0, at_least=0.0) for name, unit in units.items()})
+    table.finish()
+    return sigma
 
 
 def _encoder(table: Section, start: float, scale_key: str, unit: str, step_key: str) -> Encoder | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +17,10 @@ import numpy.typing as npt
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.normal_distribution import MAD_TO_SIGMA
-from gpuvision.ranging.range_image import RangeImage, RangePoints, StraightTransport
+from gpuvision.ranging.polygon_scan import PolygonScan
+from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
 from gpuvision.sensor.sensor import Sensor
+from gpuvision.sensor.transports import Transport
 
 Array = npt.NDArray[Any]
 
@@ -70,7 +73,7 @@ class ScanErrors:
 
 def sigma_outputs(sensor: Sensor) -> tuple[str, ...]:
     """Return the outputs of a readout from which `predict_errors` works; none if the sensor file gives no noise."""
-    if not sensor.noise_known or sensor.polygon is not None:
+    if not sensor.noise_known:
         return ()
     if not isinstance(sensor.transport, StraightTransport):
         return ("sigma",)
@@ -105,21 +108,25 @@ def predict_errors(
     -----
     First order. g and h err together. For straight transport the error of a coordinate is taken as the sum of both
     parts: exact where the coordinate depends on one of g and h, else an upper bound. The bend of a sheet, a small part
-    of the slope, is left out.
+    of the slope, is left out. Behind a polygon mirror the reading moves the spot along the beam, at twice the rotation
+    of the mirror; errors of the mirror are left out. Systematic errors of a rotating sheet are its displacements by
+    each standard deviation of ``sensor.rotating_sigma``.
     """
     if isinstance(sensor.transport, StraightTransport):
         axes = sensor.transport
-        readout = _along_axes(axes, fields["sigma_g"], fields["sigma_h"])
+        spread = _along_axes if sensor.polygon is None else partial(_along_beam, sensor.polygon)
+        readout = spread(axes, fields["sigma_g"], fields["sigma_h"])
         shifts = [abs(each) * _jitter(sensor) for each in axes.direction]
         transport = PointSigma(*(np.full_like(each, shift) for each, shift in zip(readout, shifts, strict=True)))
         systematic = None
         if "systematic_g" in fields:
-            systematic = _along_axes(axes, fields["systematic_g"], fields["systematic_h"])
+            systematic = spread(axes, fields["systematic_g"], fields["systematic_h"])
+        systematic = _with_transport(axes, systematic, transports, points)
     else:
         position, sigma = fields["position"], fields["sigma"]
-        readout = _displacement(sensor, points, position + sigma, transports, device)
-        transport = _displacement(sensor, points, position, transports + _jitter(sensor), device)
-        systematic = None
+        readout = _displacement(sensor.transport, points, position + sigma, transports, device)
+        transport = _displacement(sensor.transport, points, position, transports + _jitter(sensor), device)
+        systematic = _rotating_systematic(sensor, sensor.transport, points, position, transports, device)
     random = PointSigma(*(np.hypot(*each) for each in zip(readout, transport, strict=True)))
     return ScanErrors(
         position=fields["sigma"], readout=readout, transport=transport, random=random, systematic=systematic
@@ -137,11 +144,48 @@ def _along_axes(axes: StraightTransport, sigma_g: Array, sigma_h: Array) -> Poin
     return PointSigma(*parts)
 
 
+def _along_beam(polygon: PolygonScan, axes: StraightTransport, sigma_g: Array, sigma_h: Array) -> PointSigma:
+    """Return the errors of points behind a polygon mirror: an error of the reading moves a spot along its beam."""
+    turned = 2.0 * polygon.rotations(sigma_h.shape[-1])
+    along = zip(axes.g_axis, axes.h_axis, strict=True)
+    shares = [np.abs(-g * np.sin(turned) + h * np.cos(turned)) for g, h in along]
+    return PointSigma(*((share * sigma_h).astype(sigma_h.dtype) for share in shares))
+
+
+def _with_transport(
+    axes: StraightTransport, systematic: PointSigma | None, transports: Array, points: RangePoints
+) -> PointSigma | None:
+    """Add the error of the transport, which grows with the distance from L = 0, to the errors of the sheet."""
+    if axes.covariance is None:
+        return systematic
+    distance = np.abs(transports if transports.ndim == 2 else transports[:, None])
+    moved = [distance * math.sqrt(axes.covariance[i][i]) for i in range(3)]
+    sheet = (np.zeros(1),) * 3 if systematic is None else systematic
+    known = [np.isfinite(to_numpy(each)) for each in points[:3]]
+    total = [np.where(at, np.hypot(a, b), np.nan) for at, a, b in zip(known, moved, sheet, strict=True)]
+    return PointSigma(*(each.astype(to_numpy(points.x).dtype) for each in total))
+
+
+def _rotating_systematic(
+    sensor: Sensor, sheet: RotatingSheet, points: RangePoints, position: Array, angles: Array, device: Device
+) -> PointSigma | None:
+    """Return the root of the sum of the squared displacements by each error of the calibration."""
+    if sensor.rotating_sigma is None:
+        return None
+    total = [np.zeros(position.shape) for _ in range(3)]
+    varied = [(other, angles) for other in sensor.rotating_sigma.sheets(sheet)]
+    varied += [(sheet, other) for other in sensor.rotating_sigma.angles(sheet, angles)]
+    for geometry, turned in varied:
+        moved = _displacement(geometry, points, position, turned, device)
+        total = [held + by.astype(np.float64) ** 2 for held, by in zip(total, moved, strict=True)]
+    return PointSigma(*(np.sqrt(each).astype(position.dtype) for each in total))
+
+
 def _displacement(
-    sensor: Sensor, points: RangePoints, position: Array, transports: Array, device: Device
+    geometry: Transport, points: RangePoints, position: Array, transports: Array, device: Device
 ) -> PointSigma:
-    """Return by how much the points move for other positions or transports."""
-    assemble = RangeImage(geometry=sensor.transport)
+    """Return by how much the points move for another geometry, position or transport."""
+    assemble = RangeImage(geometry=geometry)
     status = np.zeros(position.shape, np.uint8)
     moved = assemble(position, transports.astype(position.dtype), status, device=device)
     return PointSigma(*(np.abs(to_numpy(new) - to_numpy(old)) for new, old in zip(moved[:3], points[:3], strict=True)))

@@ -48,6 +48,8 @@ def described() -> Iterator[dict[str, Any]]:
     for name in ("camera_line", "corner_scene"):
         moving = {key: value for key, value in PRESETS[name]["transport"].items() if "step" not in key}
         yield PRESETS[name] | {"transport": moving | {"encoder": "none.csv"}}
+    corner = PRESETS["corner_scene"]
+    yield corner | {"transport": corner["transport"] | {"sigma": {}}}
     mirror = {"apothem": 0.05, "facets": 8, "height": 0.3, "first_rotation": 0.0, "rotation_step": 1e-3}
     yield PRESETS["psd_line"] | {"polygon": mirror}
     output = {"output": {"cell": 1e-4}}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.sensor_geometry import SensorGeometry
 from gpuvision.ranging.sheet_calibration import SheetFit
+from gpuvision.ranging.transport_calibration import TransportFit
 from gpuvision.sensor.sensor import Sensor
 from laser_sensor import SIZE, LaserSensor, sensor
 
@@ -67,3 +69,31 @@ def test_scan_reads_the_calibrated_sensor(tmp_path: Path) -> None:
     # The next profile lies towards g x h: with y along it and z along h, x is opposite to g.
     np.testing.assert_allclose(axes, [[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], atol=1e-12)
     assert read.transport.step == 1e-3
+
+
+def test_covariance_of_the_transport(tmp_path: Path) -> None:
+    """Per metre of transport, in the scene: y is along the transport, z along the heights."""
+    truth = sensor(20.0)
+    geometry = geometry_of(truth)
+    sheet = geometry.sheet
+    axes = np.stack([-sheet.g_axis, sheet.normal, sheet.h_axis])  # x, y and z in the camera's frame
+    in_scene = np.diag([4e-12, 1e-12, 9e-12])
+    motion = TransportFit(
+        step=-1e-3 * sheet.normal,
+        normal=sheet.h_axis,
+        middle=sheet.origin,
+        noise_covariance=axes.T @ in_scene @ axes,
+        by_camera=np.zeros((3, 0)),
+        residuals=np.zeros((0, 3)),
+        rotations=np.zeros((0, 3)),
+        view_ratio=1.0,
+    )
+    path = tmp_path / "sensor.toml"
+    pixels = truth.project(truth.surface(0.01 * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [2.0, 1.0]])))
+    measured = replace(geometry, transport=motion)
+    path.write_text(
+        sensor_text(measured, name="", size=SIZE, along="columns", channel="grey", cell=4e-4, pixels=pixels)
+    )
+    transport = Sensor.load(path).transport
+    assert isinstance(transport, StraightTransport)
+    np.testing.assert_allclose(transport.covariance, in_scene / 1e-3**2, rtol=1e-9, atol=1e-15)

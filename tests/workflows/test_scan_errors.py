@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 import tifffile
 
+from gpuvision.camera.camera import Camera
 from gpuvision.formats.range_image import read_ply
 from gpuvision.host import Device, to_numpy
 from gpuvision.ranging.range_image import RangeImage, StraightTransport
+from gpuvision.ranging.rotating_sigma import RotatingSheetSigma
 from gpuvision.reference.line import pixel_gaussian
 from gpuvision.schema import DescriptionError, read_toml
 from gpuvision.sensor.sensor import Sensor
@@ -135,8 +137,111 @@ def test_errors_of_a_rotating_sheet(device: Device, rng: np.random.Generator) ->
         np.testing.assert_allclose(np.std(drawn, axis=0), predicted[0], rtol=0.07, atol=1e-7)
 
 
+def ratios_of(points: Any, truth: Any, predicted: Any) -> list[float]:
+    """Return the standard deviations of drawn coordinates (draws, ...) over the predicted ones, for x, y and z."""
+    drawn = [np.sqrt(np.mean((np.array([p[i] for p in points]) - np.asarray(truth[i])) ** 2)) for i in range(3)]
+    return [float(a / np.sqrt(np.mean(np.square(b)))) for a, b in zip(drawn, predicted, strict=True)]
+
+
+def test_systematic_errors_of_the_transport(device: Device, rng: np.random.Generator) -> None:
+    """Steps and directions drawn from the covariance move the points by the predicted systematic errors."""
+    covariance = np.array([[4e-6, 1e-6, 0.0], [1e-6, 1e-6, -5e-7], [0.0, -5e-7, 9e-6]])
+    transport = StraightTransport(step=1e-3, covariance=covariance)
+    sensor = dataclasses.replace(noisy_camera(), transport=transport)
+    lengths, samples = np.array([0.0, 0.02, 0.1]), 20
+    g, h = (rng.uniform(-0.01, 0.01, (3, samples)) for _ in range(2))
+    status = np.zeros(g.shape, np.uint8)
+    true = RangeImage(geometry=transport)(g, h, lengths, status, device=device)
+    fields = {name: np.full(g.shape, 1e-6) for name in ("sigma", "sigma_g", "sigma_h")}
+    systematic = predict_errors(sensor, fields, true, lengths, device).systematic
+    assert systematic is not None
+    assert not np.any([each[0] for each in systematic])  # L = 0
+    drawn = []
+    for moved in np.array(transport.direction) + rng.multivariate_normal(np.zeros(3), covariance, 400):
+        geometry = dataclasses.replace(transport, direction=tuple(moved))
+        drawn.append(RangeImage(geometry=geometry)(g, h, lengths * np.linalg.norm(moved), status, device=device))
+    assert ratios_of(drawn, true, systematic) == pytest.approx([1.0, 1.0, 1.0], abs=0.1)
+    # The errors of the sheet are added.
+    fields |= {name: np.full(g.shape, 3e-5) for name in ("systematic_g", "systematic_h")}
+    both = predict_errors(sensor, fields, true, lengths, device).systematic
+    assert both is not None
+    np.testing.assert_allclose(both.x, np.hypot(systematic.x, 3e-5))
+
+
+@pytest.mark.parametrize("bad", [np.array([[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]), -np.eye(3)])
+def test_no_covariance_of_a_transport(bad: Any) -> None:
+    with pytest.raises(ValueError, match="symmetric"):
+        StraightTransport(covariance=bad)
+
+
+def test_systematic_errors_of_a_rotating_sheet(device: Device, rng: np.random.Generator) -> None:
+    """Sheets drawn with every error of the calibration scatter the points by the predicted systematic errors."""
+    corner = Sensor.load("corner_scene")
+    sheet: Any = corner.transport
+    sigma = RotatingSheetSigma(
+        focal_length_px=2.0,
+        principal_point_px=1.0,
+        axis_point=3e-4,
+        axis_direction=1e-3,
+        sheet_normal=1e-3,
+        sheet_offset=3e-4,
+        first_angle=5e-4,
+        angle_scale=1e-3,
+    )
+    sensor = dataclasses.replace(corner, noise_known=True, rotating_sigma=sigma)
+    angles = sheet.transport(80)[[40, 64]]
+    position = np.tile(np.linspace(500.0, 800.0, 16), (2, 1))
+    status = np.zeros(position.shape, np.uint8)
+    true = RangeImage(geometry=sheet)(position, angles, status, device=device)
+    fields = {"position": position, "sigma": np.full(position.shape, 0.1)}
+    systematic = predict_errors(sensor, fields, true, angles, device).systematic
+    assert systematic is not None
+
+    def turned(direction: Any, angle: float) -> tuple[float, ...]:
+        """Add a random vector across the direction: for small angles a rotation."""
+        noise = rng.normal(0.0, angle, 3)
+        moved = np.array(direction) + noise - (noise @ direction) * np.array(direction)
+        return tuple(moved / np.linalg.norm(moved))
+
+    drawn = []
+    for _ in range(400):
+        other = dataclasses.replace(
+            sheet,
+            focal_length_px=sheet.focal_length_px + rng.normal(0.0, 2.0),
+            principal_point_px=tuple(np.array(sheet.principal_point_px) + rng.normal(0.0, 1.0, 2)),
+            axis_point=tuple(np.array(sheet.axis_point) + rng.normal(0.0, 3e-4, 3)),
+            axis_direction=turned(sheet.axis_direction, 1e-3),
+            sheet_normal=turned(sheet.sheet_normal, 1e-3),
+            sheet_offset=sheet.sheet_offset + rng.normal(0.0, 3e-4),
+        )
+        moved = angles + rng.normal(0.0, 5e-4) + rng.normal(0.0, 1e-3) * (angles - sheet.first_angle)
+        drawn.append(RangeImage(geometry=other)(position, moved, status, device=device))
+    assert ratios_of(drawn, true, systematic) == pytest.approx([1.0, 1.0, 1.0], abs=0.1)
+
+
+def test_a_calibrated_camera_of_a_rotating_sheet(device: Device) -> None:
+    """The same pinhole as a calibrated camera has the same systematic errors; no error is negative."""
+    corner = Sensor.load("corner_scene")
+    pinhole: Any = dataclasses.replace(corner.transport, lens=None)
+    (column, row), f = pinhole.principal_point_px, pinhole.focal_length_px
+    camera = Camera(matrix=((f, 0.0, column), (0.0, f, row), (0.0, 0.0, 1.0)))
+    calibrated = dataclasses.replace(pinhole, camera=camera, focal_length_px=None, principal_point_px=None)
+    position, angles = np.full((1, 4), 600.0), pinhole.transport(65)[64:]
+    sigma = RotatingSheetSigma(focal_length_px=2.0, principal_point_px=1.0)
+    found = []
+    for transport in (pinhole, calibrated):
+        sensor = dataclasses.replace(corner, transport=transport, rotating_sigma=sigma)
+        true = RangeImage(geometry=transport)(position, angles, np.zeros((1, 4), np.uint8), device=device)
+        fields = {"position": position, "sigma": np.full((1, 4), 0.1)}
+        found.append(predict_errors(sensor, fields, true, angles, device).systematic)
+    assert np.min(found[0]) > 0.0
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
+    with pytest.raises(ValueError, match="angle_scale is -1"):
+        RotatingSheetSigma(angle_scale=-1.0)
+
+
 def test_sigmas_need_a_noise_model_and_a_sheet() -> None:
-    """A point sensor behind a polygon mirror has no errors yet; a rotating sheet needs the position's sigma only."""
+    """A rotating sheet needs the position's sigma only; a sensor behind a polygon mirror needs those of its sheet."""
     described: Any = types.SimpleNamespace(noise_known=True, polygon=None, transport=None, readout=None)
     assert sigma_outputs(described) == ("sigma",)
     described.transport = StraightTransport()
@@ -144,7 +249,7 @@ def test_sigmas_need_a_noise_model_and_a_sheet() -> None:
     described.noise_known = False
     assert sigma_outputs(described) == ()
     described.noise_known, described.polygon = True, object()
-    assert sigma_outputs(described) == ()
+    assert sigma_outputs(described) == ("sigma", "sigma_g", "sigma_h")
 
 
 def test_throughput_of_a_short_recording_is_that_of_the_whole_time() -> None:

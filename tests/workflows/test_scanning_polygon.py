@@ -69,6 +69,27 @@ def test_a_tilted_plane(device: Device) -> None:
     np.testing.assert_allclose(done.heights.z[known], plane[known], rtol=0, atol=2e-6)
 
 
+def test_noise_scatters_the_points_by_the_predicted_sigma(device: Device, rng: np.random.Generator) -> None:
+    """Noise of the currents moves a spot along its beam: by its sigma in x and z, and not in y."""
+    currents, _, _ = recording(0.05, 0.1)
+    trials = 2000
+    noise = 2e-10  # A
+    noisy = np.tile(currents[:1], (trials, 1, 1)) + rng.normal(0.0, noise, (trials, SAMPLES, 2))
+    described = table(moving="no")
+    described["psd"]["noise"] = {"independent": noise}
+    described["transport"] |= {"jitter": 1e-4}
+    done = scan(noisy.astype(np.float64), Sensor.from_section(Section(described, "sensor.toml")), device=device)
+    assert done.errors is not None
+    for axis in "xz":
+        values, predicted = to_numpy(getattr(done.points, axis)), getattr(done.errors.random, axis)
+        scatter = np.std(values, axis=0)
+        # 2000 trials determine a standard deviation to 1.6 %.
+        used = predicted[0] > 1e-9
+        assert np.mean(scatter[used] / predicted[0][used]) == pytest.approx(1.0, abs=0.03)
+        np.testing.assert_allclose(scatter[used], predicted[0][used], rtol=0.1)
+    np.testing.assert_allclose(done.errors.random.y, 1e-4)
+
+
 def test_a_stage_that_stops(device: Device) -> None:
     currents, _, _ = recording(0.05, 0.0)
     done = scan(currents.astype(np.float32), sensor(moving="no"), device=device)

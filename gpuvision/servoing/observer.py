@@ -349,7 +349,7 @@ def _innovation(state: Float64, covariance: Float64, pose: Float64, noise: Float
     """Return the squared Mahalanobis distance of a pose, its residual, and the inverse of the residual's covariance."""
     residual = pose - state[:3]
     residual[2] -= 2.0 * math.pi * round(residual[2] / (2.0 * math.pi))
-    inverse = np.linalg.inv(covariance[:3, :3] + noise)
+    inverse = np.asarray(np.linalg.inv(covariance[:3, :3] + noise), np.float64)
     return float(residual @ inverse @ residual), residual, inverse
 
 

@@ -156,11 +156,11 @@ def test_gate_passes_999_of_1000() -> None:
     observer = fresh(MotionModel(lag=(0.0, 0.0, 0.0), position_noise=(1e-9,) * 3))
     truth = rng.multivariate_normal(np.zeros(3), 1e-10 * np.eye(3))
     verdicts = []
-    for k in range(1, 3001):
+    for k in range(1, 1001):
         truth += rng.normal(0.0, 1e-6, 3)  # sqrt(1e-9 m^2/s * 1 ms)
         verdicts.append(observer.add(measured(1e-3 * k, rng.multivariate_normal(truth, NOISE))))
         observer.command(1e-3 * k, np.zeros(3))
-    assert 2985 <= verdicts.count(Verdict.ACCEPTED) < 3000  # 3 expected beyond the gate, 15 is 7 sigma
+    assert verdicts.count(Verdict.ACCEPTED) >= 993  # 1 expected beyond the gate; 8 have a probability of 1e-5
 
 
 def test_memory_is_bounded_and_an_update_is_fast() -> None:

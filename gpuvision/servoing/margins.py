@@ -1,0 +1,199 @@
+"""Stability margins of a servo loop, and the sensitivity of a predictor to a wrong model.
+
+References
+----------
+.. [1] K. J. Astrom and R. M. Murray, *Feedback Systems*, Princeton University Press 2008, section 9.3 (margins).
+.. [2] K. J. Astrom and T. Hagglund, *Advanced PID Control*, ISA 2006, section 8.3 (sensitivity of the Smith predictor).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import brentq
+
+from gpuvision.servoing.controllers import PidGains
+from gpuvision.servoing.delay import delay_taps
+from gpuvision.validation import finite
+
+Float64 = npt.NDArray[np.float64]
+
+# Frequencies of the search for margins, from the frame rate / 1e6 to half the frame rate (chosen): the phase changes by
+# less than a degree from one to the next for delays up to 20 frames.
+_FREQUENCIES = 8192
+# Steps of the bisection for the tolerated error of a model.
+_BISECTIONS = 30
+
+
+class Margins(NamedTuple):
+    """Distance of a loop from instability.
+
+    Attributes
+    ----------
+    gain : float
+        Factor of the gain that makes the loop unstable.
+    phase : float
+        Additional loss of phase that makes the loop unstable [rad].
+    delay : float
+        Additional delay that makes the loop unstable [s], by the phase margin.
+    modulus : float
+        Smallest distance of the frequency response from -1: 1 over the largest sensitivity.
+    crossover : float
+        Frequency at which the loop's gain is 1 [Hz].
+    """
+
+    gain: float
+    phase: float
+    delay: float
+    modulus: float
+    crossover: float
+
+
+def open_loop(gains: PidGains, delay: float, period: float, z: npt.ArrayLike) -> npt.NDArray[np.complex128]:
+    """Return the open loop of controller, integrating plant with hold, and delay, at points of the z plane.
+
+    Parameters
+    ----------
+    gains : PidGains
+        Gains of the controller; the derivative is the difference of two frames.
+    delay : float
+        Delay from the middle of the exposure to the command [s].
+    period : float
+        Frame time [s].
+    z : array_like
+        (...,) complex numbers, not 1.
+    """
+    z = np.asarray(z, np.complex128)
+    whole, part = delay_taps(delay / finite(period, "period", above=0.0))
+    controller = 1.0 + gains.derivative / period * (1.0 - 1.0 / z)
+    if math.isfinite(gains.integral):
+        controller = controller + period / gains.integral / (1.0 - 1.0 / z)
+    taps = z**-whole * (1.0 - part + part / z)
+    return np.asarray(gains.proportional * period * controller * taps / (z - 1.0))
+
+
+def margins(gains: PidGains, delay: float, period: float) -> Margins:
+    """Return the stability margins of a loop with a delayed pose and no predictor.
+
+    Parameters
+    ----------
+    gains, delay, period
+        As for `open_loop`.
+
+    Raises
+    ------
+    ValueError
+        The loop's gain is above 1 up to half the frame rate: there is no crossover.
+    """
+    angles = np.append(np.geomspace(2e-6 * math.pi, math.pi, _FREQUENCIES)[:-1], math.pi)
+
+    def at(angle: float) -> complex:
+        return complex(open_loop(gains, delay, period, np.exp(1j * angle)))
+
+    response = open_loop(gains, delay, period, np.exp(1j * angles))
+    crossing = _first_root(lambda angle: math.log(abs(at(angle))), angles, np.log(np.abs(response)))
+    if crossing is None:
+        raise ValueError("the gain of the loop is above 1 at all frequencies; give smaller gains")
+    phase = float(np.angle(-at(crossing)))
+    # The response crosses the negative real axis where its imaginary part is 0; at half the frame rate it is real.
+    real = [float(response[-1].real)]
+    for k in np.flatnonzero(np.diff(np.sign(response.imag[:-1]))):
+        real.append(at(float(brentq(lambda angle: at(angle).imag, angles[k], angles[k + 1]))).real)
+    gain = 1.0 / max(max(-each for each in real), 1e-300)
+    modulus = float(np.abs(1.0 + response).min())
+    return Margins(gain, phase, phase / crossing * period, modulus, crossing / (2.0 * math.pi * period))
+
+
+def _first_root(function: Callable[[float], float], angles: Float64, values: Float64) -> float | None:
+    places = np.flatnonzero((values[:-1] > 0.0) & (values[1:] <= 0.0))
+    return float(brentq(function, angles[places[0]], angles[places[0] + 1])) if places.size else None
+
+
+def predictor_polynomial(gain: float, delay: float, model_delay: float, plant_gain: float = 1.0) -> Float64:
+    """Return the characteristic polynomial of a proportional loop with a Smith predictor and a wrong model.
+
+    Parameters
+    ----------
+    gain : float
+        Fraction of the predicted error that one frame corrects.
+    delay, model_delay : float
+        Delay of the plant and of the predictor [frames]; fractions are exact.
+    plant_gain : float
+        Motion of the plant over that of the model. Default 1.
+
+    Returns
+    -------
+    numpy.ndarray
+        Coefficients, highest power first, of z^n (z - 1 + gain (1 + plant_gain D(z) - M(z))), where D and M are the
+        taps of the two delays. With a right model it is z^n (z - 1 + gain): the loop without delay.
+    """
+    (whole, part), (known, known_part) = delay_taps(delay), delay_taps(model_delay)
+    polynomial = np.zeros(max(whole, known) + 3)
+    polynomial[:2] = 1.0, -1.0 + gain
+    polynomial[whole + 1 : whole + 3] += gain * plant_gain * np.array([1.0 - part, part])
+    polynomial[known + 1 : known + 3] -= gain * np.array([1.0 - known_part, known_part])
+    return polynomial
+
+
+class PredictorTolerance(NamedTuple):
+    """Errors of the model at which a loop with a Smith predictor becomes unstable.
+
+    Attributes
+    ----------
+    shorter, longer : float
+        Delay of the plant below and above that of the model [frames]; ``shorter`` is the model's delay where every
+        shorter delay is stable.
+    plant_gain : float
+        Largest motion of the plant over that of the model.
+    """
+
+    shorter: float
+    longer: float
+    plant_gain: float
+
+
+def predictor_tolerance(gain: float, delay: float) -> PredictorTolerance:
+    """Return the errors of the model at which a loop with a Smith predictor becomes unstable.
+
+    Parameters
+    ----------
+    gain : float
+        Fraction of the predicted error that one frame corrects, above 0 and below 2.
+    delay : float
+        Delay of the predictor [frames].
+
+    Notes
+    -----
+    The errors are scanned in 200 steps, up to a delay of ``delay + 10`` frames and a gain of 10, and the first unstable
+    one is refined by bisection.
+    """
+    finite(gain, "gain", above=0.0, maximum=2.0)
+
+    def is_stable(error: float, factor: float) -> bool:
+        polynomial = predictor_polynomial(gain, max(delay + error, 0.0), delay, factor)
+        return bool(np.abs(np.roots(polynomial)).max() < 1.0)
+
+    return PredictorTolerance(
+        _first_unstable(lambda error: is_stable(-error, 1.0), delay),
+        _first_unstable(lambda error: is_stable(error, 1.0), delay + 10.0),
+        1.0 + _first_unstable(lambda more: is_stable(0.0, 1.0 + more), 9.0),
+    )
+
+
+def _first_unstable(is_stable: Callable[[float], bool], largest: float) -> float:
+    """Return the smallest error that is not stable, or the largest one."""
+    steps = np.linspace(0.0, largest, 201)
+    found = next((k for k, each in enumerate(steps) if not is_stable(float(each))), None)
+    if found is None:
+        return largest
+    if found == 0:
+        return 0.0
+    low, high = float(steps[found - 1]), float(steps[found])
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if is_stable(middle) else (low, middle)
+    return high

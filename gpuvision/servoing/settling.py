@@ -1,0 +1,193 @@
+"""Settling: decide from the residual vibration and from the noise of the pose when the head may place its part.
+
+After a move the head swings at its resonance. `VibrationSettling` fits offset and decaying sine to the last errors, and
+allows the placement as soon as the probability of a misplacement beyond the tolerance of this part is small enough:
+a part with a wide tolerance, or a move that excited little vibration, waits less.
+
+References
+----------
+.. [1] G. H. Golub and V. Pereyra, *The differentiation of pseudo-inverses and nonlinear least squares problems whose
+   variables separate*, SIAM Journal on Numerical Analysis 10, 1973 (variable projection).
+.. [2] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 8.7.2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+
+from gpuvision.validation import finite, integer, numbers
+
+Float64 = npt.NDArray[np.float64]
+
+# Largest damping ratio of a vibration that a fit looks for (chosen): above, nothing swings.
+_MAX_DAMPING = 0.7
+
+
+class Vibration(NamedTuple):
+    """Decaying sine ``offset + amplitude exp(-decay t) cos(angular frequency t + phase)``, t from the first sample.
+
+    Attributes
+    ----------
+    offset : float
+        Final value [m] or [rad].
+    amplitude : float
+        Amplitude at the first sample.
+    phase : float
+        Phase at the first sample [rad].
+    frequency : float
+        Frequency of the swing [Hz].
+    damping : float
+        Damping ratio.
+    residual : float
+        Root mean square of the residuals.
+    """
+
+    offset: float
+    amplitude: float
+    phase: float
+    frequency: float
+    damping: float
+    residual: float
+
+
+def _basis(time: Float64, frequency: float, damping: float) -> Float64:
+    """Return the basis (n, 3): 1, decaying cosine and decaying sine; (n, 1) for the frequency 0."""
+    one = np.ones((len(time), 1))
+    if frequency == 0.0:
+        return one
+    swing = 2.0 * math.pi * frequency * time
+    decay = np.exp(-damping / math.sqrt(1.0 - damping**2) * swing)
+    return np.column_stack([one, decay * np.cos(swing), decay * np.sin(swing)])
+
+
+def fit_vibration(time: npt.ArrayLike, error: npt.ArrayLike, *, damping: float = 0.02) -> Vibration:
+    """Fit a decaying sine to errors after a move, to identify the resonance of an axis.
+
+    Parameters
+    ----------
+    time : array_like
+        (n,) increasing times [s], 8 or more, at least one period of the swing.
+    error : array_like
+        (n,) errors [m] or [rad].
+    damping : float
+        Damping ratio at which the search starts. Default 0.02.
+
+    Raises
+    ------
+    ValueError
+        There are fewer than 8 samples, or a number is not finite.
+
+    Notes
+    -----
+    Frequency and damping are found by Gauss-Newton steps from the best frequency of a scan; the other parameters are
+    linear (variable projection).
+    """
+    times, errors = np.asarray(time, np.float64), np.asarray(error, np.float64)
+    if times.ndim != 1 or errors.shape != times.shape or len(times) < 8:
+        raise ValueError(f"time and error have shapes {times.shape} and {errors.shape}, expected 8 samples or more")
+    if not (np.all(np.isfinite(times)) and np.all(np.isfinite(errors)) and np.all(np.diff(times) > 0.0)):
+        raise ValueError("time must increase, and time and error must be finite")
+    since = times - times[0]
+    step = since[-1] / (len(since) - 1)
+    frequencies = np.linspace(0.5 / since[-1], 0.45 / step, 8 * len(since))
+    costs = [float(np.sum(_residual(since, errors, each, damping) ** 2)) for each in frequencies]
+    start = float(frequencies[int(np.argmin(costs))])
+    unit = float(np.std(errors)) or 1.0
+    found = least_squares(
+        lambda each: _residual(since, errors, each[0] * start, each[1]) / unit,
+        (1.0, damping),
+        bounds=((0.5, 0.0), (2.0, _MAX_DAMPING)),
+        x_scale=(0.01, 0.01),
+    )
+    frequency, ratio = float(found.x[0]) * start, float(found.x[1])
+    offset, cosine, sine = np.linalg.lstsq(_basis(since, frequency, ratio), errors, rcond=None)[0]
+    rms = float(np.sqrt(np.mean(_residual(since, errors, frequency, ratio) ** 2)))
+    return Vibration(float(offset), math.hypot(cosine, sine), math.atan2(-sine, cosine), frequency, ratio, rms)
+
+
+def _residual(time: Float64, error: Float64, frequency: float, damping: float) -> Float64:
+    basis = _basis(time, frequency, damping)
+    return np.asarray(error - basis @ np.linalg.lstsq(basis, error, rcond=None)[0], np.float64)
+
+
+class VibrationSettling:
+    """Rule that allows a placement when vibration and noise leave its tolerance with a small probability only.
+
+    Parameters
+    ----------
+    tolerance : array_like
+        (3,) largest errors of this part [m], [m], [rad], above 0.
+    frequency : array_like
+        (3,) frequencies of the residual vibration of the axes [Hz]; 0 for an axis that does not swing. Default 0.
+    damping : array_like
+        (3,) damping ratios. Default 0.02.
+    miss_probability : float
+        Largest probability of an error beyond the tolerance. Default 0.0027 (3 sigma).
+    window : int
+        Number of the last errors to which the vibration is fitted, 4 or more. Default 24.
+    lead : float
+        Time from the decision to the contact of the part with the board [s]. Default 0.
+
+    Notes
+    -----
+    Offset and amplitude are a linear least-squares fit. The error at the contact is taken as offset plus envelope,
+    whatever the phase, with the standard deviation of the fit: the head stays within the tolerance from then on. Call
+    it once for each frame; it implements `gpuvision.servoing.loop.SettlingRule`.
+    """
+
+    def __init__(
+        self,
+        tolerance: npt.ArrayLike,
+        *,
+        frequency: npt.ArrayLike = (0.0, 0.0, 0.0),
+        damping: npt.ArrayLike = (0.02, 0.02, 0.02),
+        miss_probability: float = 0.0027,
+        window: int = 24,
+        lead: float = 0.0,
+    ) -> None:
+        self._tolerance = [finite(each, "tolerance", above=0.0) for each in numbers(tolerance, (3,), "tolerance")]
+        self._frequency = [finite(each, "frequency", minimum=0.0) for each in numbers(frequency, (3,), "frequency")]
+        self._damping = [
+            finite(each, "damping", minimum=0.0, maximum=_MAX_DAMPING) for each in numbers(damping, (3,), "damping")
+        ]
+        self._miss = finite(miss_probability, "miss_probability", above=0.0, maximum=1.0)
+        self._lead = finite(lead, "lead", minimum=0.0)
+        self._samples: deque[tuple[float, Float64, Float64]] = deque(maxlen=integer(window, "window", minimum=4))
+
+    def __call__(self, time: float, error: Float64, covariance: Float64) -> bool:
+        """Take an error (3,) with its covariance (3, 3) at a time [s]; return whether the part may be placed."""
+        self._samples.append((time, np.array(error), np.diagonal(covariance).copy()))
+        return self.miss_probability() <= self._miss
+
+    def miss_probability(self) -> float:
+        """Return the probability that an axis leaves the tolerance after the contact, by the errors so far."""
+        if len(self._samples) < 4:
+            return 1.0
+        times = np.array([each[0] for each in self._samples])
+        errors = np.array([each[1] for each in self._samples])
+        variances = np.array([each[2] for each in self._samples])
+        return float(sum(self._axis(k, times, errors[:, k], variances[:, k]) for k in range(3)))
+
+    def _axis(self, axis: int, times: Float64, errors: Float64, variances: Float64) -> float:
+        """Return the probability that one axis leaves its tolerance, at most 1."""
+        basis = _basis(times - times[-1], self._frequency[axis], self._damping[axis])
+        weighted = basis / np.maximum(variances, 1e-300)[:, None]
+        information = weighted.T @ basis
+        if np.linalg.cond(information) > 1e12:  # the window is a small part of a period
+            return 1.0
+        covariance = np.linalg.inv(information)
+        fit = covariance @ (weighted.T @ errors)
+        worst, variance = abs(float(fit[0])), float(covariance[0, 0])
+        if len(fit) == 3:
+            ratio = self._damping[axis] / math.sqrt(1.0 - self._damping[axis] ** 2)
+            decay = math.exp(-ratio * 2.0 * math.pi * self._frequency[axis] * self._lead)
+            worst += decay * math.hypot(fit[1], fit[2])
+            variance += decay**2 * 0.5 * float(covariance[1, 1] + covariance[2, 2])
+        sigma, tolerance = math.sqrt(2.0 * variance), self._tolerance[axis]
+        return 0.5 * (math.erfc((tolerance - worst) / sigma) + math.erfc((tolerance + worst) / sigma))

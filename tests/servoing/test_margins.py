@@ -1,0 +1,116 @@
+"""Margins and sensitivity, against closed forms of the proportional loop and simulated loops."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from gpuvision.servoing.controllers import PidController, PidGains, gains_without_oscillation, simc_gains
+from gpuvision.servoing.delay import gain_limit, non_oscillating_gain
+from gpuvision.servoing.margins import margins, predictor_polynomial, predictor_tolerance
+
+PERIOD = 1e-3
+
+
+@pytest.mark.parametrize("delay", [0.0, 1.0, 2.5, 6.0])
+@pytest.mark.parametrize("fraction", [0.2, 0.5])
+def test_margins_of_a_proportional_loop(delay: float, fraction: float) -> None:
+    """|L| = 1 at 2 asin(K / 2); the phase there is -90 degrees - (delay + 1/2) angle."""
+    gain = fraction * gain_limit(delay)
+    found = margins(PidGains(proportional=gain / PERIOD), delay * PERIOD, PERIOD)
+    assert found.gain == pytest.approx(1.0 / fraction, rel=1e-6)
+    if delay % 1.0 == 0.0:
+        angle = 2.0 * math.asin(gain / 2.0)
+        assert found.crossover == pytest.approx(angle / (2.0 * math.pi * PERIOD), rel=1e-6)
+        assert found.phase == pytest.approx(math.pi / 2.0 - (delay + 0.5) * angle, rel=1e-6)
+        assert found.delay == pytest.approx(found.phase / angle * PERIOD, rel=1e-6)
+    assert 0.0 < found.modulus < 1.0
+    # The sensitivity bounds the other margins [1, section 9.3].
+    assert found.gain >= 1.0 / (1.0 - found.modulus) - 1e-3
+    assert found.phase >= 2.0 * math.asin(found.modulus / 2.0) - 1e-3
+
+
+def test_delay_margin_is_the_delay_at_which_the_gain_is_the_limit() -> None:
+    gain = 0.3
+    found = margins(PidGains(proportional=gain / PERIOD), 1e-3, PERIOD)
+    assert gain_limit(1.0 + found.delay / PERIOD) == pytest.approx(gain, rel=0.01)
+
+
+def test_gain_above_all_frequencies_is_an_error() -> None:
+    with pytest.raises(ValueError, match="above 1 at all frequencies"):
+        margins(PidGains(proportional=3.0 / PERIOD), 0.0, PERIOD)
+
+
+def test_rules() -> None:
+    assert gains_without_oscillation(2e-3, PERIOD).proportional == pytest.approx(non_oscillating_gain(2) / PERIOD)
+    gains = simc_gains(2.5e-3, lag=4e-3)
+    assert (gains.proportional, gains.integral, gains.derivative) == pytest.approx((200.0, 0.02, 4e-3))
+    assert math.isinf(simc_gains(2.5e-3, integral=False).integral)
+    found = margins(simc_gains(2.5e-3), 2e-3, PERIOD)
+    # Skogestad's rule promises a gain margin of 2.96, a phase margin of 46.9 degrees for a continuous loop.
+    assert found.gain == pytest.approx(2.96, rel=0.05)
+    assert math.degrees(found.phase) == pytest.approx(46.9, abs=1.5)
+
+
+@pytest.mark.parametrize(("delay", "factor"), [(3.0, 1.0), (4.4, 1.0), (2.2, 1.0), (3.0, 1.3), (3.6, 0.8)])
+def test_polynomial_of_a_wrong_predictor_is_the_loop(delay: float, factor: float) -> None:
+    """Decay of a written-out loop whose predictor believes in a delay of 3 frames."""
+    gain, frames = 0.5, 400
+    times = np.arange(-20.0, frames + 1.0)
+    true, model = np.zeros(len(times)), np.zeros(len(times))
+    for k in range(20, 20 + frames):
+        now = times[k]
+        seen = float(np.interp(now - delay, times, true))
+        predicted = seen + model[k] - float(np.interp(now - 3.0, times, model))
+        step = gain * (1.0 - predicted)
+        true[k + 1], model[k + 1] = true[k] + factor * step, model[k] + step
+    errors = np.abs(1.0 - true[20:])
+    root = float(np.abs(np.roots(predictor_polynomial(gain, delay, 3.0, factor))).max())
+    peaks = [errors[a : a + 60].max() for a in (40, 120)]
+    if errors[120:180].max() > 1e-12:
+        assert (peaks[1] / peaks[0]) ** (1 / 80) == pytest.approx(root, rel=0.01)
+    else:
+        assert root < 0.8
+
+
+def test_tolerance_is_where_the_polynomial_leaves_the_circle() -> None:
+    found = predictor_tolerance(0.8, 4.0)
+    for error in (-found.shorter, found.longer):
+        inside, outside = (predictor_polynomial(0.8, 4.0 + factor * error, 4.0) for factor in (0.999, 1.001))
+        assert np.abs(np.roots(inside)).max() < 1.0 < np.abs(np.roots(outside)).max()
+    inside, outside = (predictor_polynomial(0.8, 4.0, 4.0, 1.0 + f * (found.plant_gain - 1.0)) for f in (0.999, 1.001))
+    assert np.abs(np.roots(inside)).max() < 1.0 < np.abs(np.roots(outside)).max()
+    slow = predictor_tolerance(0.2, 4.0)
+    assert slow.longer > found.longer
+    assert slow.plant_gain > found.plant_gain
+
+
+def test_anti_windup() -> None:
+    """A long saturated move leaves no more integral part than a short one."""
+    gains, limit = PidGains(proportional=10.0, integral=0.1), (0.1, 0.1, 0.1)
+    controller = PidController(gains, limit=limit)
+    far = np.array([1.0, -1.0, 0.0])
+    for _ in range(1000):
+        assert controller(far, np.zeros(3), PERIOD).tolist() == [0.1, -0.1, 0.0]
+    assert controller(-1e-3 * far, np.zeros(3), PERIOD) == pytest.approx([-0.01, 0.01, 0.0], rel=0.02)
+    free = PidController(gains)
+    assert free(far, np.zeros(3), PERIOD) == pytest.approx(far * 10.0 * (1.0 + PERIOD / 0.1))
+    assert free(far, np.zeros(3), PERIOD) == pytest.approx(far * 10.0 * (1.0 + 2.0 * PERIOD / 0.1))
+    free.reset()
+    assert free(far, np.zeros(3), PERIOD) == pytest.approx(far * 10.0 * (1.0 + PERIOD / 0.1))
+
+
+def test_derivative_and_feed_forward() -> None:
+    controller = PidController(PidGains(proportional=10.0, derivative=0.2), feed_forward=0.5)
+    error, speed = np.array([1.0, 2.0, 3.0]), np.array([-1.0, 0.0, 1.0])
+    assert controller(error, speed, PERIOD, 4.0 * speed) == pytest.approx(10.0 * (error + 0.2 * speed) + 2.0 * speed)
+
+
+@pytest.mark.parametrize(
+    "given", [{"proportional": 0.0}, {"proportional": 1.0, "integral": 0.0}, {"proportional": 1.0, "derivative": -1.0}]
+)
+def test_gains_are_checked(given: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="expected a number"):
+        PidGains(**given)

@@ -1,0 +1,129 @@
+"""Settling rule against a fixed wait, on moves with random vibrations and parts with different tolerances."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from gpuvision.servoing.axis import Axis
+from gpuvision.servoing.plant import SimulatedPlant
+from gpuvision.servoing.settling import VibrationSettling, fit_vibration
+
+PERIOD, SIGMA = 1e-3, 1e-6
+FREQUENCY, DAMPING = 60.0, 0.05
+LONGEST = 400
+
+
+def swings(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the true errors (count, LONGEST) of x after moves of different lengths [m]."""
+    amplitude = rng.uniform(2e-6, 80e-6, count)
+    angle = 2.0 * math.pi * FREQUENCY * PERIOD * np.arange(LONGEST)
+    envelope = np.exp(-DAMPING / math.sqrt(1.0 - DAMPING**2) * angle)
+    offset = rng.normal(0.0, 0.5e-6, count)
+    return offset[:, None] + amplitude[:, None] * envelope * np.cos(angle + rng.uniform(0, 6.28, count)[:, None])
+
+
+def wait_by_rule(errors: np.ndarray, tolerance: float, rng: np.random.Generator) -> int:
+    rule = VibrationSettling(
+        (tolerance, 1e-3, 1e-3), frequency=(FREQUENCY, 0.0, 0.0), damping=(DAMPING,) * 3, miss_probability=0.02
+    )
+    covariance = SIGMA**2 * np.eye(3)
+    for frame, error in enumerate(errors):
+        seen = np.array([error + SIGMA * rng.standard_normal(), 0.0, 0.0])
+        if rule(frame * PERIOD, seen, covariance):
+            return frame
+    return LONGEST - 1
+
+
+def compare(count: int, seed: int) -> tuple[float, float, float]:
+    """Return the mean wait of the rule, the fixed wait with as many misplacements [frames], and the misplaced fraction.
+
+    A part is misplaced if it leaves its tolerance at any time in the period of the swing after the contact.
+    """
+    rng = np.random.default_rng(seed)
+    errors = swings(count, rng)
+    tolerances = rng.choice([4e-6, 10e-6, 25e-6, 50e-6], count)
+    period = math.ceil(1.0 / FREQUENCY / PERIOD)
+    reach = np.array([np.abs(errors[:, k : k + period]).max(axis=1) for k in range(LONGEST - period)]).T
+    misses = reach > tolerances[:, None]
+    waits = np.array([wait_by_rule(each, limit, rng) for each, limit in zip(errors, tolerances, strict=True)])
+    missed = float(np.mean(misses[np.arange(count), np.minimum(waits, misses.shape[1] - 1)]))
+    fixed = int(np.flatnonzero(misses.mean(axis=0) <= max(missed, 1.0 / count))[0])
+    return float(np.mean(waits)), float(fixed), missed
+
+
+def test_rule_waits_30_percent_less_than_a_fixed_wait_with_as_many_misplacements() -> None:
+    wait, fixed, missed = compare(50, 1)
+    assert missed <= 0.05
+    assert wait <= 0.7 * fixed
+
+
+@pytest.mark.slow
+def test_misplacements_are_as_few_as_asked_for() -> None:
+    wait, fixed, missed = compare(500, 2)
+    assert missed <= 0.03
+    assert wait <= 0.7 * fixed
+
+
+def test_wide_tolerance_waits_less() -> None:
+    rng = np.random.default_rng(0)
+    errors = swings(1, rng)[0]
+    waits = [wait_by_rule(errors, tolerance, np.random.default_rng(3)) for tolerance in (3e-6, 10e-6, 30e-6, 90e-6)]
+    assert waits == sorted(waits, reverse=True)
+    assert waits[0] > waits[-1] + 20
+
+
+def test_vibration_of_a_simulated_axis_is_identified() -> None:
+    plant = SimulatedPlant((Axis(resonance=2 * math.pi * 75.0, damping=0.04), Axis(), Axis()))
+    plant.command(0.0, np.array([0.1, 0.0, 0.0]))
+    plant.command(0.02, np.zeros(3))
+    times = 0.02 + PERIOD * np.arange(80)
+    errors = plant.pose(times)[:, 0] - 2e-3
+    found = fit_vibration(times, errors + 1e-7 * np.random.default_rng(0).standard_normal(80))
+    assert found.frequency == pytest.approx(75.0 * math.sqrt(1 - 0.04**2), rel=1e-3)
+    assert found.damping == pytest.approx(0.04, rel=0.02)
+    assert found.offset == pytest.approx(0.0, abs=1e-7)
+    assert found.residual == pytest.approx(1e-7, rel=0.3)
+    angle = 2 * math.pi * found.frequency * (times - times[0])
+    decay = np.exp(-found.damping / math.sqrt(1 - found.damping**2) * angle)
+    assert found.offset + found.amplitude * decay * np.cos(angle + found.phase) == pytest.approx(errors, abs=3e-7)
+
+
+def test_rule_without_vibration_is_the_normal_distribution() -> None:
+    """Four errors of 1 um, mean 2 um: a tolerance of 3 um is two standard deviations of the mean away."""
+    rule = VibrationSettling((3e-6, 1.0, 1.0))
+    for k in range(4):
+        assert rule.miss_probability() == 1.0
+        rule(k * PERIOD, np.array([2e-6, 0.0, 0.0]), SIGMA**2 * np.eye(3))
+    assert rule.miss_probability() == pytest.approx(0.02275, rel=1e-3)
+
+
+def test_short_window_does_not_settle() -> None:
+    rule = VibrationSettling((1e-3,) * 3, frequency=(0.01, 0.0, 0.0))
+    assert not any(rule(k * PERIOD, np.zeros(3), SIGMA**2 * np.eye(3)) for k in range(6))
+
+
+def test_lead_lets_the_vibration_decay() -> None:
+    errors = swings(1, np.random.default_rng(5))[0][:24]
+    found = []
+    for lead in (0.0, 0.2):
+        rule = VibrationSettling((8e-6, 1.0, 1.0), frequency=(FREQUENCY,) * 3, damping=(DAMPING,) * 3, lead=lead)
+        for k, error in enumerate(errors):
+            rule(k * PERIOD, np.array([error, 0.0, 0.0]), SIGMA**2 * np.eye(3))
+        found.append(rule.miss_probability())
+    assert found[1] < found[0]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"), [({"tolerance": (0.0, 1.0, 1.0)}, "tolerance is"), ({"damping": (1.0,) * 3}, "damping is")]
+)
+def test_rule_is_checked(given: dict[str, tuple[float, float, float]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        VibrationSettling(**({"tolerance": (1.0, 1.0, 1.0)} | given))
+
+
+def test_fit_needs_samples() -> None:
+    with pytest.raises(ValueError, match="8 samples"):
+        fit_vibration([0.0, 1.0], [0.0, 1.0])

@@ -19,7 +19,7 @@ from gpuvision.servoing.simulated_sensor import SimulatedPoseSensor
 
 PERIOD = 1e-3
 STEP = np.array([1e-3, 0.0, 0.0])
-DELAYS = (0, 1, 2, 3, 4, 5, 6, 0.3, 1.5, 2.25, 4.7)
+DELAYS = (0, 1, 2, 3, 4, 5, 6, 0.3, 2.25)
 
 
 def run(
@@ -56,7 +56,7 @@ def test_simulated_loop_is_unstable_from_the_limit_on(delay: float) -> None:
     """1 % below the limit the error decays, 1 % above it grows; the factor is that of the slowest root."""
     for factor in (0.99, 1.01):
         gain = factor * gain_limit(delay)
-        found, root = growth(run(delay, gain, 240)[1]), float(np.abs(root_locus(delay, gain)).max())
+        found, root = growth(run(delay, gain, 400)[1]), float(np.abs(root_locus(delay, gain)).max())
         assert (found > 1.0) == (factor > 1.0)
         assert found == pytest.approx(root, abs=0.1 * abs(root - 1.0) + 2e-4)
 

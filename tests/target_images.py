@@ -80,6 +80,11 @@ def view(
     return View(width, height, place @ perspective @ lay @ shift, lens)
 
 
+def _length(vectors: Float64) -> Float64:
+    """Return the lengths of vectors (..., 2); faster than a reduction along the short last axis."""
+    return np.asarray(np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2))
+
+
 def _rendered(camera: View, inside: Callable[[Float64], Float64]) -> Float64:
     """Return the covered fraction of every pixel; ``inside`` is a signed distance in pitches (below 0: inside)."""
     cover = np.empty((camera.height, camera.width))
@@ -88,16 +93,17 @@ def _rendered(camera: View, inside: Callable[[Float64], Float64]) -> Float64:
         y, x = np.mgrid[start : min(start + block, camera.height), 0 : camera.width].astype(float)
         at = camera.pattern(np.stack([x, y], axis=-1))
         down, across = np.gradient(at, axis=(0, 1))
-        reach = np.maximum(np.linalg.norm(across, axis=-1), np.linalg.norm(down, axis=-1))
+        reach = np.maximum(_length(across), _length(down))
         distance = inside(at)
         part = (distance < 0).astype(float)
         edge = np.abs(distance) < reach
         offsets = (np.arange(_SUPERSAMPLING) + 0.5) / _SUPERSAMPLING - 0.5
-        total = np.zeros(np.count_nonzero(edge))
+        at, across, down, reach = at[edge], across[edge], down[edge], reach[edge]
+        total = np.zeros(len(reach))
         for dx in offsets:
             for dy in offsets:
-                sample = inside(at[edge] + dx * across[edge] + dy * down[edge])
-                total += np.clip(0.5 - sample * _SUPERSAMPLING / reach[edge], 0.0, 1.0)
+                sample = inside(at + dx * across + dy * down)
+                total += np.clip(0.5 - sample * _SUPERSAMPLING / reach, 0.0, 1.0)
         part[edge] = total / _SUPERSAMPLING**2
         cover[start : start + block] = part
     return cover
@@ -110,7 +116,7 @@ def dots(camera: View, present: npt.NDArray[np.bool_], radius: float = 0.25) -> 
     def inside(at: Float64) -> Float64:
         nearest = np.rint(np.nan_to_num(at, nan=-9.0)).astype(int)
         j, i = np.clip(nearest[..., 0], 0, columns - 1), np.clip(nearest[..., 1], 0, rows - 1)
-        distance = np.linalg.norm(at - np.stack([j, i], axis=-1), axis=-1) - radius
+        distance = _length(at - np.stack([j, i], axis=-1)) - radius
         return np.where(present[i, j] & np.isfinite(distance), distance, 1.0)
 
     return _rendered(camera, inside)
@@ -122,13 +128,13 @@ def chessboard(camera: View, inner: tuple[int, int]) -> Float64:
 
     def inside(at: Float64) -> Float64:
         at = np.nan_to_num(at, nan=-99.0)
-        parity = np.floor(at).astype(int).sum(axis=-1) % 2 == 0
-        distance = np.min(np.abs(at - np.rint(at)), axis=-1)
+        column, row = np.floor(at).astype(int).T
+        parity = ((column + row) % 2 == 0).T
+        away = np.abs(at - np.rint(at))
+        distance = np.minimum(away[..., 0], away[..., 1])
         squares = np.where(parity, -distance, distance)
-        border = np.max(
-            np.abs(at + 0.5 - 0.5 * np.array([columns, rows])) - 0.5 * np.array([columns + 1, rows + 1]), -1
-        )
-        return np.maximum(squares, border)
+        border = np.abs(at + 0.5 - 0.5 * np.array([columns, rows])) - 0.5 * np.array([columns + 1, rows + 1])
+        return np.maximum(squares, np.maximum(border[..., 0], border[..., 1]))
 
     return _rendered(camera, inside)
 
@@ -141,8 +147,7 @@ def line_grid(camera: View, rows: int, columns: int, width: float = 0.15, end: f
         last = np.array([columns - 1, rows - 1])
         off = np.abs(at - np.clip(np.rint(at), 0, last)) - 0.5 * width
         beyond = np.maximum(-at, at - last) - end
-        along = np.stack([np.maximum(off[..., 0], beyond[..., 1]), np.maximum(off[..., 1], beyond[..., 0])])
-        return along.min(axis=0)
+        return np.minimum(np.maximum(off[..., 0], beyond[..., 1]), np.maximum(off[..., 1], beyond[..., 0]))
 
     return _rendered(camera, inside)
 

@@ -182,7 +182,7 @@ class Lens:
     def undistort(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Return the undistorted (column, row) of measured points (..., 2); NaN beyond the fold."""
         offset = np.asarray(points, dtype=np.float64) - self.centre
-        square = np.sum(offset**2, axis=-1, keepdims=True)
+        square = (offset[..., 0] ** 2 + offset[..., 1] ** 2)[..., None]  # faster than a sum along the short last axis
         inside = square < self.fold_radius**2
         # Add the small displacement to the point instead of scaling the offset: the rounding error is smaller.
         with np.errstate(invalid="ignore", over="ignore"):

@@ -55,6 +55,12 @@ def part_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def light(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Common cache of the tests: the light of 40 profiles, computed once."""
+    return tmp_path_factory.mktemp("light")
+
+
 def task_of(part_file: Path, sensor: str = "psd_line", **more: Any) -> Any:
     part, materials = load_part(part_file, 1.0, None, 0.5)
     return prepare_simulation(part, materials, Sensor.load(sensor), **({"profiles": 40} | more))
@@ -67,8 +73,8 @@ def test_a_part_is_scanned_from_end_to_end(part_file: Path) -> None:
     np.testing.assert_allclose(task.transports[[0, -1]], [-9.75 * MM, 9.75 * MM], atol=1e-12)
 
 
-def test_what_is_read_is_told_apart_by_cause(part_file: Path, tmp_path: Path) -> None:
-    done = simulate(task_of(part_file), tmp_path, seed=None)
+def test_what_is_read_is_told_apart_by_cause(part_file: Path, light: Path, tmp_path: Path) -> None:
+    done = simulate(task_of(part_file), light, seed=None)
     attribution = done.attribution
     assert attribution.error.shape == (40, 96)
     total = np.sum(list(attribution.causes.values()), axis=0)
@@ -92,20 +98,20 @@ def test_what_is_read_is_told_apart_by_cause(part_file: Path, tmp_path: Path) ->
         assert (tmp_path / name).stat().st_size > 1000
 
 
-def test_a_mask_made_for_the_part_helps(part_file: Path, tmp_path: Path) -> None:
+def test_a_mask_made_for_the_part_helps(part_file: Path, light: Path, tmp_path: Path) -> None:
     task = task_of(part_file)
-    without = simulate(task, tmp_path, seed=None)
-    found = simulate(task, tmp_path, seed=None, mask="best")
+    without = simulate(task, light, seed=None)
+    found = simulate(task, light, seed=None, mask="best")
     assert found.computed_blocks == 0
     assert found.mask is not None
     rms = [np.sqrt(np.nanmean(each.attribution.error**2)) for each in (without, found)]
     assert rms[1] < rms[0]
     found.write(tmp_path)
-    again = simulate(task, tmp_path, seed=None, mask=Mask.load(tmp_path / "mask.txt"))
+    again = simulate(task, light, seed=None, mask=Mask.load(tmp_path / "mask.txt"))
     np.testing.assert_allclose(again.attribution.error, found.attribution.error, atol=1e-12)
 
 
-def test_what_was_stopped_goes_on_where_it_was(part_file: Path, tmp_path: Path) -> None:
+def test_what_was_stopped_goes_on_where_it_was(part_file: Path, light: Path, tmp_path: Path) -> None:
     task = task_of(part_file)
 
     def stop(done: int, of: int | None) -> None:
@@ -122,7 +128,7 @@ def test_what_was_stopped_goes_on_where_it_was(part_file: Path, tmp_path: Path) 
     assert done.computed_blocks == 1
     assert seen == [(32, 40), (40, 40)]
     assert [store.path(k).read_bytes() for k in (0, 1)] == kept
-    expected = simulate(task, tmp_path / "whole")
+    expected = simulate(task, light)
     np.testing.assert_array_equal(expected.attribution.error, done.attribution.error)
     np.testing.assert_array_equal(expected.attribution.category, done.attribution.category)
 

@@ -172,10 +172,10 @@ class _LatticeGrowth:
         index = self.index[new]
         for axis in (0, 1):
             ahead, previous = (self.at[tuple((index + side * _STEPS[2 * axis]).T)] for side in (1, -1))
-            forward = np.where((ahead >= 0)[:, None], self.points[ahead] - self.points[new], np.nan)
-            backward = np.where((previous >= 0)[:, None], self.points[new] - self.points[previous], np.nan)
+            forward = np.where((ahead >= 0)[:, None], self.points[ahead] - self.points[new], 0.0)
+            backward = np.where((previous >= 0)[:, None], self.points[new] - self.points[previous], 0.0)
             count = (ahead >= 0).astype(int) + (previous >= 0)
-            total = np.nan_to_num(forward) + np.nan_to_num(backward)
+            total = forward + backward
             known = np.flatnonzero(count)
             step, parents = total[known] / count[known, None], self.bases[new[known], axis]
             # Reject the steps of a spurious point.

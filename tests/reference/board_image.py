@@ -125,8 +125,8 @@ def edge_response(distance: npt.ArrayLike, angle: float, blur_px: float) -> Floa
 
     Notes
     -----
-    Projected to the normal, the square is the convolution of two boxes of widths |cos| and |sin|. The integral of the
-    normal distribution is z Phi(z) + phi(z), its integral ((z^2 + 1) Phi(z) + z phi(z)) / 2.
+    Projected to the normal, the square is the convolution of two boxes of widths abs(cos) and abs(sin). The integral of
+    the normal distribution is z Phi(z) + phi(z), its integral ((z^2 + 1) Phi(z) + z phi(z)) / 2.
     """
     d = np.asarray(distance, np.float64)
     wide, narrow = sorted((abs(math.cos(angle)), abs(math.sin(angle))), reverse=True)

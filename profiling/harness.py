@@ -49,7 +49,7 @@ OPERATIONS = {
     "blob": "blob",
     "line_fit": "line_fit",
     "pose": "board_pose",
-    "servo": "feature_pose",
+    "servo": "servo",
     "registration": "registration",
     "mitsuba": "mitsuba",
     "launch": "launch",

@@ -105,7 +105,7 @@ class BoundFeatures:
         for array, host in zip(bound.inputs, (self.frame, self._pose, self._corner), strict=True):
             cl.enqueue_copy(queue, memory_of(array), host, is_blocking=False)
         bound()
-        for output, target in zip(bound.outputs, self._result, strict=True):
-            cl.enqueue_copy(queue, target, memory_of(output), is_blocking=False)
+        for name, output in bound.outputs._asdict().items():
+            cl.enqueue_copy(queue, getattr(self._result, name), memory_of(output), is_blocking=False)
         queue.finish()
         return self._result

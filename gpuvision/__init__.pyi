@@ -213,6 +213,9 @@ from .matching.field.located_robot import (
 from .matching.field.odometry import (
     PoseEstimate as PoseEstimate,
 )
+from .matching.field.robot_filter import (
+    RobotFilter as RobotFilter,
+)
 from .matching.pose.board_pose import (
     BoardPoseEstimate as BoardPoseEstimate,
 )

@@ -1,0 +1,167 @@
+"""A robot's pose over time: Bayes' rule against SciPy, delayed views, symmetric poses, and kidnapping."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from gpuvision.formats.field_file import read_field
+from gpuvision.matching.field.field_pose import PoseCandidate
+from gpuvision.matching.field.odometry import PoseEstimate, predict
+from gpuvision.matching.field.robot_filter import RobotFilter, RobotFilterLimits
+from gpuvision.status import Status
+
+FIELD = read_field("robocup_msl")
+VIEW = np.diag([0.03, 0.03, 0.01]) ** 2  # covariance of a view
+STEP = np.diag([0.01, 0.01, 0.005]) ** 2  # of the odometry of a step
+START = PoseEstimate(np.array([2.0, 1.0, 0.3]), np.diag([0.05, 0.05, 0.02]) ** 2)
+
+
+def candidate(pose: np.ndarray, covariance: np.ndarray = VIEW, status: Status = Status.OK) -> PoseCandidate:
+    return PoseCandidate(np.asarray(pose), covariance, np.linalg.inv(covariance), 0.1, 0.02, 0.9, None, status)
+
+
+def twin(pose: np.ndarray) -> np.ndarray:
+    return np.array([-pose[0], -pose[1], math.remainder(pose[2] + math.pi, 2 * math.pi)])
+
+
+def moved(pose: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    return predict(PoseEstimate(pose, np.zeros((3, 3))), motion, np.zeros((3, 3))).pose
+
+
+def drive(robot: RobotFilter, true: np.ndarray, steps: int, rng: np.random.Generator, begin: float) -> list[np.ndarray]:
+    """Move a robot along a curve; return its true poses, at intervals of 0.1 s."""
+    poses = []
+    for number in range(1, steps + 1):
+        motion = np.array([0.1, 0.01, 0.03])
+        true = moved(true, motion)
+        robot.move(begin + 0.1 * number, rng.multivariate_normal(motion, STEP), STEP)
+        poses.append(true)
+    return poses
+
+
+def test_probabilities_are_those_of_bayes() -> None:
+    limits = RobotFilterLimits(carried=0.2, wrong_view=0.3, dropped=1e-12)
+    robot = RobotFilter(FIELD, START, limits=limits)
+    seen = [np.add(START.pose, (0.04, -0.05, 0.01)), twin(START.pose)]
+    assert robot.see(0.0, [candidate(each) for each in seen])
+    anywhere = 1 / (FIELD.length * FIELD.width * 2 * math.pi)
+    fits = multivariate_normal(START.pose, START.covariance + VIEW).pdf(seen[0])
+    belongs = 0.8 * 0.7 / 2 * fits
+    wrong, carried = 0.8 * 0.3 * anywhere, 0.2 * 0.7 / 2 * anywhere
+    # The hypotheses of a wrong view, and of a robot carried to the first candidate, are merged into the corrected one.
+    whole = belongs + wrong + 2 * carried
+    state = robot.state()
+    assert state.probability == pytest.approx((belongs + wrong + carried) / whole, rel=1e-12)
+    assert state.hypotheses[1].probability == pytest.approx(carried / whole, rel=1e-9)
+    assert state.status == Status.OK
+    gain = START.covariance @ np.linalg.inv(START.covariance + VIEW)
+    np.testing.assert_allclose(state.pose, START.pose + gain @ (seen[0] - START.pose), rtol=1e-9)
+    np.testing.assert_allclose(state.covariance, (np.eye(3) - gain) @ START.covariance, rtol=1e-9)
+
+
+def test_a_delayed_view_counts_at_its_time() -> None:
+    """Views that arrive late give the state of views in time, also in the middle of a motion."""
+    late, prompt = RobotFilter(FIELD, START), RobotFilter(FIELD, START)
+    motion, half = np.array([0.2, 0.0, 0.1]), 0.5
+    view = candidate(np.add(START.pose, (0.12, 0.02, 0.06)))
+    prompt.move(0.05, half * motion, half * STEP)
+    prompt.see(0.05, [view])
+    prompt.move(0.1, half * motion, half * STEP)
+    prompt.move(0.2, motion, STEP)
+    late.move(0.1, motion, STEP)
+    late.move(0.2, motion, STEP)
+    assert late.see(0.05, [view])
+    for ours, theirs in zip(late.state()[1:4], prompt.state()[1:4], strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+    assert not late.see(0.05, [view])  # the same view twice
+    assert not late.see(0.01, [view])  # older than the last one
+
+
+def test_errors_are_as_predicted(rng: np.random.Generator) -> None:
+    """Squared Mahalanobis distances of 150 independent runs: chi square of 450 degrees of freedom, 5 sigma."""
+    total = 0.0
+    for _ in range(150):
+        robot = RobotFilter(FIELD, START)
+        true = rng.multivariate_normal(*START)
+        begin = 0.0
+        for _ in range(3):
+            poses = drive(robot, true, 4, rng, begin)
+            seen = rng.multivariate_normal(poses[1], VIEW)  # two steps ago
+            robot.see(begin + 0.2, [candidate(twin(seen)), candidate(seen)])
+            true, begin = poses[-1], begin + 0.4
+        state = robot.state()
+        error = state.pose - true
+        error[2] = math.remainder(error[2], 2 * math.pi)
+        total += error @ np.linalg.solve(state.covariance, error)
+        assert state.status == Status.OK
+    assert abs(total - 450) < 5 * math.sqrt(2 * 450)
+
+
+def test_a_symmetric_field_keeps_two_poses_without_a_first_one(rng: np.random.Generator) -> None:
+    robot, true, begin = RobotFilter(FIELD), START.pose, 0.0
+    assert robot.state().status == Status.NO_DATA
+    assert np.isnan(robot.state().pose).all()
+    for _ in range(5):
+        poses = drive(robot, true, 2, rng, begin)
+        true, begin = poses[-1], begin + 0.2
+        robot.see(begin, [candidate(true), candidate(twin(true))])
+    state = robot.state()
+    assert state.status == Status.AMBIGUOUS
+    assert state.hypotheses[0].probability == pytest.approx(0.5, abs=0.01)
+    assert state.hypotheses[1].probability == pytest.approx(0.5, abs=0.01)
+    for each, expected in zip((true, twin(true)), (0, 1), strict=True):
+        assert min(np.abs(h.estimate.pose[:2] - each[:2]).max() for h in state.hypotheses[:2]) < 0.1, expected
+
+
+def test_one_wrong_view_does_not_carry_the_robot_away(rng: np.random.Generator) -> None:
+    robot = RobotFilter(FIELD, START)
+    for number in range(4):
+        robot.see(0.1 * number, [candidate(START.pose if number != 2 else (-3.0, 4.0, 1.0))])
+        robot.move(0.1 * (number + 1), np.zeros(3), STEP)
+    state = robot.state()
+    assert state.status == Status.OK
+    assert np.abs(state.pose - START.pose).max() < 0.1
+
+
+def test_a_kidnapped_robot_is_found_again(rng: np.random.Generator) -> None:
+    robot, there = RobotFilter(FIELD, START), np.array([-3.0, 4.0, 1.0])
+    robot.see(0.0, [candidate(START.pose)])
+    found = []
+    for number in range(1, 5):
+        robot.move(0.1 * number, np.zeros(3), STEP)
+        robot.see(0.1 * number, [candidate(rng.multivariate_normal(there, VIEW))])
+        state = robot.state()
+        found.append(bool(np.abs(state.pose - there).max() < 0.15 and state.status == Status.OK))
+    assert found == [False, True, True, True]
+    assert np.abs(robot.state().pose - there).max() < 0.1
+
+
+def test_refused_views_and_single_lines(rng: np.random.Generator) -> None:
+    robot = RobotFilter(FIELD, START)
+    robot.see(0.0, [])
+    np.testing.assert_array_equal(robot.state().pose, START.pose)
+    line = candidate(np.add(START.pose, (1.0, 0.1, 0.0)))._replace(
+        information=np.diag([0.0, 1e6, 1e6]), status=Status.AMBIGUOUS
+    )
+    robot.move(0.1, np.zeros(3), 1e-12 * np.eye(3))
+    robot.see(0.1, [line])
+    np.testing.assert_allclose(robot.state().pose, np.add(START.pose, (0.0, 0.1, 0.0)), atol=1e-3)
+    far = line._replace(pose=np.add(START.pose, (0.0, 5.0, 0.0)))
+    robot.move(0.2, np.zeros(3), 1e-12 * np.eye(3))
+    robot.see(0.2, [far])
+    np.testing.assert_allclose(robot.state().pose, np.add(START.pose, (0.0, 0.1, 0.0)), atol=1e-3)
+
+
+def test_wrong_times_are_refused() -> None:
+    robot = RobotFilter(FIELD, START)
+    robot.move(0.1, np.zeros(3), STEP)
+    with pytest.raises(ValueError, match="expected a time after"):
+        robot.move(0.1, np.zeros(3), STEP)
+    with pytest.raises(ValueError, match="give the motion first"):
+        robot.see(0.2, [])
+    with pytest.raises(ValueError, match="time"):
+        robot.state(0.5)

@@ -133,17 +133,18 @@ def reject_unused(reason: str, **given: object) -> None:
 _UNITS = {
     "m": {"": 1.0, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
     "rad": {"": 1.0, "rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180},
+    "s": {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
 }
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµ]*)\s*")
 
 
 def quantities(text: str, option: str, units: str) -> tuple[float, ...]:
-    """Parse comma-separated quantities and return them in metres and radians.
+    """Parse comma-separated quantities and return them in metres, radians and seconds.
 
     Parameters
     ----------
     text : str
-        Numbers with optional units, such as "1.5e-3,2mm,90deg". Units: m, cm, mm, um; rad, mrad, deg.
+        Numbers with optional units, such as "1.5e-3,2mm,90deg". Units: m, cm, mm, um; rad, mrad, deg; s, ms, us.
     option : str
         Name of the option, for the error message.
     units : str
@@ -152,7 +153,7 @@ def quantities(text: str, option: str, units: str) -> tuple[float, ...]:
     Returns
     -------
     tuple of float
-        One value per unit [m] or [rad].
+        One value per unit [m], [rad] or [s].
 
     Raises
     ------
@@ -170,7 +171,7 @@ def quantities(text: str, option: str, units: str) -> tuple[float, ...]:
             if not all(map(math.isfinite, values)):
                 raise ValueError(f"{option} is {text!r}, expected finite numbers")
             return values
-    ends = {"m": "m (or cm, mm, um)", "rad": "rad (or mrad, deg)"}
+    ends = {"m": "m (or cm, mm, um)", "rad": "rad (or mrad, deg)", "s": "s (or ms, us)"}
     expected = ", ".join(ends[kind] for kind in kinds)
     raise ValueError(f"{option} is {text!r}, expected {len(kinds)} number{'s' * (len(kinds) > 1)}: {expected}")
 

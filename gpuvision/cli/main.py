@@ -33,6 +33,7 @@ def application() -> typer.Typer:
     import typer
 
     from gpuvision.cli.calibrate import calibrate
+    from gpuvision.cli.delay import delay
     from gpuvision.cli.demo import demo
     from gpuvision.cli.devices import devices
     from gpuvision.cli.inspect import inspect
@@ -64,6 +65,7 @@ def application() -> typer.Typer:
         locate,
         locate_robot,
         inspect,
+        delay,
         demo,
         devices,
         profile,

@@ -1,0 +1,227 @@
+"""Analysis of the delay of a servo loop from its parts or from a recording: limits, gains, margins, picture, report."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpuvision.formats.json import json_tree
+from gpuvision.formats.loop_recording import LoopRecording
+from gpuvision.host.files import write_text_atomic
+from gpuvision.host.outputs import Outputs
+from gpuvision.plots.servoing import DelayPicture, draw_delay, draw_measured_delay
+from gpuvision.servoing.controllers import PidGains, gains_without_oscillation, simc_gains
+from gpuvision.servoing.delay import DelayBudget, continuous_gains, gain_limit
+from gpuvision.servoing.delay_measurement import MeasuredDelay, measure_delay
+from gpuvision.servoing.delay_response import (
+    delay_against_frame_time,
+    jitter_gain_limit,
+    normal_delays,
+    root_locus,
+    settling_frames,
+    step_response,
+)
+from gpuvision.servoing.margins import margins, predictor_tolerance
+from gpuvision.validation import finite
+
+DELAY_FILES = ("delay.png", "report.json")
+"""Names of the files that `DelayAnalysis.write` always writes."""
+MEASURED_PICTURE = "measured_delay.png"
+"""Name of the picture of a recording."""
+
+# Gains of a loop with a predictor whose tolerated model errors are reported: fractions of the predicted error.
+_PREDICTOR_GAINS = (0.2, 0.5, 0.8)
+# Remaining error of the reported settling time, and frames of the drawn step responses.
+_SETTLED, _FRAMES = 0.01, 40
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelayAnalysis:
+    """Delay of a servo loop and its consequences.
+
+    Attributes
+    ----------
+    budget : DelayBudget
+        Parts of the delay. With a recording and no other parts: one stage, the measured delay.
+    measured : MeasuredDelay or None
+        Delay of the recording.
+    recording : LoopRecording or None
+        The recording.
+    jitter : float
+        Standard deviation of the delay [s].
+    """
+
+    budget: DelayBudget
+    measured: MeasuredDelay | None
+    recording: LoopRecording | None
+    jitter: float
+
+    @property
+    def delay(self) -> float:
+        """Delay from the middle of the exposure to the command [s]: the measured one if there is a recording."""
+        return self.budget.latency if self.measured is None else self.measured.mean
+
+    @property
+    def frames(self) -> float:
+        """Delay in frames."""
+        return self.delay / self.budget.period
+
+    def gains(self) -> dict[str, PidGains]:
+        """Return the gains by each rule."""
+        total = self.delay + self.budget.period / 2.0
+        return {
+            "non_oscillating": gains_without_oscillation(self.delay, self.budget.period),
+            "simc_p": simc_gains(total, integral=False),
+            "simc_pi": simc_gains(total),
+        }
+
+    def summary(self) -> str:
+        """Return one line: delay, limits and bandwidth."""
+        best, period = self.gains()["non_oscillating"].proportional, self.budget.period
+        return (
+            f"delay {1e3 * self.delay:.4g} ms = {self.frames:.3g} frames of {1e3 * period:.4g} ms: "
+            f"unstable from {gain_limit(self.frames) / period:.4g} /s on, no oscillation up to {best:.4g} /s "
+            f"({best / (2.0 * math.pi):.3g} Hz)"
+        )
+
+    def report(self) -> dict[str, Any]:
+        """Return the content of ``report.json``."""
+        period, frames = self.budget.period, self.frames
+        continuous = continuous_gains(self.delay + period / 2.0)
+        best = self.gains()["non_oscillating"].proportional * period
+        tree: dict[str, Any] = {
+            "gpuvision": version("gpuvision"),
+            "period_s": period,
+            "parts_s": self.budget.parts,
+            "delay_s": self.delay,
+            "delay_frames": frames,
+            "total_delay_s": self.delay + period / 2.0,
+            "jitter_s": self.jitter,
+            "limit_per_frame": gain_limit(frames),
+            "limit_with_jitter_per_frame": self._jitter_limit(),
+            "non_oscillating_per_frame": best,
+            "settling_frames_to_1_percent": settling_frames(frames, best, _SETTLED),
+            "continuous_limit_per_s": continuous.limit,
+            "continuous_critical_per_s": continuous.critical,
+            "rules": {name: self._rule(gains) for name, gains in self.gains().items()},
+            "predictor": [self._predictor(gain) for gain in _PREDICTOR_GAINS],
+        }
+        if self.measured is not None:
+            tree["measured"] = {
+                "mean_s": self.measured.mean,
+                "mean_sigma_s": self.measured.mean_sigma,
+                "jitter_s": self.measured.jitter,
+                "jitter_sigma_s": self.measured.jitter_sigma,
+                "scale": self.measured.scale,
+                "noise": self.measured.noise,
+                "beyond_the_budget_s": self.measured.mean - self.budget.latency,
+            }
+        return dict(json_tree(tree))
+
+    def _jitter_limit(self) -> float:
+        sigma = self.jitter / self.budget.period
+        return jitter_gain_limit(*normal_delays(self.frames, sigma)) if sigma else gain_limit(self.frames)
+
+    def _rule(self, gains: PidGains) -> dict[str, float]:
+        found = margins(gains, self.delay, self.budget.period)
+        return {
+            "proportional_per_s": gains.proportional,
+            "integral_s": gains.integral,
+            "gain_margin": found.gain,
+            "phase_margin_rad": found.phase,
+            "delay_margin_s": found.delay,
+            "modulus_margin": found.modulus,
+            "crossover_Hz": found.crossover,
+        }
+
+    def _predictor(self, gain: float) -> dict[str, float]:
+        found, period = predictor_tolerance(gain, self.frames), self.budget.period
+        return {
+            "gain_per_frame": gain,
+            "unstable_from_shorter_by_s": found.shorter * period,
+            "unstable_from_longer_by_s": found.longer * period,
+            "unstable_from_plant_gain": found.plant_gain,
+        }
+
+    def picture(self) -> DelayPicture:
+        """Return the data of ``delay.png``."""
+        limit, period = gain_limit(self.frames), self.budget.period
+        chosen = {
+            "no oscillation": self.gains()["non_oscillating"].proportional * period,
+            "half of the limit": 0.5 * limit,
+            "90 % of the limit": 0.9 * limit,
+        }
+        labels = {f"{name}: gain {gain:.3g}": gain for name, gain in chosen.items()}
+        return DelayPicture(
+            title=self.summary(),
+            parts=self.budget.parts,
+            steps=[(label, step_response(self.frames, gain, _FRAMES)) for label, gain in labels.items()],
+            locus=root_locus(self.frames, np.linspace(0.0, 1.3, 400)[1:] * limit),
+            marked=[(label, root_locus(self.frames, gain)[0]) for label, gain in labels.items()],
+            curve=delay_against_frame_time(self.budget, period * np.geomspace(0.1, 10.0, 60)),
+            period=period,
+        )
+
+    def write(self, folder: str | Path, *, inputs: tuple[Path, ...] = (), overwrite: bool = False) -> None:
+        """Write ``delay.png``, ``report.json`` and, with a recording, ``measured_delay.png``.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Output folder; created if it is missing.
+        inputs : tuple of Path
+            Files that are never replaced.
+        overwrite : bool
+            Whether files may be replaced that no earlier analysis wrote. Default False.
+
+        Raises
+        ------
+        OSError
+            A file exists that is not an output of an earlier analysis, or the folder cannot be written.
+        """
+        outputs = Outputs("delay", inputs=inputs, overwrite=overwrite)
+        with outputs.folder(folder, optional=[MEASURED_PICTURE]) as inside:
+            draw_delay(inside / DELAY_FILES[0], self.picture())
+            if self.measured is not None and self.recording is not None:
+                draw_measured_delay(inside / MEASURED_PICTURE, *self.recording, self.measured)
+            write_text_atomic(inside / DELAY_FILES[1], json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
+
+
+def analyse_delay(
+    budget: DelayBudget | None = None, *, recording: LoopRecording | None = None, jitter: float | None = None
+) -> DelayAnalysis:
+    """Analyse the delay of a servo loop.
+
+    Parameters
+    ----------
+    budget : DelayBudget, optional
+        Parts of the delay. Default: the recording alone.
+    recording : LoopRecording, optional
+        Recording of an excited axis; its delay is measured and used instead of that of the budget.
+    jitter : float, optional
+        Standard deviation of the delay [s]. Default: that of the recording, or 0.
+
+    Raises
+    ------
+    ValueError
+        Neither a budget nor a recording is given, or the recording shows no delay; see `measure_delay`.
+    """
+    if budget is None and recording is None:
+        raise ValueError("give the parts of the delay, or a recording")
+    measured = None if recording is None else measure_delay(*recording)
+    if budget is None and measured is not None:
+        budget = DelayBudget(period=measured.mean / measured.frames, stages={"measured": measured.mean})
+    assert budget is not None
+    known = 0.0 if measured is None else measured.jitter
+    return DelayAnalysis(
+        budget=budget,
+        measured=measured,
+        recording=recording,
+        jitter=known if jitter is None else finite(jitter, "jitter", minimum=0.0),
+    )

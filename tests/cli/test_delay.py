@@ -1,0 +1,97 @@
+"""The command ``gpuvision delay``: analysis of parts and of a recording, refused options, files that are kept."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gpuvision.cli.main import application
+from gpuvision.servoing.delay import gain_limit
+from gpuvision.servoing.delay_measurement import excitation
+from gpuvision.workflows import analysing_delay
+
+PERIOD = 1e-3
+
+
+def run(*words: object) -> str:
+    done = CliRunner().invoke(application(), ["delay", *map(str, words)])
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+def write_recording(path: Path, delay: float) -> None:
+    time = PERIOD * np.arange(300)
+    command = np.concatenate([[0.0], np.cumsum(excitation(299, 0.02)) * PERIOD])
+    measured = np.interp(time - delay, time, command) + 1e-6 * np.random.default_rng(0).standard_normal(300)
+    rows = [f"{t:.9g},{c:.9g},{m:.9g}" for t, c, m in zip(time, command, measured, strict=True)]
+    path.write_text("\n".join(["time,command,measured", *rows]) + "\n")
+
+
+@pytest.fixture
+def quick_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write a few bytes instead of the picture, whose drawing takes most of the time."""
+    monkeypatch.setattr(analysing_delay, "draw_delay", lambda path, _: Path(path).write_bytes(b"a picture"))
+
+
+def test_parts_and_a_recording(tmp_path: Path) -> None:
+    """The recording measures 0.4 ms more than the parts sum up to."""
+    write_recording(tmp_path / "loop.csv", 2.4e-3)
+    parts = ("--rate", 1000, "--exposure", "200us", "--readout", "0.9ms", "--transfer", "0.5ms", "--stage", "all=0.5ms")
+    said = run(*parts, "--recording", tmp_path / "loop.csv", "--out", tmp_path / "out")
+    assert "frames of 1 ms" in said
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert sum(report["parts_s"].values()) == pytest.approx(2.5e-3)
+    assert report["measured"]["beyond_the_budget_s"] == pytest.approx(0.4e-3, abs=2e-5)
+    assert report["delay_frames"] == pytest.approx(2.4, abs=0.02)
+    assert report["limit_per_frame"] == pytest.approx(gain_limit(report["delay_frames"]))
+    assert report["rules"]["non_oscillating"]["gain_margin"] == pytest.approx(
+        report["limit_per_frame"] / report["non_oscillating_per_frame"], rel=1e-6
+    )
+    for name in ("delay.png", "measured_delay.png"):
+        assert (tmp_path / "out" / name).stat().st_size > 10_000
+
+
+def test_sensor_gives_the_readout(tmp_path: Path, quick_picture: None) -> None:
+    parts = ("--rate", 1000, "--exposure", "200us", "--sensor", "pb1024", "--jitter", "0.2ms", "--json", "-")
+    delays = []
+    for roi in ("128x128", "256x256"):
+        report = json.loads(run(*parts, "--roi", roi, "--out", tmp_path / roi))
+        delays.append(report["delay_s"])
+        assert report["limit_with_jitter_per_frame"] != report["limit_per_frame"]
+        assert not (tmp_path / roi / "measured_delay.png").exists()
+    assert 1e-4 < delays[0] < delays[1] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "give --rate and the parts of the delay, or --recording"),
+        (("--exposure", "1ms"), "--exposure has no effect without --rate"),
+        (("--rate", "1000", "--stage", "edges"), "--stage is 'edges'"),
+        (("--rate", "1000", "--exposure", "1mm"), "--exposure is '1mm', expected 1 number: s"),
+        (("--rate", "1000", "--roi", "8x8"), "--roi has no effect without --sensor"),
+        (("--rate", "1000", "--sensor", "pb1024", "--readout", "1ms"), "--readout has no effect with --sensor"),
+        (("--rate", "1000", "--sensor", "pb1024", "--exposure", "1us", "--roi", "8by8"), "--roi is '8by8'"),
+        (("--rate", "90000", "--sensor", "pb1024", "--exposure", "1us"), "--rate is 90000; lower --roi"),
+    ],
+)
+def test_options_are_checked(tmp_path: Path, words: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        run(*words, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_foreign_files_are_kept(tmp_path: Path, quick_picture: None) -> None:
+    (tmp_path / "report.json").write_text("mine")
+    with pytest.raises(FileExistsError, match="--overwrite"):
+        run("--rate", 1000, "--out", tmp_path)
+    assert (tmp_path / "report.json").read_text() == "mine"
+    run("--rate", 1000, "--out", tmp_path, "--overwrite")
+    assert (tmp_path / "report.json").read_text() != "mine"
+    run("--rate", 500, "--out", tmp_path)

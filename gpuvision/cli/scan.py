@@ -109,6 +109,15 @@ TraceFile = Annotated[
 ]
 
 
+EncoderFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        parser=named_path,
+        help="Encoder file of this recording: a count for each profile. It replaces the encoder file or the step of "
+        "the sensor file, which gives the size of a count.",
+    ),
+]
 Preview = Annotated[
     bool,
     typer.Option(
@@ -131,6 +140,7 @@ def scan(
     policy: RoomPolicy = None,
     formats: SurfaceFiles = None,
     ply: PlyFile = PlyPoints.organised,
+    encoder: EncoderFile = None,
     trace: TraceFile = None,
     preview: Preview = False,
     as_json: ReportFile = None,
@@ -149,7 +159,7 @@ def scan(
     from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES, surface_files
     from gpuvision.workflows.scanning import scan as run
 
-    described = Sensor.load(sensor)
+    described = Sensor.load(sensor, encoder=encoder)
     inputs: list[str | Path] = [recording, sensor, *described.files]
     if preview:
         reject_unused(

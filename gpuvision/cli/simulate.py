@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -198,7 +199,7 @@ def simulate(
         "device": None if device is None else Device.named(device),
         "scheduler": scheduler,
     }
-    summary, report = _run(task, other, rule or Rule.stronger, out, made, f"simulating {part.name}", overwrite)
+    summary, report = _run(task, other, rule or Rule.stronger, out, made, f"simulating {part.name}", read, overwrite)
     write_report(as_json, report, outputs)
     echo(
         f"{summary}\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}",
@@ -248,6 +249,7 @@ def _run(
     out: Path,
     made: dict[str, Any],
     description: str,
+    inputs: Sequence[str | Path],
     overwrite: bool,
 ) -> tuple[str, dict[str, Any]]:
     """Simulate one sensor or two, write the results, and return the summary and the first sensor's report."""
@@ -261,8 +263,8 @@ def _run(
     if other is not None:
         with progress_bar(f"{description}, second sensor") as progress:
             pair = SensorPair.fuse(done, run(other, out, progress=progress, **made), SensorFusion(rule=rule.value))
-        pair.write(out, overwrite=overwrite)
+        pair.write(out, inputs=inputs, overwrite=overwrite)
         summary += f"\n{pair.summary()}"
         scale = pair.picture_scale
-    done.write(out, overwrite=overwrite, scale=scale)
+    done.write(out, inputs=inputs, overwrite=overwrite, scale=scale)
     return summary, done.report()

@@ -58,6 +58,38 @@ class EncoderStatistics:
         )
 
 
+def unwrapped_counts(counts: npt.ArrayLike, bits: int, what: str = "the encoder") -> Float64:
+    """Return the counts of a counter that wraps around, without the jumps.
+
+    Parameters
+    ----------
+    counts : array_like
+        (profiles,): counts of a counter of some bits, unsigned or signed (two's complement).
+    bits : int
+        Bits of the counter: after ``2**bits`` counts it starts again.
+    what : str
+        Name of the counter for messages.
+
+    Returns
+    -------
+    numpy.ndarray
+        (profiles,) float64: the first count, and from there the sums of the steps. A step is taken as the shorter way,
+        less than ``2**(bits - 1)`` counts.
+
+    Raises
+    ------
+    ValueError
+        A count does not fit the bits.
+    """
+    read = np.asarray(counts, dtype=np.float64)
+    lowest, highest = -(2.0 ** (bits - 1)), 2.0**bits
+    wrong = (read < lowest) | (read >= highest)
+    if np.any(wrong):
+        place = int(np.argmax(wrong))
+        raise ValueError(f"{what}: count {read[place]:.0f} of profile {place} does not fit {bits} bits")
+    return np.asarray(np.unwrap(read, period=2.0**bits))
+
+
 def not_advancing(positions: npt.ArrayLike) -> npt.NDArray[np.bool_]:
     """Find the profiles that do not advance: the smallest set without which the positions are strictly monotone.
 

@@ -161,7 +161,8 @@ class Sensor:
     rotating_sigma
         Standard deviations of the calibration of a rotating sheet, if the file has them (``[transport.sigma]``).
     files
-        Files that the sensor file names: background image, camera or lens, encoder. No command replaces one of them.
+        The sensor file, and the files that it names: background image, camera or lens, encoder. No command replaces one
+        of them.
     """
 
     name: str
@@ -179,8 +180,16 @@ class Sensor:
     files: tuple[Path, ...] = field(default=(), compare=False)
 
     @classmethod
-    def load(cls, path: str | Path) -> Sensor:
+    def load(cls, path: str | Path, *, encoder: str | Path | None = None) -> Sensor:
         """Read a sensor from a TOML file, or a sensor of the package by its name (``"corner_scene"``).
+
+        Parameters
+        ----------
+        path : str or Path
+            File, or name of a sensor of the package.
+        encoder : str or Path, optional
+            Encoder file of one recording. It replaces ``[transport] encoder`` or the step; the file gives the size of a
+            count. A relative name refers to the current folder.
 
         Raises
         ------
@@ -194,17 +203,18 @@ class Sensor:
         }
         if str(path) in brought:
             with resources.as_file(brought[str(path)]) as file:
-                return cls.from_section(read_toml(file))
+                return cls.from_section(read_toml(file), encoder=encoder)
         path = Path(path)
         if not path.exists():
             close = difflib.get_close_matches(path.stem, brought, 1)
             hint = f"did you mean '{close[0]}'?" if close else f"give a file or one of {', '.join(sorted(brought))}"
             raise FileNotFoundError(f"there is no sensor file {path}; {hint}")
-        return cls.from_section(read_toml(path))
+        read = cls.from_section(read_toml(path), encoder=encoder)
+        return replace(read, files=(path, *read.files))
 
     @classmethod
-    def from_section(cls, top: Section) -> Sensor:
-        """Read a sensor from an opened description.
+    def from_section(cls, top: Section, *, encoder: str | Path | None = None) -> Sensor:
+        """Read a sensor from an opened description; `encoder` as for `load`.
 
         Raises
         ------
@@ -212,7 +222,7 @@ class Sensor:
             See `load`.
         """
         try:
-            sensor = cls._read(top)
+            sensor = cls._read(top, None if encoder is None else Path(encoder))
         except DescriptionError:
             raise
         except (TypeError, ValueError, OverflowError) as error:
@@ -220,11 +230,13 @@ class Sensor:
         return sensor
 
     @classmethod
-    def _read(cls, top: Section) -> Sensor:
+    def _read(cls, top: Section, encoder_file: Path | None) -> Sensor:
         kind = top.choice("kind", ("camera", "psd", "focus"))
         name = top.text("name", "")
         recording = _recording(kind, top.optional_section("recording"))
         if kind == "focus":
+            if encoder_file is not None:
+                raise top.error("a focus stack has no transport; an encoder file has no effect on it")
             return cls._read_focus(top, name, recording)
         readout = top.section("line" if kind == "camera" else "psd")
         along: Along = readout.choice("along", ("columns", "rows"), "columns") if kind == "camera" else "columns"
@@ -237,7 +249,9 @@ class Sensor:
         )
         axes = SampleAxes() if is_rotating else _axes(top.optional_section("axes"))
         optics = read_optics(top, kind, frame, along, axes)
-        transport, encoder, rotating_sigma = read_transport(moving, optics, along, is_rotating=is_rotating)
+        transport, encoder, rotating_sigma = read_transport(
+            moving, optics, along, is_rotating=is_rotating, encoder_file=encoder_file
+        )
         if not is_rotating:
             region = _region(kind, top, frame, along, axes, readout)
             sheet, bend = read_triangulation(top.section("triangulation"), optics, region, along)
@@ -264,7 +278,7 @@ class Sensor:
             polygon=polygon,
             noise_known=noise_known,
             rotating_sigma=rotating_sigma,
-            files=top.files,
+            files=top.files if encoder_file is None else (*top.files, encoder_file),
         )
 
     @classmethod

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.formats.encoder_file import read_encoder
-from gpuvision.ranging.encoder import EncoderStatistics, not_advancing
+from gpuvision.ranging.encoder import EncoderStatistics, not_advancing, unwrapped_counts
 from gpuvision.ranging.range_image import RotatingSheet, StraightTransport, Vector
 from gpuvision.ranging.rotating_sigma import RotatingSheetSigma
 from gpuvision.ranging.triangulation import Along
@@ -19,6 +19,7 @@ from gpuvision.schema import Section
 from gpuvision.sensor.optics import Optics
 
 Transport = StraightTransport | RotatingSheet
+_LONGEST_COUNTER = 52  # bits of a count that is exact in a double
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +61,7 @@ class Encoder:
 
 
 def read_transport(
-    table: Section, optics: Optics, along: Along, *, is_rotating: bool
+    table: Section, optics: Optics, along: Along, *, is_rotating: bool, encoder_file: Path | None = None
 ) -> tuple[Transport, Encoder | None, RotatingSheetSigma | None]:
     """Read the table ``[transport]``.
 
@@ -74,6 +75,8 @@ def read_transport(
         Image axis along which the samples of a profile run.
     is_rotating : bool
         Whether the sheet of light turns.
+    encoder_file : Path, optional
+        Encoder file of this recording, for the one that the table may name.
 
     Returns
     -------
@@ -93,10 +96,10 @@ def read_transport(
     transport: Transport
     sigma = None
     if is_rotating:
-        transport, encoder = _rotating(table, optics, along)
+        transport, encoder = _rotating(table, optics, along, encoder_file)
         sigma = _rotating_sigma(table.optional_section("sigma"))
     else:
-        transport, encoder = _straight(table)
+        transport, encoder = _straight(table, encoder_file)
     table.finish()
     return transport, encoder, sigma
 
@@ -107,10 +110,10 @@ def read_vector(table: Section, key: str, unit: str, default: tuple[float, ...] 
     return x, y, z
 
 
-def _straight(table: Section) -> tuple[StraightTransport, Encoder | None]:
+def _straight(table: Section, encoder_file: Path | None) -> tuple[StraightTransport, Encoder | None]:
     default = StraightTransport()
     start = table.number("start", "m", 0.0)
-    encoder = _encoder(table, start, "metres_per_count", "m per count", "step")
+    encoder = _encoder(table, encoder_file, start, "metres_per_count", "m per count", "step")
     transport = StraightTransport(
         step=None if encoder is not None else table.number("step", "m per profile"),
         start=start,
@@ -124,14 +127,16 @@ def _straight(table: Section) -> tuple[StraightTransport, Encoder | None]:
     return transport, encoder
 
 
-def _rotating(table: Section, optics: Optics, along: Along) -> tuple[RotatingSheet, Encoder | None]:
+def _rotating(
+    table: Section, optics: Optics, along: Along, encoder_file: Path | None
+) -> tuple[RotatingSheet, Encoder | None]:
     pinhole: dict[str, Any] = {}
     if optics.camera is None:
         pinhole["focal_length_px"] = table.number("focal_length_px", "pixel", above=0.0)
         pinhole["principal_point_px"] = table.numbers("principal_point_px", "pixel", (2,))
     identity = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     first_angle = table.number("first_angle", "rad", at_least=-2 * math.pi, at_most=2 * math.pi)
-    encoder = _encoder(table, first_angle, "radians_per_count", "rad per count", "angle_step")
+    encoder = _encoder(table, encoder_file, first_angle, "radians_per_count", "rad per count", "angle_step")
     limits: dict[str, Any] = {"above": -math.pi, "below": math.pi}
     sheet = RotatingSheet(
         along=along,
@@ -163,15 +168,26 @@ def _rotating_sigma(table: Section | None) -> RotatingSheetSigma | None:
     return sigma
 
 
-def _encoder(table: Section, start: float, scale_key: str, unit: str, step_key: str) -> Encoder | None:
-    """Read an encoder: its positions are ``start + scale counts``."""
-    if "encoder" not in table:
-        return None
-    if step_key in table:
-        raise table.error(f"[{table.name}] has encoder and {step_key} at once, expected one of them")
-    file = table.file("encoder")
+def _encoder(
+    table: Section, given: Path | None, start: float, scale_key: str, unit: str, step_key: str
+) -> Encoder | None:
+    """Read an encoder: its positions are ``start + scale counts``. A given file replaces the table's file or step."""
     key = table.text("encoder_key", None)
+    bits = table.integer("encoder_bits", None, at_least=2, at_most=_LONGEST_COUNTER)
+    if "encoder" in table and step_key in table:
+        raise table.error(f"[{table.name}] has encoder and {step_key} at once, expected one of them")
+    file = table.file("encoder") if "encoder" in table else None
+    if file is None and given is None:
+        table.number(scale_key, unit, None)  # for the recordings that have an encoder file
+        return None
+    if given is not None:
+        table.number(step_key, unit, None)
+        file = given
+    assert file is not None  # one of them is given
     scale = table.number(scale_key, unit)
     if scale == 0.0:
         raise table.error(f"{table.dotted(scale_key)} is 0, expected the size of a count [{unit}]")
-    return Encoder(file=file, scale=scale, positions=start + scale * read_encoder(file, key))
+    counts = read_encoder(file, key)
+    if bits is not None:
+        counts = unwrapped_counts(counts, bits, str(file))
+    return Encoder(file=file, scale=scale, positions=start + scale * counts)

@@ -70,7 +70,8 @@ def scan(
     policy : {"block", "drop_oldest", "raise"}, optional
         Handling of a frame when the queue is full; default "block" without a rate and "drop_oldest" with one.
     trace : str or Path, optional
-        Output file for the timeline of the stream. The path is checked before the scan.
+        Output file for the timeline of the stream. The path is checked before the scan; the recording and the files of
+        the sensor are never replaced.
     overwrite : bool
         Whether an existing file of `trace` may be replaced that no earlier trace wrote. Default False.
     progress : callable, optional
@@ -97,7 +98,10 @@ def scan(
         if rate is not None or policy is not None or trace is not None:
             raise ValueError("a focus stack is one measurement; rate, policy and trace have no effect on it")
         return _scan_stack(recording, sensor, sensor.readout, device, precision, progress, limits)
-    timeline = None if trace is None else _DeferredTrace(trace, overwrite)
+    timeline = None
+    if trace is not None:
+        read = [*sensor.files, *([Path(recording)] if isinstance(recording, str | Path) else [])]
+        timeline = _DeferredTrace(trace, read, overwrite)
     opened = open_for_scan(recording, sensor)
     source, name, sensor = opened.source, opened.name, opened.sensor
     try:
@@ -187,12 +191,12 @@ def _scan_stack(
 class _DeferredTrace(Trace):
     """Trace that writes its file after the scan: a scan that fails leaves no file.
 
-    The constructor checks that the file can be written.
+    The constructor checks that the file can be written and is no input.
     """
 
-    def __init__(self, path: str | Path, overwrite: bool) -> None:
+    def __init__(self, path: str | Path, inputs: Sequence[Path], overwrite: bool) -> None:
         super().__init__(path, overwrite=overwrite)
-        Outputs("trace", overwrite=overwrite).claim(path)
+        Outputs("trace", inputs=inputs, overwrite=overwrite).claim(path)
 
     def write(self) -> None:
         """Ignore the end of the stream: the scan ends later."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -108,13 +109,15 @@ class SensorPair:
         """Scale of the pictures of both sensors and of their fused readings, for comparison."""
         return PictureScale.of([self.first.attribution, self.second.attribution, self.errors["both"]], self.limit)
 
-    def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
+    def write(self, folder: str | Path, *, inputs: Sequence[str | Path] = (), overwrite: bool = False) -> None:
         """Write the second sensor's results into ``second``, and pictures and a report of both into ``both``.
 
         Parameters
         ----------
         folder
             Folder of the first sensor's results.
+        inputs
+            Files that were read, as for `Simulation.write`.
         overwrite
             Whether files may be replaced that no earlier simulation wrote. Default False.
 
@@ -125,9 +128,10 @@ class SensorPair:
         OSError
             The folders cannot be written.
         """
-        self.second.write(Path(folder) / "second", overwrite=overwrite, scale=self.picture_scale)
+        self.second.write(Path(folder) / "second", inputs=inputs, overwrite=overwrite, scale=self.picture_scale)
         both = self.errors["both"]
-        with Outputs("simulate", overwrite=overwrite).folder(Path(folder) / "both") as inside:
+        outputs = Outputs("simulate", inputs=inputs, overwrite=overwrite)
+        with outputs.folder(Path(folder) / "both") as inside:
             backward = self.first.moves_backward
             draw_errors(inside / "errors.png", both, "Both sensors", self.picture_scale, backward=backward)
             draw_causes(inside / "causes.png", both, "Both sensors", self.picture_scale, backward=backward)

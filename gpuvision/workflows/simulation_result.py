@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
@@ -145,17 +146,27 @@ class Simulation:
         """Whether the transport decreases with the profile number."""
         return bool(self.task.transports[-1] < self.task.transports[0])
 
-    def write(self, folder: str | Path, *, overwrite: bool = False, scale: PictureScale | None = None) -> None:
+    def write(
+        self,
+        folder: str | Path,
+        *,
+        inputs: Sequence[str | Path] = (),
+        overwrite: bool = False,
+        scale: PictureScale | None = None,
+    ) -> None:
         """Write the range image, pictures and the report into a folder, all or nothing.
 
         ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` hold the height map as it will be
         measured, ``range_image.ply`` the organised points, ``errors.png`` and ``causes.png`` the errors and their
-        causes, ``simulation.npz`` the arrays, ``report.json`` the report.
+        causes, ``simulation.npz`` the arrays, ``report.json`` the report. ``mask.txt`` holds a mask that was optimised;
+        the unchanged mask of an earlier simulation is removed.
 
         Parameters
         ----------
         folder : str or Path
             Output folder; created if it is missing.
+        inputs : sequence of path
+            Files that were read, such as a mask; with the files of the sensor they are never replaced or removed.
         overwrite : bool
             Whether files may be replaced that no earlier simulation wrote. Default False.
         scale : PictureScale, optional
@@ -171,7 +182,9 @@ class Simulation:
         attribution = self.attribution
         title = self.task.sensor.name or "Simulation"
         scale = PictureScale.of([attribution], self.limit) if scale is None else scale
-        with Outputs("simulate", overwrite=overwrite).folder(folder) as inside:
+        outputs = Outputs("simulate", inputs=[*inputs, *self.task.sensor.files], overwrite=overwrite)
+        # The mask of an earlier simulation would seem to belong to these readings.
+        with outputs.folder(folder, optional=[_MASK_FILE]) as inside:
             write_tiff(inside / "range_image.tiff", self.heights.z, self.grid)
             write_png16(inside / "range_image.png", self.heights.z, self.grid)
             write_ply(

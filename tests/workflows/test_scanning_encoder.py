@@ -14,6 +14,7 @@ import pytest
 import tomli_w
 
 from gpuvision.host import Device, to_numpy
+from gpuvision.schema import DescriptionError
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.workflows.scanning import scan
@@ -131,3 +132,55 @@ def test_the_file_of_the_encoder_is_never_replaced(
     )  # fmt: skip
     check_refused(ran, r"belt\.csv")
     assert (tmp_path / "belt.csv").read_bytes() == before
+
+
+def test_the_trace_never_replaces_a_file_of_the_scan(tmp_path: Path) -> None:
+    np.save(tmp_path / "belt.npy", currents(3))
+    path = sensor_file(tmp_path, range(3), metres_per_count=1e-4)
+    sensor = Sensor.load(path)
+    for file in (path, tmp_path / "belt.csv", tmp_path / "belt.npy"):
+        before = file.read_bytes()
+        with pytest.raises(FileExistsError, match="it is the input"):
+            scan(tmp_path / "belt.npy", sensor, trace=file, overwrite=True)
+        assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("first", "step", "signed"), [(250, 3, False), (5, -3, False), (120, 3, True), (-120, -3, True)]
+)
+def test_a_counter_of_8_bits_wraps_around(tmp_path: Path, first: int, step: int, signed: bool) -> None:
+    counts = first + step * np.arange(400)
+    read = (counts + 128) % 256 - 128 if signed else counts % 256
+    path = sensor_file(tmp_path, read, metres_per_count=1e-3, encoder_bits=8)
+    np.testing.assert_allclose(Sensor.load(path).transports(400), 1e-3 * counts, rtol=0, atol=1e-12)
+
+
+def test_a_count_beyond_the_bits(tmp_path: Path) -> None:
+    path = sensor_file(tmp_path, [1, 2, 256], metres_per_count=1e-3, encoder_bits=8)
+    with pytest.raises(DescriptionError, match="count 256 of profile 2 does not fit 8 bits"):
+        Sensor.load(path)
+
+
+def test_the_encoder_of_one_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """--encoder replaces the step, or the encoder file, of the sensor file; its file is an input."""
+    np.save(tmp_path / "belt.npy", currents(3))
+    (tmp_path / "today.csv").write_text("0\n10\n30\n")
+    table = copy.deepcopy(PSD)
+    table["transport"]["metres_per_count"] = 1e-4
+    (tmp_path / "step.toml").write_text(tomli_w.dumps(table))
+    assert Sensor.load(tmp_path / "step.toml").encoder is None
+    words: list[Any] = ["scan", tmp_path / "belt.npy", "--encoder", tmp_path / "today.csv", "--sensor"]
+    for file in (tmp_path / "step.toml", sensor_file(tmp_path, range(7), metres_per_count=1e-4)):
+        out = tmp_path / file.stem
+        ran = Ran(capsys, monkeypatch, *words, file, "--out", out)
+        assert ran.code == 0, ran.err
+        with np.load(out / "range_image.npz") as held:
+            np.testing.assert_allclose(held["y"][:, 0], [0.0, 1e-3, 3e-3], rtol=0, atol=1e-9)
+    ran = Ran(capsys, monkeypatch, *words, tmp_path / "step.toml", "--out", tmp_path / "out", "--overwrite",
+              "--json", tmp_path / "today.csv")  # fmt: skip
+    check_refused(ran, r"today\.csv")
+    (tmp_path / "plain.toml").write_text(tomli_w.dumps(PSD))
+    ran = Ran(capsys, monkeypatch, *words, tmp_path / "plain.toml", "--out", tmp_path / "out")
+    check_refused(ran, r"'transport\.metres_per_count' is missing")

@@ -108,6 +108,11 @@ def test_a_mask_made_for_the_part_helps(part_file: Path, light: Path, tmp_path: 
     assert rms[1] < rms[0]
     found.write(tmp_path)
     again = simulate(task, light, seed=None, mask=Mask.load(tmp_path / "mask.txt"))
+    # The mask of another run goes, unless this run read it.
+    again.write(tmp_path, inputs=[tmp_path / "mask.txt"])
+    assert (tmp_path / "mask.txt").exists()
+    again.write(tmp_path)
+    assert not (tmp_path / "mask.txt").exists()
     np.testing.assert_allclose(again.attribution.error, found.attribution.error, atol=1e-12)
 
 

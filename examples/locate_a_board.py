@@ -68,6 +68,14 @@ error = np.array(found.pose) - true_pose
 print(f"error {1e6 * error[0]:+.2f} µm, {1e6 * error[1]:+.2f} µm, {1e6 * error[2]:+.0f} µrad")
 
 # %%
+# In a loop, bind the features once. A call takes a frame and the predicted pose, and returns the pose of the camera
+# with its covariance; it builds and allocates nothing.
+levels = {"copper": found.copper, "threshold": found.threshold, "noise": found.noise}
+bound = features.bind(None, image.shape, image.dtype, pixel_size=pixel, **levels)
+measured = bound(image, found.pose)
+print("in a loop", measured.pose, "sigmas", np.sqrt(np.diag(measured.covariance)))
+
+# %%
 # The image with the rulers: green where the measured edge agrees with the pose.
 figure, axes = plt.subplots(figsize=(8, 6), layout="constrained")
 axes.imshow(image, cmap="gray")

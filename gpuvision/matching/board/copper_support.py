@@ -86,7 +86,7 @@ def find_other_pose(
     margin = math.ceil(reach / view.scale) + 1
     drawn = _draw_copper(artwork, view, margin, blur_px)
     grey = np.asarray(image, np.float32)
-    correlation = cv2.matchTemplate(drawn, grey, cv2.TM_CCOEFF_NORMED)
+    correlation = np.asarray(cv2.matchTemplate(drawn, grey, cv2.TM_CCOEFF_NORMED), np.float32)
     shift = _best_other_shift(correlation if is_bright else -correlation, margin)
     if shift is None:
         return None

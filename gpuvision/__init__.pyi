@@ -141,6 +141,12 @@ from .host import (
 from .host import (
     open_recording as open_recording,
 )
+from .inspection.deposits import (
+    DepositSums as DepositSums,
+)
+from .inspection.deposits import (
+    MeasureDeposits as MeasureDeposits,
+)
 from .matching.artwork.artwork import (
     Artwork as Artwork,
 )

@@ -33,6 +33,7 @@ OPERATIONS = {
     "triangulation": "triangulation",
     "range_image": "range_image",
     "merge_heights": "merge_heights",
+    "deposits": "deposits",
     "undistort": "undistort_image",
     "points": "undistort_points",
     "calibration": "calibration",

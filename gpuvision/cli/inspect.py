@@ -25,7 +25,7 @@ from gpuvision.cli.select import Side
 if TYPE_CHECKING:
     from gpuvision.formats.height_files import ImageScale
     from gpuvision.inspection.apertures import Aperture
-    from gpuvision.inspection.deposits import PasteSettings
+    from gpuvision.inspection.paste import PasteSettings
     from gpuvision.workflows.inspecting_leads import LeadInspection
     from gpuvision.workflows.inspecting_paste import PasteInspection, VolumeLimits
 
@@ -194,7 +194,7 @@ def inspect(
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host.outputs import Outputs
-    from gpuvision.inspection.deposits import PasteSettings
+    from gpuvision.inspection.paste import PasteSettings
     from gpuvision.validation import finite
     from gpuvision.workflows.inspecting_leads import LEAD_FILES
     from gpuvision.workflows.inspecting_paste import PASTE_FILES, VolumeLimits

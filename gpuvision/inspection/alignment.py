@@ -14,7 +14,7 @@ from scipy.ndimage import median_filter
 
 from gpuvision.inspection.apertures import Aperture, BoardPlacement
 from gpuvision.inspection.coverage import covered
-from gpuvision.inspection.deposits import Deposits, PasteSettings, measure_deposits
+from gpuvision.inspection.paste import Deposits, PasteSettings, measure_deposits
 from gpuvision.matching.artwork.shapes import Float64
 from gpuvision.ranging.regrid import Grid
 from gpuvision.validation import finite

@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linprog
 
+from gpuvision.inspection.aperture_cells import cells_of
 from gpuvision.inspection.apertures import Aperture
 from gpuvision.inspection.coverage import covered
-from gpuvision.inspection.deposits import cells_of, complete_sigmas
+from gpuvision.inspection.height_noise import complete_sigmas
 from gpuvision.inspection.top_height import top_height
 from gpuvision.matching.artwork.shapes import Float64
 from gpuvision.normal_distribution import MAD_TO_SIGMA

@@ -17,7 +17,7 @@ from gpuvision.formats.json import json_tree
 from gpuvision.host.outputs import Outputs
 from gpuvision.inspection.alignment import Alignment, align_apertures
 from gpuvision.inspection.apertures import Aperture, BoardPlacement
-from gpuvision.inspection.deposits import Deposits, PasteSettings, measure_deposits
+from gpuvision.inspection.paste import Deposits, PasteSettings, measure_deposits
 from gpuvision.matching.artwork.board_artwork import Side
 from gpuvision.matching.artwork.shapes import Float64
 from gpuvision.plots.inspection import draw_regions

@@ -14,7 +14,7 @@ import pytest
 
 import gpuvision as gv
 from gpuvision.formats.height_files import ImageScale
-from gpuvision.inspection.deposits import PasteSettings
+from gpuvision.inspection.paste import PasteSettings
 from gpuvision.ranging.focus_stack import FocusStack, StageFocus
 from gpuvision.simulation.clustering.light_clustering import LightClustering
 from gpuvision.simulation.scene.rays import AnyHit, ClosestHit

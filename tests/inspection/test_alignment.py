@@ -11,7 +11,7 @@ import pytest
 
 from gpuvision.inspection.alignment import _fit_rigid, align_apertures
 from gpuvision.inspection.apertures import BoardPlacement
-from gpuvision.inspection.deposits import PasteSettings
+from gpuvision.inspection.paste import PasteSettings
 from paste_maps import Cap, board_grid, circle, paste_map, rectangle
 
 SETTINGS = PasteSettings(stencil=120e-6)

@@ -1,227 +1,154 @@
-"""Volume, area, height and offset of solder paste against closed forms, and their sigmas by Monte Carlo."""
+"""Sums of deposits on the device against the float64 reference, at the edges of the map, and their messages."""
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
-from gpuvision.inspection.apertures import BoardPlacement
-from gpuvision.inspection.deposits import PasteSettings, aperture_windows, measure_deposits
-from paste_maps import Box, Cap, Frustum, board_grid, circle, paste_map, rectangle
+from gpuvision.host import Device, to_numpy
+from gpuvision.inspection.deposits import SURFACE, TERMS, DepositSums, MeasureDeposits
+from gpuvision.reference.deposits import Plane, ReferenceDeposit, measure_deposit
+from gpuvision.status import Status
 
-STENCIL = 120e-6
-SETTINGS = PasteSettings(stencil=STENCIL)
-HERE = BoardPlacement(x=0.0, y=0.0, theta=0.0)
-
-
-def test_a_box_on_the_cells_has_its_exact_volume_area_and_height():
-    grid = board_grid(100, 80)
-    box = Box((300e-6, 200e-6), 110e-6)
-    z = paste_map(grid, HERE, [(box, (0.5e-3, 0.4e-3))])
-    found = measure_deposits(z, grid, [rectangle("1", (0.5e-3, 0.4e-3), (300e-6, 200e-6))], HERE, SETTINGS)
-    assert found.status == ("measured",)
-    np.testing.assert_allclose(found.volume, box.volume, rtol=1e-9)
-    np.testing.assert_allclose(found.area, 300e-6 * 200e-6, rtol=1e-9)
-    np.testing.assert_allclose([found.height_mean, found.height_max], 110e-6, rtol=1e-9)
-    np.testing.assert_allclose(found.expected_volume, 300e-6 * 200e-6 * STENCIL, rtol=1e-12)
-    np.testing.assert_allclose(found.offset, 0, atol=1e-12)
-    np.testing.assert_allclose(found.reference, 1e-3 + 0.01 * 0.5e-3 - 0.02 * 0.4e-3, rtol=1e-9)
-    np.testing.assert_allclose(found.valid, 1.0)
+CELL = 10e-6
+STATUS = {"measured": Status.OK, "missing": Status.LOW_SIGNAL, "holes": Status.NO_DATA}
+TURN = np.array([[math.cos(0.3), math.sin(0.3)], [-math.sin(0.3), math.cos(0.3)]])
 
 
-@pytest.mark.parametrize("shape", [Cap(250e-6, 130e-6), Frustum(250e-6, 200e-6, 130e-6)])
-@pytest.mark.parametrize("side", ["top", "bottom"])
-def test_round_deposits_with_an_offset_on_a_turned_board(shape, side):
-    """Caps and frusta; the offset is in the coordinates of the board's files, also where the board is mirrored."""
-    grid = board_grid(160, 150)
-    place = BoardPlacement(
-        x=1.6e-3 if side == "bottom" else 0.4e-3, y=0.6e-3 if side == "bottom" else 0.1e-3, theta=0.4, side=side
-    )
-    centre, offset = np.array([0.8e-3, 0.45e-3]), np.array([22e-6, -13e-6])
-    z = paste_map(grid, place, [(shape, tuple(centre + offset))])
-    found = measure_deposits(z, grid, [circle("1", tuple(centre), 250e-6)], place, SETTINGS)
-    np.testing.assert_allclose(found.centre[0], place.to_map(centre), atol=1e-9)
-    np.testing.assert_allclose(found.volume, shape.volume, rtol=2e-3)
-    np.testing.assert_allclose(found.area, shape.area_above(STENCIL / 2), rtol=5e-3)
-    np.testing.assert_allclose(found.offset[0], offset, atol=2e-7)
-    np.testing.assert_allclose(found.height_max, 130e-6, rtol=2e-3)
+class Scene(NamedTuple):
+    """Inputs of the operation, and the surfaces and centroids of the apertures."""
+
+    z: np.ndarray
+    sigma: np.ndarray
+    owner: np.ndarray
+    boxes: np.ndarray
+    table: np.ndarray
+    surfaces: list[Plane]
+    centroids: np.ndarray
 
 
-def _nine(deposit):
-    places = [(0.45e-3 + 0.6e-3 * column, 0.45e-3 + 0.6e-3 * row) for row in range(3) for column in range(3)]
-    return [circle(str(number), place, 200e-6) for number, place in enumerate(places, 1)], [
-        (deposit, place) for place in places
+def places(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    rows, columns = np.indices(shape)
+    return columns * CELL, (shape[0] - 1 - rows) * CELL
+
+
+def scene(
+    rng: np.random.Generator, shape: tuple[int, int], dtype: Any, *, pitch: int = 24, holes: float = 0.05
+) -> Scene:
+    """Round deposits on curved surfaces, one per square of ``pitch`` cells, up to the border of the map.
+
+    The first deposit is missing, the second has too many holes.
+    """
+    x, y = places(shape)
+    z, sigma, owner = rng.normal(0.0, 2e-6, shape), rng.uniform(1e-6, 4e-6, shape), np.zeros(shape, np.int32)
+    boxes, table, surfaces, centroids = [], [], [], []
+    for top in range(0, shape[0] - pitch + 1, pitch):
+        for left in range(0, shape[1] - pitch + 1, pitch):
+            number = len(boxes)
+            box = (slice(top, top + pitch), slice(left, left + pitch))
+            centroid = np.array([x[box].mean(), y[box].mean()]) + rng.uniform(-CELL, CELL, 2)
+            away = np.hypot(x[box] - centroid[0], y[box] - centroid[1])
+            radius = 0.36 * pitch * CELL
+            owner[box] = np.where(away < radius, number + 1, np.where(away < 0.48 * pitch * CELL, -number - 1, 0))
+            covariance = np.diag(rng.uniform(0.5, 2.0, TERMS) * 1e-14)
+            covariance[0, 1] = covariance[1, 0] = 2e-15
+            terms = np.array([1e-3, 5e-6, -8e-6, 3e-6, 2e-6, -1e-6]) * rng.uniform(0.5, 1.0, TERMS)
+            surface = Plane(terms, covariance, centroid + 3 * CELL, 0.6 * pitch * CELL)
+            z[box] += (terms @ surface.basis(x[box].ravel(), y[box].ravel())).reshape(pitch, pitch)
+            z[box] += 0.0 if number == 0 else np.clip(120e-6 * (1.3 - (away / radius) ** 2), 0.0, 120e-6)
+            z[box] = np.where(rng.random((pitch, pitch)) < (0.5 if number == 1 else 0.05), math.nan, z[box])
+            first = (np.array([left * CELL, (shape[0] - 1 - top) * CELL]) - surface.centre) / surface.length
+            middle, step = (centroid - surface.centre) / surface.length, CELL / surface.length
+            row = [*terms, first[0], step, first[1], -step, *middle, surface.length, *covariance.ravel()]
+            boxes.append((top, top + pitch, left, left + pitch))
+            table.append(row)
+            surfaces.append(surface)
+            centroids.append(centroid)
+    numbers = np.array(boxes, np.int32), np.array(table, dtype)
+    return Scene(z.astype(dtype), sigma.astype(dtype), owner, *numbers, surfaces, np.array(centroids))
+
+
+def operation(of: Scene, **more: Any) -> MeasureDeposits:
+    settings = {"cell_area": CELL**2, "threshold": 60e-6, "correlation_area": 1.7, "to_board": TURN} | more
+    return MeasureDeposits(apertures=len(of.boxes), **settings)
+
+
+def run(measured: MeasureDeposits, of: Scene, device: Device) -> DepositSums:
+    sums = measured(of.z, of.sigma, of.owner, of.boxes, of.table, device=device)
+    return DepositSums(*map(to_numpy, sums))
+
+
+def expected(of: Scene, **settings: Any) -> list[ReferenceDeposit]:
+    x, y = (each.ravel() for each in places(of.z.shape))
+    z, sigma, owner = of.z.ravel().astype(np.float64), of.sigma.ravel().astype(np.float64), of.owner.ravel()
+    given = {"cell_area": CELL**2, "threshold": 60e-6, "correlation_area": 1.7, "to_board": TURN} | settings
+    return [
+        measure_deposit(z, sigma, x, y, owner == number, owner == -number, surface, centroid, **given)
+        for number, (surface, centroid) in enumerate(zip(of.surfaces, of.centroids, strict=True), 1)
     ]
 
 
-def _draws(clean, grid, apertures, count, noise_of, sigma=None):
-    """Return the deposits of `count` noisy maps as arrays (draws, deposits, ...), by field."""
-    draws = [measure_deposits(clean + noise_of(), grid, apertures, HERE, SETTINGS, sigma=sigma) for _ in range(count)]
-    return {name: np.array([getattr(each, name) for each in draws]) for name in draws[0]._fields}
+def check(found: DepositSums, wanted: list[ReferenceDeposit], rtol: float) -> None:
+    assert [Status(int(each)) for each in found.status] == [STATUS[each.status] for each in wanted]
+    for name in DepositSums._fields[:-1]:
+        values = np.array([getattr(each, name) for each in wanted], np.float64)
+        # An offset is small against the deposit: its rounding is that of a length of some cells. The kernel neglects
+        # noise of more than 12 sigmas.
+        atol = {"offset": rtol * 5 * CELL, "area_sigma": 1e-12 * CELL**2}.get(name, 0.0)
+        np.testing.assert_allclose(getattr(found, name), values, rtol=rtol, atol=atol, err_msg=name)
 
 
-def _check_spread(found, name):
-    """The spread of the values in their sigmas is 1 within 10 %, or 3 standard deviations of so few draws."""
-    value, sigma = found[name], found[f"{name}_sigma"]
-    ratio = np.std((value - value.mean(axis=0)) / sigma) * math.sqrt(len(value) / (len(value) - 1))
-    assert abs(ratio - 1) < max(0.1, 3 / math.sqrt(2 * value.size)), (name, ratio)
+@pytest.mark.parametrize("variant", ["vector", "work_item"])
+@pytest.mark.parametrize(("dtype", "rtol"), [(np.float32, 2e-4), (np.float64, 1e-9)])
+def test_sums_equal_the_reference(
+    rng: np.random.Generator, device: Device, variant: Any, dtype: Any, rtol: float
+) -> None:
+    """Boxes of 24 columns end inside a vector; the last one ends with the map."""
+    of = scene(rng, (48, 96), dtype)
+    wanted = expected(of)
+    assert [each.status for each in wanted[:3]] == ["missing", "holes", "measured"]
+    check(run(operation(of, variant=variant), of, device), wanted, rtol)
 
 
-def _check_sigmas(rng, count, given):
-    grid, noise = board_grid(210, 210), 4e-6
-    apertures, deposits = _nine(Cap(210e-6, 130e-6))
-    clean = paste_map(grid, HERE, deposits)
-    sigma = noise if given else None
-    found = _draws(clean, grid, apertures, count, lambda: rng.normal(0, noise, clean.shape), sigma)
-    np.testing.assert_allclose(found["noise"], noise, rtol=0 if given else 0.05)
-    assert found["correlation_area"].min() >= 1.0
-    assert found["correlation_area"].max() < 1.2
-    for name in ("volume", "area", "height_mean", "height_max", "offset"):
-        _check_spread(found, name)
-    np.testing.assert_allclose(np.mean(found["volume"]), Cap(210e-6, 130e-6).volume, rtol=3e-3)
-    # The largest of the noisy patches would be 2 sigmas too high.
-    bias = np.mean(found["height_max"]) - 130e-6
-    assert abs(bias) < 0.5 * np.mean(found["height_max_sigma"])
+def test_a_map_narrower_than_a_vector(rng: np.random.Generator, device: Device) -> None:
+    of = scene(rng, (33, 11), np.float32, pitch=11)
+    check(run(operation(of), of, device), expected(of), 2e-4)
 
 
-def test_sigmas_are_the_spread_under_noise(rng):
-    _check_sigmas(rng, 12, given=False)
+def test_an_aperture_without_cells_and_cells_without_noise(rng: np.random.Generator, device: Device) -> None:
+    """No cell: no deposit. Noise of almost 0: a cell is above the threshold or below it, and nothing overflows."""
+    of = scene(rng, (48, 96), np.float32)
+    of = of._replace(sigma=np.full_like(of.sigma, np.finfo(np.float32).tiny))
+    of.owner[np.abs(of.owner) == 8] = 0
+    found = run(operation(of), of, device)
+    assert found.valid[7] == found.volume[7] == 0.0
+    assert Status(int(found.status[7])) == Status.LOW_SIGNAL
+    wanted = expected(of._replace(surfaces=of.surfaces[:7], centroids=of.centroids[:7]))
+    check(DepositSums(*(each[:7] for each in found)), wanted, 2e-4)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("given", [True, False])
-def test_sigmas_are_the_spread_under_noise_of_many_draws(rng, given):
-    _check_sigmas(rng, 60, given)
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("apertures", 0, r"MeasureDeposits\.apertures is 0"),
+        ("threshold", 0.0, r"MeasureDeposits\.threshold is 0"),
+        ("correlation_area", 0.5, r"MeasureDeposits\.correlation_area is 0\.5"),
+        ("to_board", np.eye(3), r"MeasureDeposits\.to_board must be a finite matrix \(2, 2\)"),
+    ],
+)
+def test_wrong_parameters_are_refused(name: str, value: Any, message: str) -> None:
+    settings: dict[str, Any] = {"apertures": 1, "cell_area": 1e-10, "threshold": 1e-5} | {name: value}
+    with pytest.raises(ValueError, match=message):
+        MeasureDeposits(**settings)
 
 
-def test_sigmas_contain_the_uncertainty_of_the_reference(rng):
-    """A flat cone on a board of few cells: the reference determines area and mean height; 100 draws."""
-    grid = board_grid(60, 60)
-    apertures = [circle("1", (0.3e-3, 0.3e-3), 180e-6)]
-    clean = paste_map(grid, HERE, [(Frustum(180e-6, 10e-6, 60e-6), (0.3e-3, 0.3e-3))])
-    away = np.hypot(*np.meshgrid(grid.x - 0.3e-3, grid.y - 0.3e-3))
-    clean[away > 191e-6] = np.nan
-    settings = PasteSettings(stencil=40e-6, margin=5e-6, ring=40e-6, least_reference=20)
-    draws = [
-        measure_deposits(
-            clean + rng.normal(0, 2e-6, clean.shape), grid, apertures, HERE, settings, sigma=2e-6, correlation_area=1.0
-        )
-        for _ in range(100)
-    ]
-    for name in ("volume", "area", "height_mean"):
-        values = np.array([getattr(each, name)[0] for each in draws])
-        sigmas = np.array([getattr(each, f"{name}_sigma")[0] for each in draws])
-        ratio = values.std(ddof=1) / np.sqrt(np.mean(sigmas**2))
-        assert abs(ratio - 1) < 3 / math.sqrt(2 * len(draws)), (name, ratio)
-
-
-def _check_correlated(rng, count):
-    """Noise that neighbours share has larger sigmas: its correlation area is found in the board."""
-    grid = board_grid(210, 210)
-    apertures, deposits = _nine(Cap(210e-6, 130e-6))
-    clean = paste_map(grid, HERE, deposits)
-
-    def noise():
-        smooth = gaussian_filter(rng.normal(0, 1, clean.shape), 0.8, mode="wrap")
-        return 4e-6 * smooth / smooth.std()
-
-    found = _draws(clean, grid, apertures, count, noise)
-    np.testing.assert_allclose(np.mean(found["correlation_area"]), 4 * math.pi * 0.8**2, rtol=0.1)
-    for name in ("volume", "offset"):
-        _check_spread(found, name)
-
-
-def test_sigmas_of_correlated_noise(rng):
-    _check_correlated(rng, 6)
-
-
-@pytest.mark.slow
-def test_sigmas_of_correlated_noise_of_many_draws(rng):
-    _check_correlated(rng, 60)
-
-
-def test_other_levels_in_the_ring_do_not_move_the_reference(rng):
-    """A trace of 35 um under a quarter of the ring, holes, and noise."""
-    grid = board_grid(100, 100)
-    z = paste_map(
-        grid, HERE, [(Cap(200e-6, 130e-6), (0.5e-3, 0.5e-3)), (Box((2e-3, 110e-6), 35e-6), (0.5e-3, 0.19e-3))]
-    )
-    z += rng.normal(0, 1e-6, z.shape)
-    z[rng.random(z.shape) < 0.05] = np.nan
-    found = measure_deposits(z, grid, [circle("1", (0.5e-3, 0.5e-3), 200e-6)], HERE, SETTINGS)
-    np.testing.assert_allclose(found.volume, Cap(200e-6, 130e-6).volume, rtol=0.01)
-    assert found.valid[0] == pytest.approx(0.95, abs=0.02)
-
-
-def test_the_height_of_the_pad_is_subtracted():
-    grid = board_grid(100, 80)
-    z = paste_map(grid, HERE, [(Box((300e-6, 200e-6), 110e-6), (0.5e-3, 0.4e-3))])
-    settings = PasteSettings(stencil=STENCIL, pad_height=10e-6, margin=0.0)
-    found = measure_deposits(z, grid, [rectangle("1", (0.5e-3, 0.4e-3), (300e-6, 200e-6))], HERE, settings)
-    np.testing.assert_allclose(found.volume, 300e-6 * 200e-6 * 100e-6, rtol=1e-9)
-    np.testing.assert_allclose(found.height_mean, 100e-6, rtol=1e-9)
-
-
-def test_cells_of_unknown_sigma_have_the_median():
-    grid = board_grid(100, 80)
-    z = paste_map(grid, HERE, [(Box((300e-6, 200e-6), 110e-6), (0.5e-3, 0.4e-3))])
-    sigma = np.full(grid.shape, 2e-6)
-    known = measure_deposits(z, grid, [rectangle("1", (0.5e-3, 0.4e-3), (300e-6, 200e-6))], HERE, SETTINGS, sigma=sigma)
-    sigma[30:50, 40:60] = np.nan
-    found = measure_deposits(z, grid, [rectangle("1", (0.5e-3, 0.4e-3), (300e-6, 200e-6))], HERE, SETTINGS, sigma=sigma)
-    np.testing.assert_array_equal(found.volume_sigma, known.volume_sigma)
-    np.testing.assert_array_equal(found.noise, 2e-6)
-
-
-def test_deposits_that_cannot_be_measured_say_why(rng):
-    grid = board_grid(200, 100)
-    z = paste_map(grid, HERE, [(Cap(200e-6, 130e-6), (0.5e-3, 0.5e-3)), (Cap(200e-6, 130e-6), (1.5e-3, 0.5e-3))])
-    z += rng.normal(0, 1e-6, z.shape)
-    z[35:65, 140:160] = np.nan
-    apertures = [circle("good", (0.5e-3, 0.5e-3), 200e-6), circle("bare", (1.0e-3, 0.2e-3), 100e-6)]
-    apertures += [circle("holes", (1.5e-3, 0.5e-3), 200e-6), circle("edge", (1.95e-3, 0.2e-3), 100e-6)]
-    found = measure_deposits(z, grid, apertures, HERE, SETTINGS)
-    assert found.names == ("good", "bare", "holes", "edge")
-    assert found.status == ("measured", "missing", "holes", "outside")
-    assert np.isnan(found.offset[1:]).all()
-    assert np.isnan(found.volume[2:]).all()
-    assert abs(found.volume[1]) < 4 * found.volume_sigma[1]
-    empty = np.full(grid.shape, np.nan)
-    empty[45:55, 45:55] = 1e-3
-    small = measure_deposits(empty, grid, [circle("1", (0.5e-3, 0.5e-3), 10e-6)], HERE, SETTINGS)
-    assert small.status == ("no reference",)
-
-
-def test_a_cell_belongs_to_the_nearest_aperture_within_the_margin():
-    grid = board_grid(60, 32)
-    apertures = [
-        rectangle("1", (0.2e-3, 0.16e-3), (100e-6, 100e-6)),
-        rectangle("2", (0.36e-3, 0.16e-3), (100e-6, 100e-6)),
-    ]
-    first, second = aperture_windows(apertures, grid, 100e-6)
-    assert first is not None
-    assert second is not None
-    whole = np.zeros(grid.shape, int)
-    for number, window in enumerate((first, second), 1):
-        assert not np.any(whole[window.rows, window.columns][window.cells])
-        whole[window.rows, window.columns][window.cells] = number
-    # The gap of 60 um is divided in the middle, at x = 0.28 mm; the margin ends 100 um away from the apertures.
-    np.testing.assert_array_equal(whole[15, :51], [0] * 5 + [1] * 23 + [2] * 23)
-    assert np.count_nonzero(whole[:, 20]) == 30
-
-
-def test_wrong_arguments_are_refused():
-    grid = board_grid(30, 30)
-    with pytest.raises(ValueError, match=r"the grid has \(30, 30\)"):
-        measure_deposits(np.zeros((3, 3)), grid, [], HERE, SETTINGS)
-    with pytest.raises(ValueError, match="sigma has shape"):
-        measure_deposits(np.zeros(grid.shape), grid, [], HERE, SETTINGS, sigma=np.ones(3))
-    with pytest.raises(ValueError, match="sigma is negative"):
-        measure_deposits(np.zeros(grid.shape), grid, [], HERE, SETTINGS, sigma=-1.0)
-    with pytest.raises(ValueError, match=r"PasteSettings\.stencil is 0"):
-        PasteSettings(stencil=0.0)
-    with pytest.raises(ValueError, match=r"PasteSettings\.reference_order is 3, expected 0 to 2"):
-        PasteSettings(stencil=1e-4, reference_order=3)
+def test_wrong_inputs_are_refused(device: Device) -> None:
+    op = MeasureDeposits(apertures=1, cell_area=1e-10, threshold=1e-5)
+    with pytest.raises(ValueError, match="heights \\(rows, columns\\) of 16 cells or more"):
+        op.launch(device, (3, 3), np.dtype(np.float32))
+    with pytest.raises(TypeError, match="float32"):
+        op.launch(device, (8, 8), np.dtype(np.uint8))
+    assert SURFACE == 49

@@ -14,7 +14,7 @@ import pytest
 from gpuvision.formats.height_files import HeightMapFile
 from gpuvision.formats.range_image import write_tiff
 from gpuvision.inspection.apertures import BoardPlacement
-from gpuvision.inspection.deposits import PasteSettings
+from gpuvision.inspection.paste import PasteSettings
 from gpuvision.workflows.inspecting_leads import inspect_leads
 from gpuvision.workflows.inspecting_paste import inspect_paste
 from paste_maps import Box, Cap, board_grid, circle, paste_map

@@ -351,6 +351,66 @@ from .ranging.transport_calibration import (
 from .ranging.triangulation import (
     Triangulation as Triangulation,
 )
+from .servoing.axis import (
+    Axis as Axis,
+)
+from .servoing.axis import (
+    FineStage as FineStage,
+)
+from .servoing.controllers import (
+    PidController as PidController,
+)
+from .servoing.controllers import (
+    PidGains as PidGains,
+)
+from .servoing.controllers import (
+    SmithPredictor as SmithPredictor,
+)
+from .servoing.delay import (
+    DelayBudget as DelayBudget,
+)
+from .servoing.delay import (
+    gain_limit as gain_limit,
+)
+from .servoing.delay import (
+    non_oscillating_gain as non_oscillating_gain,
+)
+from .servoing.delay_measurement import (
+    measure_delay as measure_delay,
+)
+from .servoing.guard import (
+    LoopLimits as LoopLimits,
+)
+from .servoing.guard import (
+    Outcome as Outcome,
+)
+from .servoing.loop import (
+    ServoLoop as ServoLoop,
+)
+from .servoing.loop import (
+    SimulatedClock as SimulatedClock,
+)
+from .servoing.loop import (
+    WallClock as WallClock,
+)
+from .servoing.observer import (
+    MotionModel as MotionModel,
+)
+from .servoing.observer import (
+    PoseMeasurement as PoseMeasurement,
+)
+from .servoing.observer import (
+    PoseObserver as PoseObserver,
+)
+from .servoing.plant import (
+    SimulatedPlant as SimulatedPlant,
+)
+from .servoing.settling import (
+    VibrationSettling as VibrationSettling,
+)
+from .servoing.simulated_sensor import (
+    SimulatedPoseSensor as SimulatedPoseSensor,
+)
 from .simulation.board_image.board_image import (
     BoardImage as BoardImage,
 )

@@ -112,7 +112,8 @@ def chirp(count: int, period: float, amplitude: float, low: float, high: float) 
         First and last frequency [Hz], below half the frame rate.
     """
     time = period * np.arange(integer(count, "count", minimum=2))
-    return amplitude * np.sin(2.0 * math.pi * (low + 0.5 * (high - low) * time / time[-1]) * time)
+    phase = 2.0 * math.pi * (low + 0.5 * (high - low) * time / time[-1]) * time
+    return np.asarray(amplitude * np.sin(phase), np.float64)
 
 
 def measure_delay(
@@ -282,4 +283,4 @@ class _Likelihood:
 
 def _simplex(first: Float64) -> Float64:
     """Return the first simplex: half a frame of delay, and factors of about 2 and 3 of jitter and noise."""
-    return first + np.vstack([np.zeros(3), np.diag([0.3, 0.7, -1.0])])
+    return np.asarray(first + np.vstack([np.zeros(3), np.diag([0.3, 0.7, -1.0])]), np.float64)

@@ -107,9 +107,11 @@ class BoardPicture:
         copper = painter.painted([*left, *more], (0.0, 0.0))
         opened = painter.painted(artwork.mask, view.mask_shift) if artwork.mask else np.ones_like(copper)
         surface = copper.view(np.uint8) + 2 * opened.view(np.uint8)  # index of the grey level
-        surface[painter.painted(artwork.silk, view.silk_shift)] = 4
         holes = zip(artwork.holes.start, artwork.holes.end, artwork.holes.diameter, strict=True)
-        surface[painter.painted([Shape(capsule(start, end, across / 2)) for start, end, across in holes], (0, 0))] = 5
+        drilled = [Shape(capsule(start, end, across / 2)) for start, end, across in holes]
+        for level, shapes, shift in ((4, artwork.silk, view.silk_shift), (5, drilled, (0.0, 0.0))):
+            if shapes:
+                surface[painter.painted(shapes, shift)] = level
         levels = np.zeros(256, np.float32)
         levels[: len(view.levels)] = view.levels
         rows, columns = painter.shape

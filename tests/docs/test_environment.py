@@ -20,7 +20,10 @@ def tables() -> tuple[set[str], set[str]]:
 
 def uses(path: Path) -> Iterator[tuple[str, bool]]:
     """Yield (variable, whether it is set) for each use of the environment in a file."""
-    tree = ast.parse(path.read_text())
+    text = path.read_text()
+    if not re.search(r"\bos\.(environ|getenv|putenv)", text):
+        return  # most files: without parsing
+    tree = ast.parse(text)
     constants = {
         node.targets[0].id: node.value.value
         for node in tree.body

@@ -157,8 +157,9 @@ def _write_tables() -> None:
     )
     (SEEDS / "materials.toml").write_text(_MATERIALS)
     (SEEDS / "field.toml").write_text(_FIELD)
-    presets = Path(__file__).resolve().parents[2] / "gpuvision" / "presets" / "sensors"
-    (SEEDS / "sensor.toml").write_bytes((presets / "camera_line.toml").read_bytes())
+    presets = Path(__file__).resolve().parents[2] / "gpuvision" / "presets"
+    (SEEDS / "sensor.toml").write_bytes((presets / "sensors" / "camera_line.toml").read_bytes())
+    (SEEDS / "cmos_sensor.toml").write_bytes((presets / "cameras" / "lupa300.toml").read_bytes())
     identity = np.eye(3).tolist()
     features = {
         "side": "top",

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gpuvision.formats.camera_file import read_lens, read_mounted
+from gpuvision.formats.cmos_sensor_file import read_cmos_sensor
 from gpuvision.formats.encoder_file import read_encoder
 from gpuvision.formats.features_file import read_features
 from gpuvision.formats.field_file import read_field
@@ -121,6 +122,7 @@ _ALL = (
     Reader("sensor.toml", Sensor.load),
     *(Reader(f"encoder.{kind}", read_encoder) for kind in ("csv", "npz")),
     Reader("camera.toml", _camera),
+    Reader("cmos_sensor.toml", read_cmos_sensor),
     Reader("features.toml", read_features),
     Reader("field.toml", read_field),
     Reader("materials.toml", read_materials),

@@ -155,8 +155,10 @@ def test_kernel_includes_are_not_circular() -> None:
 
 
 def test_every_kernel_has_a_module_a_test_and_a_benchmark_of_its_name() -> None:
-    """The folder ``kernels/line`` belongs to ``line.py``, ``test_line.py`` and the benchmark ``profiling/line.py``."""
-    operations = {path.parent.name for path in _files("kernels") if path.suffix == ".cl"} - {"ceiling"}  # a benchmark
+    """``kernels/line/line.cl`` belongs to ``line.py``, ``test_line.py`` and the benchmark ``profiling/line.py``."""
+    kernels = [path for path in _files("kernels") if path.suffix == ".cl"]
+    assert {path.parent.name for path in kernels} - {path.stem for path in kernels} == set()
+    operations = {path.parent.name for path in kernels} - {"ceiling"}  # a benchmark
     assert len(operations) > 20
     assert operations - {path.stem for path in _files("gpuvision")} == set()
     assert {f"test_{name}" for name in operations} - {path.stem for path in _files("tests")} == set()

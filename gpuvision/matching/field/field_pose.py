@@ -160,7 +160,7 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
         angles = self.angles
         work = pose_grid_work(build, len(angles), rows, columns)
         return build.launch(
-            "field_pose/field_pose_search.cl",
+            "field_pose/field_pose.cl",
             "field_pose_search",
             work=work,
             outputs=pose_cost_outputs(build, len(angles), rows, columns, with_scores=self.with_scores),
@@ -316,7 +316,7 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
         cells, starts = self.map.cells.nearest, (self.count,)
         shapes = {"poses": (*starts, 3), "covariance": (*starts, 3, 3), "information": (*starts, 3, 3)}
         return build.launch(
-            "field_pose/field_pose_refinement.cl",
+            "field_pose/field_pose.cl",
             "field_pose_refinement",
             work=WorkSize(starts, (1,)),
             more_inputs=[((self.count, 3), build.real)],

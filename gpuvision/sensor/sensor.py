@@ -450,15 +450,25 @@ def _light(top: Section, transport: Transport) -> Light | None:
     if light.lens is not None or not isinstance(transport, StraightTransport):
         return light
     setup = top.section("triangulation")
-    if "baseline" not in setup:
+    if "sheet_origin" in setup:
+        place = _pinhole(setup, transport)
+    elif "baseline" in setup:
+        up = np.array(transport.h_axis) / np.linalg.norm(transport.h_axis)
+        sheet_normal = np.cross(transport.g_axis, transport.h_axis)
+        sheet_normal *= np.sign(sheet_normal @ np.array(transport.direction)) / np.linalg.norm(sheet_normal)
+        beside = np.array(transport.origin) + setup.number("baseline", "m") * sheet_normal
+        place = beside + setup.number("stand_off", "m") * up
+    else:
         return light
-    up = np.array(transport.h_axis) / np.linalg.norm(transport.h_axis)
-    sheet_normal = np.cross(transport.g_axis, transport.h_axis)
-    sheet_normal *= np.sign(sheet_normal @ np.array(transport.direction)) / np.linalg.norm(sheet_normal)
-    place = (
-        np.array(transport.origin) + setup.number("baseline", "m") * sheet_normal + setup.number("stand_off", "m") * up
-    )
     return replace(light, lens=(float(place[0]), float(place[1]), float(place[2])))
+
+
+def _pinhole(setup: Section, transport: StraightTransport) -> npt.NDArray[np.float64]:
+    """Return the pinhole of a camera in the scene at transport 0 [m], from the sheet in the camera's frame."""
+    origin, g_axis, h_axis = (np.array(setup.numbers(key, "", (3,))) for key in ("sheet_origin", "g_axis", "h_axis"))
+    of_camera = np.stack([g_axis, h_axis, np.cross(g_axis, h_axis)])
+    of_scene = np.array([transport.g_axis, transport.h_axis, np.cross(transport.g_axis, transport.h_axis)])
+    return np.asarray(np.array(transport.origin) - (of_camera @ origin) @ of_scene)
 
 
 def _output(table: Section) -> Output:

@@ -77,7 +77,7 @@ class SensorView:
     Parameters
     ----------
     triangulation
-        Triangulation from the sensor to the sheet, with the lens distortion.
+        Triangulation from the sensor to the sheet, with the distortion of a lens or a camera.
     transport
         Motion of sheet and sensor over the scene.
     lens
@@ -111,10 +111,6 @@ class SensorView:
     limits: ViewLimits = ViewLimits()
 
     def __post_init__(self) -> None:
-        if self.triangulation.camera is not None or self.triangulation.polynomial is not None:
-            raise ValueError(
-                "SensorView.triangulation has a camera or a polynomial; a simulation takes one with a lens, or without"
-            )
         if self.transport.bend is not None:
             raise ValueError("SensorView.transport has a bent sheet; a simulation takes a flat one")
         object.__setattr__(self, "lens", numbers(self.lens, (3,), "SensorView.lens"))
@@ -180,7 +176,7 @@ class SensorView:
     def points_in_sheet(self, u: npt.ArrayLike, v: npt.ArrayLike, L: float = 0.0) -> Float64:
         """Return the points of the sheet imaged at (u, v), (..., 3) in the scene [m]; NaN beyond the horizon."""
         sensor = np.stack(np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64)), axis=-1)
-        lens = self.triangulation.sensor_lens
+        lens = self.triangulation.distortion
         straight = sensor if lens is None else lens.undistort(sensor)
         lifted = straight @ self._matrix[:, :2].T + self._matrix[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -207,7 +203,7 @@ class SensorView:
         and for directions away from the optical axis.
         """
         sensor = np.stack(np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64)), axis=-1)
-        lens = self.triangulation.sensor_lens
+        lens = self.triangulation.distortion
         straight = sensor if lens is None else lens.undistort(sensor)
         lifted = straight @ self._matrix[2, :2] + self._matrix[2, 2]
         with np.errstate(divide="ignore", invalid="ignore"):

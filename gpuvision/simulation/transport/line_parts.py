@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.camera.distortion import Distortion
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
 from gpuvision.host.arrays import host_view
@@ -28,6 +29,9 @@ _FANS_PER_LAUNCH = 1024
 # Points nearer to a limit of the view than this fraction of the farther end's distance count as beyond it. Chosen: a
 # million roundings of double; the lost part of a line is far below the resolution of a sensor.
 _VIEW_MARGIN = 1e-9
+# Points on each edge of the sensor, and the margin, for the circle around its undistorted image. Chosen: between two of
+# the points an edge bends by far less than the margin.
+_BORDER_POINTS, _BORDER_MARGIN = 33, 1.01
 # Newton iterations that find an edge under lens distortion. Chosen: the error of the start value is squared each time.
 _NEWTON_ITERATIONS = 3
 
@@ -246,7 +250,8 @@ class LineProjector:
         middle = np.append(np.mean(np.array(view.triangulation.region), axis=1), 1.0)
         in_front = np.sign(distance) * np.sign(homography[2] @ middle)
         lifting = in_front * np.column_stack([in_sheet, normal]) @ np.linalg.inv(homography).T
-        self._view, self._lens = view, view.triangulation.sensor_lens
+        self._view, self._lens = view, view.triangulation.distortion
+        self._circle = _image_circle(view)
         self._lifting = lifting
         # Linear functions of a ray that are positive where the point is in front of the lens, on the sheet's side, and
         # on the near side of the sheet's horizon.
@@ -256,7 +261,31 @@ class LineProjector:
         """Return the projections of segments (m, 2, 3) [m] at a transport L [m]."""
         rays = ends - self._view.lens_at(L)
         lifted = rays @ self._lifting
-        return ProjectedLines(self._lens, self._lifting, rays @ self._limits, lifted[:, 0], lifted[:, 1] - lifted[:, 0])
+        return ProjectedLines(
+            self._lens, self._circle, self._lifting, rays @ self._limits, lifted[:, 0], lifted[:, 1] - lifted[:, 0]
+        )
+
+
+def _image_circle(view: SensorView) -> tuple[Float64, float] | None:
+    """Return centre (2,) and radius of a circle of ideal positions (u, v) that have an image; None: all have one.
+
+    Of a lens: within the fold. Of a camera or a polynomial, whose fold is no circle: around the image of the sensor,
+    with a margin of 1 % of its radius.
+    """
+    lens = view.triangulation.distortion
+    if lens is None:
+        return None
+    if isinstance(lens, Lens):
+        if math.isinf(lens.fold_radius):
+            return None
+        return np.array(lens.centre), (1.0 - _VIEW_MARGIN) * lens.undistorted_radius(lens.fold_radius)
+    u, v = (np.linspace(edges[0], edges[-1], _BORDER_POINTS) for edges in (view.u_edges, view.v_edges))
+    ideal = lens.undistort(np.stack(np.meshgrid(u, v), axis=-1)).reshape(-1, 2)
+    ideal = ideal[np.isfinite(ideal).all(axis=1)]
+    if not len(ideal):
+        raise ValueError("SensorView.triangulation: no position of the sensor has an undistorted one")
+    centre = 0.5 * (ideal.min(axis=0) + ideal.max(axis=0))
+    return centre, _BORDER_MARGIN * float(np.linalg.norm(ideal - centre, axis=1).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,6 +296,8 @@ class ProjectedLines:
     ----------
     lens
         Distortion of the sensor; None: none.
+    circle
+        Centre and radius of the ideal positions (u, v) that have an image; None: all.
     lifting
         float64 (3, 3): maps metres to homogeneous (u, v, 1).
     limits
@@ -275,7 +306,8 @@ class ProjectedLines:
         float64 (m, 3): homogeneous (u, v, 1) of the start of a segment, and the difference from there to its end.
     """
 
-    lens: Lens | None
+    lens: Distortion | None
+    circle: tuple[Float64, float] | None
     lifting: Float64
     limits: Float64
     start: Float64
@@ -309,13 +341,12 @@ class ProjectedLines:
             high = np.where(end > least, 1.0, np.where(start > least, share, 0.0))[parts.segment]
             parts = parts._replace(start=np.maximum(parts.start, low), end=np.minimum(parts.end, high))
         parts = parts.select(parts.start < parts.end)
-        return parts if self.lens is None or math.isinf(self.lens.fold_radius) else self._clip_to_fold(parts, self.lens)
+        return parts if self.circle is None else self._clip_to_circle(parts, *self.circle)
 
-    def _clip_to_fold(self, parts: Parts, lens: Lens) -> Parts:
-        radius = (1.0 - _VIEW_MARGIN) * lens.undistorted_radius(lens.fold_radius)
+    def _clip_to_circle(self, parts: Parts, centre: Float64, radius: float) -> Parts:
         start, direction = self.start[parts.segment], self.way[parts.segment]
         ends = [start + share[:, None] * direction for share in (parts.start, parts.end)]
-        vectors = [each[:, :2] - each[:, 2:] * np.array(lens.centre) for each in ends]
+        vectors = [each[:, :2] - each[:, 2:] * centre for each in ends]
         found = parts_within_radius(*vectors, *(radius * each[:, 2] for each in ends))
         size, begin = parts.end - parts.start, parts.start
         parts = parts.select(found.segment)

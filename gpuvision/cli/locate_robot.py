@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, Overwrite, ReportFile, named_path, quantities, reject_unused
+from gpuvision.cli.arguments import (
+    DeviceLabel,
+    Overwrite,
+    ReportFile,
+    echo,
+    named_path,
+    prints_report,
+    quantities,
+    reject_unused,
+    write_report,
+)
 from gpuvision.cli.pose_output import PoseFolder, check_image, claim_outputs, initial_pose_of, report_pose
 
 if TYPE_CHECKING:
@@ -25,8 +35,8 @@ Input = Annotated[
     typer.Argument(
         metavar="INPUT",
         parser=named_path,
-        help="Image of the floor: a top view with the robot in the middle, or the view of a camera on the robot; or "
-        "points on lines (NPY or CSV, metres, x ahead, y to the left).",
+        help="Image of the floor: a top view with the robot in the middle, or the view of a camera on the robot; "
+        "points on lines (NPY or CSV, metres, x ahead, y to the left); or, with --rate, a recording of such images.",
     ),
 ]
 FieldFile = Annotated[
@@ -66,6 +76,26 @@ BlindRadius = Annotated[
 ]
 
 
+FrameRate = Annotated[
+    float | None,
+    typer.Option(
+        metavar="FPS",
+        min=1e-6,
+        help="INPUT is a recording with this number of frames per second: follow the robot through it. DIR gets "
+        "track.csv, track.json and track.png.",
+    ),
+]
+OdometryFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE.csv",
+        parser=named_path,
+        help="Motions between the frames: header forward,left,turn [m, m, rad], one line for each frame after the "
+        "first; with --rate. Default: unknown motion.",
+    ),
+]
+
+
 def locate_robot(
     source: Input,
     field: FieldFile,
@@ -75,6 +105,8 @@ def locate_robot(
     line_width: LineWidth = None,
     blind_radius: BlindRadius = None,
     threshold: Threshold = None,
+    rate: FrameRate = None,
+    odometry: OdometryFile = None,
     out: PoseFolder = None,
     as_json: ReportFile = None,
     device: DeviceLabel = None,
@@ -83,7 +115,8 @@ def locate_robot(
     """Locate a robot on a field from the white lines around it: candidate poses with standard deviations.
 
     The pose is the position of the robot on the field [m] and its heading [rad]. A symmetric field has two poses that
-    look alike; both are listed. INPUT that does not fit the field is refused with a reason.
+    look alike; both are listed. INPUT that does not fit the field is refused with a reason. Over a recording, odometry
+    and views are filtered: symmetric poses, views that are wrong, and a robot that is carried elsewhere.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size
@@ -94,11 +127,17 @@ def locate_robot(
     from gpuvision.workflows.locating_robot import locate_robot as locate
 
     check_image(source)
-    outputs = claim_outputs("locate-robot", (source, field, camera), out, as_json, overwrite)
     pose = initial_pose_of(initial_pose)
     pixel = None if scale is None else quantities(scale, "--scale", "m")[0]
     described = read_field(field)
     chosen = None if device is None else Device.named(device)
+    if rate is not None:
+        files = _TrackFiles((source, field, camera, odometry), out, as_json, overwrite)
+        sizes = (camera, pixel, line_width, blind_radius)
+        _track(source, described, rate, odometry, sizes, files, initial_pose=pose, threshold=threshold, device=chosen)
+        return
+    reject_unused("without --rate", odometry=odometry)
+    outputs = claim_outputs("locate-robot", (source, field, camera), out, as_json, overwrite)
     picture = None
     measured: npt.NDArray[np.float32] | FloorScan
     if source.suffix.lower() in POINT_FILES:
@@ -122,6 +161,47 @@ def locate_robot(
     report_pose(located, lambda path: draw_located_robot(path, located, picture), out, as_json, outputs)
 
 
+class _TrackFiles(NamedTuple):
+    """Inputs of a track, and where its results go."""
+
+    inputs: tuple[str | Path | None, ...]
+    out: Path | None
+    as_json: Path | None
+    overwrite: bool
+
+
+def _track(
+    source: Path,
+    field: Field,
+    rate: float,
+    odometry: Path | None,
+    sizes: tuple[Path | None, float | None, str | None, str | None],
+    files: _TrackFiles,
+    **settings: Any,
+) -> None:
+    """Follow a robot through a recording and write its track."""
+    from gpuvision.host import open_recording
+    from gpuvision.host.outputs import Outputs
+    from gpuvision.workflows.tracking_robot import TRACK_FILES, read_odometry, track_robot
+
+    given = [each for each in files.inputs if each is not None]
+    outputs = Outputs("locate-robot", inputs=given, overwrite=files.overwrite)
+    outputs.claim(files.as_json)
+    if files.out is not None:
+        outputs.claim_folder(files.out, TRACK_FILES)
+    motions = None if odometry is None else read_odometry(odometry)
+    views = open_recording(source)
+    how = _scan_settings((int(views.shape[0]), int(views.shape[1])), field, *sizes)
+    track = track_robot(views, field, rate=rate, odometry=motions, **how, **settings)
+    write_report(files.as_json, track.report(), outputs)
+    shown = ""
+    if files.out is not None:
+        with outputs.folder(files.out) as inside:
+            track.write(inside)
+        shown = f"\nlook at {files.out / 'track.png'} and {files.out / 'track.csv'}"
+    echo(track.summary() + shown, err=prints_report(files.as_json))
+
+
 def _scan(
     picture: npt.NDArray[np.generic],
     field: Field,
@@ -132,10 +212,24 @@ def _scan(
     **settings: Any,
 ) -> FloorScan:
     """Find points on the lines of the floor in a top view, or in the view of a camera on the robot."""
-    from gpuvision.formats.camera_file import read_lens, read_mounted
-    from gpuvision.workflows.locating_robot import default_line_width, scan_floor
+    from gpuvision.workflows.locating_robot import scan_floor
 
     shape = (int(picture.shape[0]), int(picture.shape[1]))
+    return scan_floor(picture, **_scan_settings(shape, field, camera, scale, line_width, blind_radius), **settings)
+
+
+def _scan_settings(
+    shape: tuple[int, int],
+    field: Field,
+    camera: Path | None,
+    scale: float | None,
+    line_width: str | None,
+    blind_radius: str | None,
+) -> dict[str, Any]:
+    """Return the parameters of `scan_floor` for images of one shape."""
+    from gpuvision.formats.camera_file import read_lens, read_mounted
+    from gpuvision.workflows.locating_robot import default_line_width
+
     mounted = None if camera is None else read_mounted(camera, shape)
     if mounted is not None:
         reason = f"with {camera}, whose table [mount] gives height and tilt"
@@ -143,11 +237,9 @@ def _scan(
     elif scale is None:
         raise ValueError("--scale is missing: the size of a pixel on the floor, such as 1cm")
     width = default_line_width(field) if line_width is None else quantities(line_width, "--line-width", "m")[0]
-    return scan_floor(
-        picture,
-        scale=scale,
-        line_width=width,
-        blind=0.0 if blind_radius is None else quantities(blind_radius, "--blind-radius", "m")[0],
-        model=mounted or (None if camera is None else read_lens(camera)),
-        **settings,
-    )
+    return {
+        "scale": scale,
+        "line_width": width,
+        "blind": 0.0 if blind_radius is None else quantities(blind_radius, "--blind-radius", "m")[0],
+        "model": mounted or (None if camera is None else read_lens(camera)),
+    }

@@ -1,8 +1,9 @@
-"""Picture of a located robot: its view with the field's lines, and the field with the pose candidates."""
+"""Pictures of a located robot: its view with the field's lines, the field with the pose candidates, and its track."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,15 @@ from matplotlib.patches import Ellipse
 from gpuvision.host.files import atomic_write
 from gpuvision.matching.field.distance_map import Field
 from gpuvision.matching.field.located_robot import LocatedRobot
+from gpuvision.matching.field.robot_filter import RobotState
+from gpuvision.status import Status
 
 Float64 = npt.NDArray[np.float64]
 
 _DPI = 130
 _CARPET, _LINE, _ON, _OFF, _BEST, _OTHER = "#2e7d4f", "#ffffff", "#00e5ff", "#ff9f1c", "#d50000", "#5d4037"
 _ELLIPSE = 3.0  # sigmas
+_ELLIPSE_EVERY = 10  # frames of a track
 
 
 def draw_located_robot(
@@ -47,6 +51,47 @@ def draw_located_robot(
     _draw_view(left, located, image)
     _draw_field(right, located)
     figure.suptitle(located.summary(), fontsize=8, x=0.01, ha="left")
+    with atomic_write(path, overwrite=overwrite) as file:
+        figure.savefig(file, format="png")
+
+
+def draw_robot_track(path: str | Path, field: Field, states: Sequence[RobotState], *, overwrite: bool = False) -> None:
+    """Draw the poses of a robot over time on its field, as PNG.
+
+    Parameters
+    ----------
+    path
+        File to write; it is replaced only once the picture is complete.
+    field
+        The field.
+    states
+        State at each frame: ambiguous ones are drawn in another colour, 3 sigma ellipses at every tenth frame.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
+    """
+    figure = Figure(figsize=(9.0, 6.5), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    axes.set_facecolor(_CARPET)
+    axes.add_collection(LineCollection(field_lines(field), colors=_LINE, linewidths=1.5))
+    for name, colour, which in (
+        ("certain", _ON, [not each.status for each in states]),
+        ("ambiguous", _OFF, [each.status == Status.AMBIGUOUS for each in states]),
+    ):
+        poses = np.array([each.pose for each, there in zip(states, which, strict=True) if there]).reshape(-1, 3)
+        axes.plot(poses[:, 0], poses[:, 1], ".", color=colour, markersize=4.0, label=f"{len(poses)} frames {name}")
+    for each in [*states[::_ELLIPSE_EVERY], states[-1]]:
+        if np.all(np.isfinite(each.covariance)):
+            axes.add_patch(_ellipse(each.pose, each.covariance, _BEST if each is states[-1] else _OTHER))
+    axes.set(
+        aspect="equal",
+        xlabel="x [m]",
+        ylabel="y [m]",
+        xlim=(-0.56 * field.length, 0.56 * field.length),
+        ylim=(-0.6 * field.width, 0.6 * field.width),
+    )
+    axes.set_title("track of the robot, 3 sigma ellipses at every tenth frame and at the last", fontsize=9, loc="left")
+    axes.legend(loc="lower left", fontsize=7)
     with atomic_write(path, overwrite=overwrite) as file:
         figure.savefig(file, format="png")
 

@@ -1,0 +1,242 @@
+"""Follow a robot through a recording of views: pose, covariance and probability at every frame.
+
+References
+----------
+.. [1] S. Thrun, W. Burgard and D. Fox, *Probabilistic Robotics*, MIT Press 2005, chapter 7.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device, Source
+from gpuvision.host.errors import RecordingError
+from gpuvision.host.files import write_text_atomic
+from gpuvision.host.reading import reading
+from gpuvision.matching.field.distance_map import Field
+from gpuvision.matching.field.odometry import PoseEstimate
+from gpuvision.matching.field.robot_filter import RobotFilter, RobotFilterLimits, RobotState
+from gpuvision.plots.field import draw_robot_track
+from gpuvision.workflows.locating_robot import locate_robot, scan_floor
+
+Float64 = npt.NDArray[np.float64]
+
+TRACK_FILES = ("track.csv", "track.json", "track.png")
+_COLUMNS = ("frame", "time", "x", "y", "theta", "sigma_x", "sigma_y", "sigma_theta", "probability", "status")
+_ODOMETRY = "forward,left,turn"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionUncertainty:
+    """Standard deviations of a robot's motion.
+
+    Parameters
+    ----------
+    speed, turn_rate : float
+        Of the unknown motion without odometry [m/s], [rad/s] (chosen: a walking pace and a quarter turn a second).
+    share : float
+        Of odometry, relative to the distance and to the turn (chosen: wheels on a carpet).
+    least, least_turn : float
+        Least ones of odometry for a frame [m], [rad] (chosen).
+    initial, initial_turn : float
+        Of a given first pose [m], [rad] (chosen: placed by hand).
+    """
+
+    speed: float = 1.0
+    turn_rate: float = 1.5
+    share: float = 0.1
+    least: float = 2e-3
+    least_turn: float = 2e-3
+    initial: float = 0.5
+    initial_turn: float = 0.35
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RobotTrack:
+    """Track of a robot.
+
+    Attributes
+    ----------
+    states
+        State after each frame.
+    refused
+        Reason of each frame whose view was refused, by its number.
+    field
+        The field.
+    device
+        Where it ran.
+    """
+
+    states: tuple[RobotState, ...]
+    refused: dict[int, str]
+    field: Field
+    device: Device
+
+    def summary(self) -> str:
+        """Return the number of frames and the last pose in two lines."""
+        last = self.states[-1]
+        found = f"{len(self.states)} frames, {len(self.refused)} of them refused; last state {last.status.name or 'OK'}"
+        x, y, theta = last.pose
+        sigmas = np.sqrt(np.diag(last.covariance))
+        return (
+            f"{found}, probability {last.probability:.3f}\nx {x:.3f} m, y {y:.3f} m, heading {math.degrees(theta):.2f} "
+            f"degrees; sigmas {1e3 * sigmas[0]:.2g} mm, {1e3 * sigmas[1]:.2g} mm, {math.degrees(sigmas[2]):.2g} degrees"
+        )
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row for each frame: metres, radians, seconds; None where a value is not known."""
+        rows = []
+        for number, state in enumerate(self.states):
+            values = (*state.pose, *np.sqrt(np.diag(state.covariance)))
+            numbers = [float(each) if math.isfinite(each) else None for each in values]
+            row = (number, state.time, *numbers, state.probability, state.status.name or "OK")
+            rows.append(dict(zip(_COLUMNS, row, strict=True)))
+        return rows
+
+    def report(self) -> dict[str, Any]:
+        """Return the content of ``track.json``."""
+        states = [
+            row
+            | {
+                "covariance": None if row["x"] is None else state.covariance.tolist(),
+                "hypotheses": [
+                    {"pose": each.estimate.pose.tolist(), "probability": each.probability} for each in state.hypotheses
+                ],
+                "refused": self.refused.get(number),
+            }
+            for number, (row, state) in enumerate(zip(self.rows(), self.states, strict=True))
+        ]
+        return {
+            "gpuvision": version("gpuvision"),
+            "field": self.field.name,
+            "symmetric": self.field.is_symmetric,
+            "frames": states,
+            "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
+        }
+
+    def write(self, folder: Path) -> None:
+        """Write ``track.csv``, ``track.json`` and the picture ``track.png`` into a folder."""
+        text = io.StringIO()
+        writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.rows())
+        write_text_atomic(folder / "track.csv", text.getvalue())
+        write_text_atomic(folder / "track.json", json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
+        draw_robot_track(folder / "track.png", self.field, self.states)
+
+
+def track_robot(
+    source: Source,
+    field: Field,
+    *,
+    rate: float,
+    odometry: npt.ArrayLike | None = None,
+    initial_pose: tuple[float, float, float] | None = None,
+    uncertainty: MotionUncertainty = MotionUncertainty(),
+    limits: RobotFilterLimits = RobotFilterLimits(),
+    device: Device | None = None,
+    **scan: Any,
+) -> RobotTrack:
+    """Follow a robot through a recording.
+
+    Parameters
+    ----------
+    source
+        Views; the source is closed at the end.
+    field
+        The field.
+    rate
+        Frames per second, above 0.
+    odometry
+        (frames - 1, 3) motions (forward, left, turn) from each frame to the next [m], [m], [rad]. None: unknown.
+    initial_pose
+        Pose at the first frame, x, y [m], heading [rad]; needed to tell the two poses on a symmetric field apart. None:
+        unknown.
+    uncertainty, limits
+        Standard deviations of the motion, and thresholds of the filter.
+    device
+        Where to run; None: `Device.best`.
+    **scan
+        Parameters of `scan_floor`: ``line_width``, and ``scale`` or ``model``, ...
+
+    Raises
+    ------
+    ValueError
+        The rate is not above 0, or the odometry has another number of rows than there are motions.
+    RecordingError
+        A frame cannot be read, or there is none.
+    """
+    if not 0.0 < rate < math.inf:
+        raise ValueError(f"the rate is {rate}, expected frames per second above 0")
+    device = Device.best() if device is None else device
+    motions = None if odometry is None else np.asarray(odometry, np.float64).reshape(-1, 3)
+    initial = None
+    if initial_pose is not None:
+        sigmas = np.array([uncertainty.initial, uncertainty.initial, uncertainty.initial_turn])
+        initial = PoseEstimate(np.array(initial_pose, np.float64), np.diag(sigmas**2))
+    robot, states, refused = RobotFilter(field, initial, limits=limits), list[RobotState](), dict[int, str]()
+    frame, arrived = np.empty((1, *source.shape), source.dtype), np.zeros(1, np.int64)
+    try:
+        while source.wait() and source.read_into(frame, arrived):
+            number = len(states)
+            if number:
+                if motions is not None and number > len(motions):
+                    raise ValueError(f"the odometry has {len(motions)} motions, fewer than between the frames")
+                robot.move(number / rate, *_motion(motions, number - 1, rate, uncertainty))
+            located = locate_robot(scan_floor(frame[0], device=device, **scan), field, device=device)
+            if located.reason:
+                refused[number] = located.reason
+            robot.see(number / rate, located.candidates)
+            states.append(robot.state())
+    finally:
+        source.close()
+    if not states:
+        raise RecordingError("the recording has no frame")
+    if motions is not None and len(motions) != len(states) - 1:
+        raise ValueError(
+            f"the odometry has {len(motions)} motions, expected {len(states) - 1} between {len(states)} frames"
+        )
+    return RobotTrack(states=tuple(states), refused=refused, field=field, device=device)
+
+
+def _motion(
+    motions: Float64 | None, number: int, rate: float, uncertainty: MotionUncertainty
+) -> tuple[Float64, Float64]:
+    """Return the motion between two frames with its covariance."""
+    if motions is None:
+        sigmas = np.array([uncertainty.speed, uncertainty.speed, uncertainty.turn_rate]) / rate
+        return np.zeros(3), np.diag(sigmas**2)
+    forward, left, turn = motions[number]
+    moved = uncertainty.least + uncertainty.share * math.hypot(forward, left)
+    sigmas = np.array([moved, moved, uncertainty.least_turn + uncertainty.share * abs(turn)])
+    return motions[number], np.diag(sigmas**2)
+
+
+def read_odometry(path: Path) -> Float64:
+    """Read the motions between frames: CSV with the header ``forward,left,turn`` [m], [m], [rad].
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    RecordingError
+        The file has another header or content.
+    """
+    with reading(path, "list of motions", RecordingError):
+        head, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
+        if head.replace(" ", "") != _ODOMETRY:
+            raise RecordingError(f"{path}: the header is {head[:60]!r}, expected {_ODOMETRY}")
+        motions = np.array([[float(each) for each in line.split(",")] for line in lines if line], np.float64)
+    if motions.size and (motions.ndim != 2 or motions.shape[1] != 3 or not np.isfinite(motions).all()):
+        raise RecordingError(f"{path}: expected three finite numbers in each line")
+    return motions.reshape(-1, 3)

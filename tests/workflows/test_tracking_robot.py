@@ -1,0 +1,115 @@
+"""A robot through a recording of top views: its track, and the files of the command."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from floors import floor_image
+from gpuvision.cli import main as cli
+from gpuvision.formats.field_file import read_field
+from gpuvision.host import ArraySource
+from gpuvision.host.errors import RecordingError
+from gpuvision.matching.field.odometry import PoseEstimate, predict
+from gpuvision.status import Status
+from gpuvision.workflows.tracking_robot import read_odometry, track_robot
+
+SCALE, SHAPE, WIDE = 0.04, (300, 330), 0.125
+MOTION = np.array([0.15, 0.02, 0.04])
+START = np.array([-3.0, 1.0, 0.4])
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[np.ndarray, np.ndarray]:
+    """Return grey views of a robot that drives a curve, the third one of a bare carpet, and its true poses."""
+    rng, field, zero = np.random.default_rng(3), read_field("robocup_msl"), np.zeros((3, 3))
+    poses, views = [START], []
+    for number in range(5):
+        if number:
+            poses.append(predict(PoseEstimate(poses[-1], zero), MOTION, zero).pose)
+        colour = floor_image(field, tuple(poses[-1]), scale=SCALE, shape=SHAPE, line_width=WIDE, rng=rng)
+        views.append(colour.min(axis=2) if number != 2 else np.full(SHAPE, 50, np.uint8))
+    return np.stack(views), np.stack(poses)
+
+
+def test_a_track_from_a_known_pose_is_certain(drive: tuple[np.ndarray, np.ndarray]) -> None:
+    views, true = drive
+    odometry = np.tile(MOTION, (len(views) - 1, 1))
+    track = track_robot(
+        ArraySource(views),
+        read_field("robocup_msl"),
+        rate=10.0,
+        odometry=odometry,
+        initial_pose=tuple(np.add(START, (0.2, -0.1, 0.1))),
+        scale=SCALE,
+        line_width=WIDE,
+    )
+    assert list(track.refused) == [2]
+    assert [state.status for state in track.states] == [Status.OK] * len(views)
+    for state, pose in zip(track.states, true, strict=True):
+        error = state.pose - pose
+        assert np.abs(error[:2]).max() < 0.06
+        assert abs(error[2]) < 0.02
+        assert error @ np.linalg.solve(state.covariance, error) < 30
+    # Without a view the odometry alone goes on, with a larger covariance.
+    assert track.states[2].covariance[0, 0] > track.states[1].covariance[0, 0]
+    assert [state.time for state in track.states] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+
+
+def test_the_command_writes_the_track(
+    drive: tuple[np.ndarray, np.ndarray],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    views, true = drive
+    np.save(tmp_path / "views.npy", views[:2])
+    (tmp_path / "odometry.csv").write_text("forward,left,turn\n0.15,0.02,0.04\n")
+    start = f"--initial-pose={START[0]},{START[1]},{START[2]}"
+    where = [
+        "--field",
+        "robocup_msl",
+        "--scale",
+        "4cm",
+        "--rate",
+        "10",
+        "--odometry",
+        str(tmp_path / "odometry.csv"),
+        start,
+    ]
+    monkeypatch.setattr(
+        "sys.argv", ["gpuvision", "locate-robot", str(tmp_path / "views.npy"), *where, "--out", str(tmp_path / "out")]
+    )
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert not end.value.code
+    assert capsys.readouterr().out.startswith("2 frames, 0 of them refused; last state OK")
+    with (tmp_path / "out" / "track.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    report = json.loads((tmp_path / "out" / "track.json").read_text())
+    for row, entry, pose in zip(rows, report["frames"], true, strict=False):
+        for name, value in zip(("x", "y", "theta"), pose, strict=True):
+            assert abs(float(row[name]) - value) < 6 * float(row[f"sigma_{name}"]) + 1e-3
+            assert entry[name] == float(row[name])
+        assert math.sqrt(entry["covariance"][0][0]) == pytest.approx(float(row["sigma_x"]))
+    assert (tmp_path / "out" / "track.png").stat().st_size > 1000
+
+
+def test_wrong_odometry_is_refused(drive: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    views, _ = drive
+    source, field = ArraySource(views[:1]), read_field("robocup_msl")
+    with pytest.raises(ValueError, match="has 2 motions, expected 0 between 1 frames"):
+        track_robot(source, field, rate=10.0, odometry=np.zeros((2, 3)), scale=SCALE, line_width=WIDE)
+    with pytest.raises(ValueError, match="rate"):
+        track_robot(source, field, rate=0.0, scale=SCALE, line_width=WIDE)
+    (tmp_path / "a.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(RecordingError, match="expected forward,left,turn"):
+        read_odometry(tmp_path / "a.csv")
+    (tmp_path / "b.csv").write_text("forward,left,turn\n1,2,nan\n")
+    with pytest.raises(RecordingError, match="three finite numbers"):
+        read_odometry(tmp_path / "b.csv")

@@ -12,11 +12,15 @@ import numpy as np
 import pytest
 import trimesh
 
+from gpuvision.camera.polynomial import PlanePolynomial
 from gpuvision.host import Device
+from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.schema import Section
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.simulated import make_sensor_view
 from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.sensor_view import SensorView
 from gpuvision.workflows.simulating import load_part, prepare_simulation, simulate
 
 MATRIX = ((1600.0, 0.0, 239.5), (0.0, 1600.0, 44.0), (0.0, 0.0, 1.0))
@@ -57,6 +61,40 @@ def test_the_view_is_that_of_opencv(rng: np.random.Generator) -> None:
     rays = view.rays(found[:, 0], found[:, 1])
     beside = np.cross(scene - rays[:, :3], rays[:, 3:])
     assert np.abs(beside).max() < 1e-9
+
+
+def polynomial_view() -> SensorView:
+    """Return a view by polynomials with distortion of some percent, about 0.1 m by 0.08 m of the sheet."""
+    polynomial = PlanePolynomial(
+        p=(-0.05, 8e-5, 2e-6, 3e-10, 5e-9, -1e-10, 2e-13, 4e-13),
+        q=(-0.04, -7.5e-5, 1e-6, 4e-9, 2e-10, 3e-10, -3e-13, 2e-13),
+        region=((0.0, 1279.0), (0.0, 1023.0)),
+    )
+    return SensorView(
+        triangulation=Triangulation.from_polynomial(polynomial),
+        transport=StraightTransport(step=1e-3),
+        lens=(0.0, -0.2, 0.3),
+        u_edges=np.arange(100.0, 900.0),
+        v_edges=np.arange(100.0, 1100.0),
+    )
+
+
+@pytest.mark.parametrize("which", ["camera", "polynomial"])
+def test_etendue_is_the_solid_angle_of_a_pixel(which: str, rng: np.random.Generator) -> None:
+    """Numerically: the area of the sheet that a pixel sees, over the squared distance, times the aperture."""
+    view = make_sensor_view(sensor()) if which == "camera" else polynomial_view()
+    u, v = (rng.uniform(edges[0] + 5, edges[-1] - 5, 50) for edges in (view.u_edges, view.v_edges))
+    step = 0.05
+    point = view.points_in_sheet(u, v)
+    along = view.points_in_sheet(u + step, v) - view.points_in_sheet(u - step, v)
+    across = view.points_in_sheet(u, v + step) - view.points_in_sheet(u, v - step)
+    area = np.cross(along, across) / (2.0 * step) ** 2
+    rays = point - np.array(view.lens)
+    distance = np.linalg.norm(rays, axis=-1)
+    solid = np.abs(np.sum(area * rays, axis=-1)) / distance**3
+    expected = 0.25 * math.pi * view.aperture**2 * (rays @ np.array(view.axis)) / distance * solid
+    np.testing.assert_allclose(view.etendue(u, v), expected, rtol=1e-6)
+    np.testing.assert_allclose(view.project(point), np.stack([u, v], axis=-1), rtol=0, atol=1e-7)
 
 
 def test_a_scan_of_the_simulation_finds_the_part(device: Device, tmp_path: Any) -> None:

@@ -78,7 +78,9 @@ def check_calibrated_size(
     file: str | Path,
     size: tuple[int, int],
     calibrated_size: tuple[int, int] | None,
-    part: tuple[tuple[int, int], int] | None = None,
+    part: tuple[tuple[float, float], int] | None = None,
+    *,
+    hint: str = "give the window and the binning of these images to gpuvision undistort, or calibrate at this size",
 ) -> None:
     """Check that an image shows the sensor pixels for which a camera model was calibrated.
 
@@ -90,9 +92,11 @@ def check_calibrated_size(
         Columns and rows of the image.
     calibrated_size : (int, int) or None
         Columns and rows of the calibrated images, see `read_calibrated_size`; None: no check.
-    part : ((int, int), int), optional
+    part : ((float, float), int), optional
         Part of the sensor that the image shows: column and row of its first pixel in the calibrated image, and
         calibrated pixels per pixel along each axis. Default: the whole sensor.
+    hint : str
+        Last part of the message for an image of another size without a `part`.
 
     Raises
     ------
@@ -104,9 +108,7 @@ def check_calibrated_size(
     columns, rows = size
     said = f"{file}: {columns} x {rows} pixels, the model was calibrated at {calibrated_size[0]} x {calibrated_size[1]}"
     if part is None:
-        raise ValueError(
-            f"{said}; give the window and the binning of these images to gpuvision undistort, or calibrate at this size"
-        )
+        raise ValueError(f"{said}; {hint}")
     window, binning = part
     ends = (window[0] + columns * binning, window[1] + rows * binning)
     if min(window) < 0 or ends[0] > calibrated_size[0] or ends[1] > calibrated_size[1]:

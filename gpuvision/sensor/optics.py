@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
-from gpuvision.formats.camera_file import camera_of, radial_lens, read_calibrated_size, read_lens
+from gpuvision.formats.camera_file import camera_of, check_calibrated_size, radial_lens, read_calibrated_size, read_lens
 from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Along
 from gpuvision.schema import Section
@@ -66,7 +66,7 @@ def _lens(table: Section, frame: Frame | None, along: Along, axes: SampleAxes) -
         raise table.error(
             f"{path} has a table [camera], expected [lens]: name it in [camera], or calibrate with --method lines"
         )
-    _check_size(table, path, frame)
+    _check_size(table, path, frame, window)
     with table.checking():
         return _in_sensor_coordinates(lens.in_window(window), along, axes)
 
@@ -81,7 +81,7 @@ def _camera(table: Section, frame: Frame | None) -> Camera:
     camera = read_lens(path)
     if not isinstance(camera, Camera):
         raise table.error(f"{path} has a table [lens], expected [camera]: name it in [lens], or calibrate with views")
-    _check_size(table, path, frame)
+    _check_size(table, path, frame, window)
     return camera.in_window(window)
 
 
@@ -90,14 +90,14 @@ def _window(table: Section) -> tuple[float, float]:
     return column, row
 
 
-def _check_size(table: Section, path: Path, frame: Frame | None) -> None:
-    """Check that the frames are as large as the calibrated images, unless the table says which window they show."""
-    size = read_calibrated_size(path)
-    if frame is not None and size is not None and size != frame[::-1] and "window" not in table:
-        raise table.error(
-            f"{path} is for images of {size[0]} x {size[1]} pixels, the frames have {frame[1]} x {frame[0]}; "
-            f"give {table.dotted('window')}, the column and row of a frame's first pixel in those images"
-        )
+def _check_size(table: Section, path: Path, frame: Frame | None, window: tuple[float, float]) -> None:
+    """Check that the frames are as large as the calibrated images, or that their window lies within those."""
+    if frame is None:
+        return
+    part = (window, 1) if "window" in table else None
+    hint = f"give {table.dotted('window')}, the column and row of a frame's first pixel in the calibrated images"
+    with table.checking():
+        check_calibrated_size(f"frames of {path}", frame[::-1], read_calibrated_size(path), part, hint=hint)
 
 
 def _in_sensor_coordinates(lens: Lens, along: Along, axes: SampleAxes) -> Lens:

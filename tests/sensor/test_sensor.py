@@ -495,8 +495,10 @@ def test_the_lens_of_a_calibration_acts_on_the_pixels_of_the_frames(
 
 
 def test_the_lens_of_a_calibration_for_other_images_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DescriptionError, match=r"images of 1920 x 1080 pixels, the frames have 480 x 64; .*window"):
+    with pytest.raises(DescriptionError, match=r"480 x 64 pixels, .* calibrated at 1920 x 1080; give lens\.window"):
         with_lens_file(tmp_path, (1920, 1080))
+    with pytest.raises(DescriptionError, match=r"window from \(1500.0, 0.0\) with binning 1 ends at .*, outside"):
+        with_lens_file(tmp_path, (1920, 1080), lens__window=[1500.0, 0.0])
     assert with_lens_file(tmp_path, None).readout.triangulation is not None
     with pytest.raises(DescriptionError, match=r"pitches of equal size in \[axes\]"):
         with_lens_file(tmp_path, axes__sample_pitch=2.0)
@@ -609,7 +611,7 @@ def test_errors_of_a_calibrated_camera(tmp_path: Path) -> None:
     camera = TILTED_CAMERA.to_dict()
     write_lens(tmp_path / "camera.toml", TILTED_CAMERA, {"image": {"size": [1920, 1080]}})
     write_lens(tmp_path / "lens.toml", PIXEL_LENS, {})
-    with pytest.raises(DescriptionError, match=r"images of 1920 x 1080 pixels, .* give camera\.window"):
+    with pytest.raises(DescriptionError, match=r"calibrated at 1920 x 1080; give camera\.window"):
         with_camera({"file": "camera.toml"}, tmp_path)
     with pytest.raises(DescriptionError, match=r"has a table \[lens\], expected \[camera\]"):
         with_camera({"file": "lens.toml"}, tmp_path)

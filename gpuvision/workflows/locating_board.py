@@ -26,13 +26,9 @@ from gpuvision.camera.undistort_image import UndistortImage
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.board.copper_support import find_other_pose
-from gpuvision.matching.board.edge_measurement import (
-    BoardMeasurement,
-    BoardMeasurer,
-    Copper,
-    move_view,
-)
+from gpuvision.matching.board.edge_measurement import BoardMeasurer, move_view
 from gpuvision.matching.board.located_board import LocatedBoard
+from gpuvision.matching.board.measurement_result import BoardMeasurement, Copper
 from gpuvision.matching.board.view_features import select_features_in_view
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.imaging import Imaging

@@ -28,8 +28,9 @@ from gpuvision.formats.camera_file import write_lens
 from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
-from gpuvision.matching.board.edge_measurement import BoardMeasurer, MeasurementLimits
+from gpuvision.matching.board.edge_measurement import BoardMeasurer
 from gpuvision.matching.board.located_board import LocatedBoard
+from gpuvision.matching.board.measurement_result import MeasurementLimits
 from gpuvision.workflows.locating_board import _reason_of_ambiguity, locate_board
 from gpuvision.workflows.locating_robot import floor_points
 

@@ -11,166 +11,38 @@ References
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device, to_numpy
-from gpuvision.matching.board.fiducial_detection import MIN_WEIGHT, FoundFiducials, find_fiducials
+from gpuvision.matching.board.fiducial_detection import FoundFiducials, find_fiducials
+from gpuvision.matching.board.measurement_result import (
+    BoardMeasurement,
+    Copper,
+    MeasurementLimits,
+    PoseSolution,
+    RulerMeasurements,
+    ScaleError,
+    count_true,
+    refuse_measurement,
+)
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.fiducials import search_distance
-from gpuvision.matching.features.ruler import MAX_LENGTH, SAMPLING_SIGMA_PX, RulerEdges
+from gpuvision.matching.features.ruler import MAX_LENGTH, RulerEdges
 from gpuvision.matching.pose.pose import BoardPose, SolvePose, Transform, line_rows
 from gpuvision.status import Status
 
-Copper = Literal["auto", "bright", "dark"]
 Float64 = npt.NDArray[np.float64]
 
 _MAX_SEARCH_PX = 190.0  # largest search range of fiducials: their rulers fit into `MAX_LENGTH` samples
+_SPACING_GROUP = 1.2  # largest by smallest spacing of a group of rulers (chosen: launches against room for edges)
 # Start candidates of the robust pose: with 50 % outliers all four rows of a candidate are good often enough, so that
 # all candidates contain an outlier on 7 of 1e8 boards (derived).
-_SPACING_GROUP = 1.2  # largest by smallest spacing of a group of rulers (chosen: launches against room for edges)
 _TRIALS = 256
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeasurementLimits:
-    """Thresholds of the measurement of a board.
-
-    Parameters
-    ----------
-    second_range_px
-        Search range of the second pass [px] (chosen: several times the error of a first pass).
-    sampling_sigma_px
-        Standard deviation of the error that bilinear sampling adds to an edge [px]; neighbouring rulers share a part of
-        it (measured).
-    min_share
-        Least share of the rulers and fiducials in the image that must agree with the pose, and least inlier fraction of
-        the pose (chosen).
-    min_count
-        Least number of rulers and fiducials that must agree: as many as unknowns of a rigid pose.
-    max_residual_px
-        Largest accepted scale of the residuals [px]: more is another board or a wrong scale (chosen).
-    fiducial_slack_px
-        Largest accepted distance of a fiducial beyond its expected search range, besides the etch bias [px] (chosen).
-    range_factor, min_angle
-        A pose of the first pass is refused beyond this multiple of the expected search range (rulers find no edge
-        farther away), with at least this angle [rad] (chosen).
-    scale_significance
-        Error of the scale that is significant [standard deviations] (4: one false alarm in 16 000 for normal errors).
-    max_board_scale, max_scale_effect
-        A pose is refused if the error of the scale is larger than the first number (chosen: laminate shrinks by up to
-        0.1 %) and moves the pose by more than the second one [standard deviations] (chosen).
-    """
-
-    second_range_px: float = 4.0
-    sampling_sigma_px: float = SAMPLING_SIGMA_PX
-    min_share: float = 0.3
-    min_count: int = 3
-    max_residual_px: float = 0.5
-    fiducial_slack_px: float = 1.0
-    range_factor: float = 2.0
-    min_angle: float = 5e-3
-    scale_significance: float = 4.0
-    max_board_scale: float = 2e-3
-    max_scale_effect: float = 3.0
-
-
-class RulerMeasurements(NamedTuple):
-    """Measurements of calipers (rulers), (n, ...); pixel coordinates refer to the undistorted image.
-
-    Attributes
-    ----------
-    point, normal : (n, 2)
-        On the board, as in `FeatureSet`.
-    length_px : (n,)
-        Length along the normal [px].
-    position_px : (n,)
-        Position of the edge from the ruler's centre, along the normal [px]; NaN where no edge was found.
-    sigma : (n,)
-        Standard deviation of the edge's position on the board [m].
-    weight : (n,)
-        Weight in the pose, 0 (outlier, or no edge) to 1.
-    residual : (n,)
-        Residual of the pose along the normal [m].
-    status : (n,), uint8
-        `Status` flags, as in `gpuvision.matching.features.ruler.Edges`.
-    """
-
-    point: Float64
-    normal: Float64
-    length_px: Float64
-    position_px: Float64
-    sigma: Float64
-    weight: Float64
-    residual: Float64
-    status: npt.NDArray[np.uint8]
-
-    @property
-    def in_image(self) -> npt.NDArray[np.bool_]:
-        """(n,) which rulers lie in the image."""
-        return np.asarray((self.status & Status.OUT_OF_RANGE) == 0)
-
-    @property
-    def found(self) -> npt.NDArray[np.bool_]:
-        """(n,) which rulers found an edge."""
-        return np.isfinite(self.position_px)
-
-    @property
-    def used(self) -> npt.NDArray[np.bool_]:
-        """(n,) which rulers found an edge that agrees with the pose."""
-        return self.weight > MIN_WEIGHT
-
-
-class ScaleError(NamedTuple):
-    """Relative error of the given image scale, and its sigma: 0.001 for a board that appears 0.1 % larger."""
-
-    value: float
-    sigma: float
-
-
-class PoseSolution(NamedTuple):
-    """Result of one pass: pose, covariance at the placement point, and the reason of a refusal or ``""``.
-
-    ``scale_error`` has NaN where the features do not determine it, and in the first pass.
-    """
-
-    pose: Float64
-    covariance: Float64
-    etch_bias: float
-    residual_scale: float
-    condition: float
-    rulers: RulerMeasurements
-    fiducials: FoundFiducials
-    reason: str
-    scale_error: ScaleError = ScaleError(math.nan, math.nan)
-    warnings: tuple[str, ...] = ()
-
-
-class BoardMeasurement(NamedTuple):
-    """Result of two passes, or of a refused first pass: the camera's pose after and before the last pass."""
-
-    view: BoardView
-    before: BoardView
-    solution: PoseSolution
-
-    @property
-    def rulers(self) -> RulerMeasurements:
-        """Measurements of the last pass."""
-        return self.solution.rulers
-
-    @property
-    def agreeing(self) -> int:
-        """Number of rulers and fiducials that agree with the pose."""
-        return _count(self.solution.rulers.used, self.solution.fiducials.used)
-
-    @property
-    def reason(self) -> str:
-        """Why the pose is refused; empty where it is accepted."""
-        return self.solution.reason
 
 
 class BoardMeasurer:
@@ -248,14 +120,14 @@ class BoardMeasurer:
         rulers = self._measure_rulers(view, copper, length_px)
         fiducials = self._find_fiducials(view, copper, is_first=search_range is not None)
         features = "rulers and fiducials" if len(fiducials.in_image) else "rulers"
-        in_image, found = _count(rulers.in_image, fiducials.in_image), _count(rulers.found, fiducials.found)
+        in_image, found = count_true(rulers.in_image, fiducials.in_image), count_true(rulers.found, fiducials.found)
         least = self.limits.min_count
         if in_image < least:
             count = len(rulers.in_image) + len(fiducials.in_image)
             reason = f"{in_image} of {count} {features} lie in the image, expected {least} or more"
-            return _refuse(rulers, fiducials, reason)
+            return refuse_measurement(rulers, fiducials, reason)
         if found < least:
-            return _refuse(
+            return refuse_measurement(
                 rulers,
                 fiducials,
                 f"{found} of {in_image} {features} found an edge of {self.threshold:.3g} grey levels or more, expected "
@@ -339,8 +211,8 @@ class BoardMeasurer:
         rulers = rulers._replace(weight=np.nan_to_num(weights[:count]), residual=residuals[:count])
         fiducials = fiducials.with_pose(weights[count:], residuals[count:])
         if int(to_numpy(fit.status)):
-            found = _count(rulers.found, fiducials.found, fiducials.found)
-            return _refuse(rulers, fiducials, _reason_of(fit, found, self.limits))
+            found = count_true(rulers.found, fiducials.found, fiducials.found)
+            return refuse_measurement(rulers, fiducials, _reason_of(fit, found, self.limits))
         residual_scale = float(to_numpy(fit.residual_scale))
         solution = PoseSolution(
             pose=_about_origin(np.asarray(to_numpy(fit.pose), np.float64), self.features.placement),
@@ -428,7 +300,7 @@ class BoardMeasurer:
     def _check(self, solution: PoseSolution, residual_scale: float, scale: float) -> PoseSolution:
         """Refuse a pose with which too few rulers and fiducials agree, or agree too badly."""
         rulers, fiducials, limits = solution.rulers, solution.fiducials, self.limits
-        used, in_image = _count(rulers.used, fiducials.used), _count(rulers.in_image, fiducials.in_image)
+        used, in_image = count_true(rulers.used, fiducials.used), count_true(rulers.in_image, fiducials.in_image)
         if used < max(limits.min_count, limits.min_share * in_image):
             features = "rulers and fiducials" if len(fiducials.in_image) else "rulers"
             return solution._replace(
@@ -474,15 +346,6 @@ def _reason_of(fit: BoardPose, found: int, limits: MeasurementLimits) -> str:
     if math.isfinite(leverage) and leverage > 0.0:
         return "a part of the pose depends on a single edge that no other edge checks; use more features"
     return "the edges found do not determine x, y and theta (all parallel, or all through one point)"
-
-
-def _refuse(rulers: RulerMeasurements, fiducials: FoundFiducials, reason: str) -> PoseSolution:
-    unknown = np.full((3, 3), np.nan)
-    return PoseSolution(unknown[0], unknown, math.nan, math.nan, math.nan, rulers, fiducials, reason)
-
-
-def _count(*masks: npt.NDArray[np.bool_]) -> int:
-    return int(sum(each.sum() for each in masks))
 
 
 def _about_origin(pose: Float64, point: Float64) -> Float64:

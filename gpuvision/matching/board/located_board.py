@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device
-from gpuvision.matching.board.edge_measurement import Copper, RulerMeasurements, ScaleError
 from gpuvision.matching.board.fiducial_detection import FoundFiducials
+from gpuvision.matching.board.measurement_result import Copper, RulerMeasurements, ScaleError
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.pose.registration import Registration
 from gpuvision.status import Status

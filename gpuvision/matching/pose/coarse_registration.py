@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -129,7 +129,7 @@ class CoarseRegistration:
     max_candidates: int = 48
     min_score: float = 0.4
     etch_bias_sigma: float | None = None
-    limits: RegistrationLimits = field(default_factory=RegistrationLimits)
+    limits: RegistrationLimits = RegistrationLimits()
 
     def __post_init__(self) -> None:
         matrix = np.asarray(self.to_image, np.float64)

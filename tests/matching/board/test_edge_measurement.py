@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpuvision.camera.orthographic import BoardView
-from gpuvision.matching.board.edge_measurement import MeasurementLimits, _reason_of, move_view
+from gpuvision.matching.board.edge_measurement import _reason_of, move_view
+from gpuvision.matching.board.measurement_result import MeasurementLimits
 from gpuvision.status import Status
 
 LENGTHS = st.floats(-0.2, 0.2)

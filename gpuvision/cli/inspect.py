@@ -194,10 +194,8 @@ def inspect(
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host.outputs import Outputs
-    from gpuvision.inspection.paste import PasteSettings
-    from gpuvision.validation import finite
     from gpuvision.workflows.inspecting_leads import LEAD_FILES
-    from gpuvision.workflows.inspecting_paste import PASTE_FILES, VolumeLimits
+    from gpuvision.workflows.inspecting_paste import PASTE_FILES
 
     if not heights.exists():
         raise FileNotFoundError(f"{heights}: no such file")
@@ -213,10 +211,8 @@ def inspect(
         side="bottom" if side is Side.bottom else "top",
         layers=layers,
         pose=_pose(pose, "--pose"),
-        sigma=None if sigma is None else finite(_length(sigma, "--sigma"), "--sigma", above=0.0),
-        correlation_area=None
-        if correlation_area is None
-        else finite(correlation_area, "--correlation-area", minimum=1.0),
+        sigma=_sigma(sigma),
+        correlation_area=_correlation_area(correlation_area),
     )
     found: PasteInspection | LeadInspection
     if leads is not None:
@@ -248,18 +244,8 @@ def inspect(
         found = _inspect_paste(
             common,
             board,
-            PasteSettings(
-                stencil=quantities(stencil, "--stencil", "m")[0],
-                threshold=_length(threshold, "--threshold"),
-                margin=quantities(margin or "50um", "--margin", "m")[0],
-                ring=quantities(ring or "0.2mm", "--ring", "m")[0],
-                reference_order=1 if reference_order is None else reference_order,
-                pad_height=quantities(pad_height or "0", "--pad-height", "m")[0],
-            ),
-            VolumeLimits(
-                minimum=0.5 if minimum_volume is None else minimum_volume,
-                maximum=1.5 if maximum_volume is None else maximum_volume,
-            ),
+            _paste_settings(stencil, threshold, margin, ring, reference_order, pad_height),
+            _volume_limits(minimum_volume, maximum_volume),
             initial_pose=initial_pose,
             search_range=search_range,
             scale_sigma=scale_sigma,
@@ -385,6 +371,43 @@ def _regions(
     if board is None:
         raise ValueError(f"--leads is {leads!r}, a part: give --board too, or a CSV file of leads")
     return pads_of_part(read_artwork(board, side=side, layers=layers_of(layers)).pads, leads)
+
+
+def _paste_settings(
+    stencil: str, threshold: str | None, margin: str | None, ring: str | None, order: int | None, pad_height: str | None
+) -> PasteSettings:
+    """Parse the settings of the measurement of paste."""
+    from gpuvision.inspection.paste import PasteSettings
+
+    return PasteSettings(
+        stencil=quantities(stencil, "--stencil", "m")[0],
+        threshold=_length(threshold, "--threshold"),
+        margin=quantities(margin or "50um", "--margin", "m")[0],
+        ring=quantities(ring or "0.2mm", "--ring", "m")[0],
+        reference_order=1 if order is None else order,
+        pad_height=quantities(pad_height or "0", "--pad-height", "m")[0],
+    )
+
+
+def _volume_limits(minimum: float | None, maximum: float | None) -> VolumeLimits:
+    """Return the limits of the verdicts, 50 % and 150 % by default."""
+    from gpuvision.workflows.inspecting_paste import VolumeLimits
+
+    return VolumeLimits(minimum=0.5 if minimum is None else minimum, maximum=1.5 if maximum is None else maximum)
+
+
+def _sigma(text: str | None) -> float | None:
+    """Parse ``--sigma``: a length above 0; None without the option."""
+    from gpuvision.validation import finite
+
+    return None if text is None else finite(_length(text, "--sigma"), "--sigma", above=0.0)
+
+
+def _correlation_area(number: float | None) -> float | None:
+    """Check ``--correlation-area``: 1 or more; None without the option."""
+    from gpuvision.validation import finite
+
+    return None if number is None else finite(number, "--correlation-area", minimum=1.0)
 
 
 def _pose(text: str | None, option: str) -> tuple[float, float, float] | None:

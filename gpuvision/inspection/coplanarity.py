@@ -196,12 +196,7 @@ def measure_coplanarity(
     parts = [_region(heights, grid, each) for each in regions]
     noise = _noise(parts) if sigma is None else sigma
     sigmas = complete_sigmas(np.asarray(noise, np.float64), grid.shape)
-    tops = np.full((len(regions), 2), math.nan)
-    for index, (each, (part, inside, rows, columns)) in enumerate(zip(regions, parts, strict=True)):
-        if inside.any():
-            half = max(round(_TOP_PATCH * math.sqrt(each.area / (grid.cell_x * grid.cell_y))), 1)
-            found = top_height(part, inside, sigmas[rows, columns], half)
-            tops[index] = found.height, found.sigma * math.sqrt(correlated)
+    tops = _tops(regions, parts, sigmas, grid, correlated)
     place = np.array([each.centroid for each in regions]).reshape(-1, 2)
     known = np.flatnonzero(np.isfinite(tops[:, 0]))
     if len(known) < 3:
@@ -211,15 +206,8 @@ def measure_coplanarity(
     gravity = (float(place[:, 0].mean()), float(place[:, 1].mean())) if centre is None else centre
     plane = seating_plane(x, y, top, gravity)
     design = np.stack([np.ones_like(x), x - place[:, 0].mean(), y - place[:, 1].mean()], axis=1)
-    # Each row holds the weights of the tops in one gap: the height of the plane at the lead, less the lead's top.
-    through_seats = np.zeros((len(known), len(known)))
-    through_seats[:, plane.seats] = design @ np.linalg.inv(design[plane.seats])
-    to_gap = through_seats - np.eye(len(known))
-    to_deviation = np.eye(len(known)) - design @ np.linalg.pinv(design)
     result = np.full((4, len(regions)), math.nan)
-    for row, weights in ((0, to_gap), (2, to_deviation)):
-        result[row, known] = weights @ (top - top.mean())
-        result[row + 1, known] = np.sqrt((weights**2) @ top_sigma**2)
+    result[:, known] = _gaps_and_deviations(design, plane.seats, top, top_sigma)
     worst = int(np.nanargmax(result[0]))
     return Coplanarity(
         names=tuple(each.name for each in regions),
@@ -236,6 +224,34 @@ def measure_coplanarity(
         lowest=regions[worst].name,
         noise=float(np.median(sigmas)),
     )
+
+
+def _tops(
+    regions: Sequence[Aperture],
+    parts: Sequence[tuple[Float64, npt.NDArray[np.bool_], slice, slice]],
+    sigmas: Float64,
+    grid: Grid,
+    correlated: float,
+) -> Float64:
+    """Return the height of the top of each lead and its standard deviation, (n, 2); NaN where it is not measured."""
+    tops = np.full((len(regions), 2), math.nan)
+    for index, (each, (part, inside, rows, columns)) in enumerate(zip(regions, parts, strict=True)):
+        if inside.any():
+            half = max(round(_TOP_PATCH * math.sqrt(each.area / (grid.cell_x * grid.cell_y))), 1)
+            found = top_height(part, inside, sigmas[rows, columns], half)
+            tops[index] = found.height, found.sigma * math.sqrt(correlated)
+    return tops
+
+
+def _gaps_and_deviations(design: Float64, seats: npt.NDArray[np.int64], top: Float64, top_sigma: Float64) -> Float64:
+    """Return the gaps to the seating plane, their sigmas, the deviations from the least-squares plane, their sigmas."""
+    # Each row holds the weights of the tops in one gap: the height of the plane at the lead, less the lead's top.
+    through_seats = np.zeros((len(top), len(top)))
+    through_seats[:, seats] = design @ np.linalg.inv(design[seats])
+    rows: list[Float64] = []
+    for weights in (through_seats - np.eye(len(top)), np.eye(len(top)) - design @ np.linalg.pinv(design)):
+        rows += [weights @ (top - top.mean()), np.sqrt((weights**2) @ top_sigma**2)]
+    return np.stack(rows)
 
 
 def _region(z: Float64, grid: Grid, region: Aperture) -> tuple[Float64, npt.NDArray[np.bool_], slice, slice]:

@@ -24,8 +24,9 @@ import numpy.typing as npt
 from gpuvision.host.cache import cache_folder, is_private, read_private_bytes, write_private_bytes
 from gpuvision.host.reading import MAX_UNPACKED_BYTES
 from gpuvision.matching.artwork.board_artwork import Artwork, Holes, Pad
-from gpuvision.matching.artwork.board_files import MAX_BOARD_BYTES, MAX_BOARD_FILES, MAX_BOARD_OBJECTS
+from gpuvision.matching.artwork.board_files import MAX_BOARD_BYTES, MAX_BOARD_FILES
 from gpuvision.matching.artwork.edges import MAX_BOARD_COMPARISONS, BoardEdges
+from gpuvision.matching.artwork.gerber_parser import MAX_BOARD_OBJECTS
 from gpuvision.matching.artwork.shapes import MAX_BOARD_SIZE, Float64, Shape
 
 _LIMITS = (

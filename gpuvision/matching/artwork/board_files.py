@@ -31,15 +31,12 @@ from gerbonara.rs274x import GerberFile
 from gpuvision.host.errors import ReadError
 from gpuvision.host.reading import FileLimit, check_archive, reading
 from gpuvision.host.text import printable
-from gpuvision.matching.artwork.gerber_parser import parse_gerber
+from gpuvision.matching.artwork.gerber_parser import MAX_BOARD_OBJECTS, parse_gerber
 
 MAX_BOARD_FILES = FileLimit("GPUVISION_MAX_BOARD_FILES", 1000)
 """Files in the folder or ZIP file of a board. Chosen: 1000; boards have 10 to 60."""
 MAX_BOARD_BYTES = FileLimit("GPUVISION_MAX_BOARD_BYTES", 1 << 28)
 """Bytes of a file of a board. Chosen: 256 MiB."""
-MAX_BOARD_OBJECTS = FileLimit("GPUVISION_MAX_BOARD_OBJECTS", 100_000)
-"""Objects of a layer, repeated ones included. Chosen: 100 000, which take 110 MiB and 7 s to build. The largest layer
-of the boards in the tests has 23 000 objects; a panel of 100 boards with 1000 objects each is accepted."""
 # A command, as gerbonara splits a file: a comment, an extended command between %, or text up to an asterisk.
 _COMMAND = re.compile(r"G04[^*]*+\*|%[^%]*+%|[^*%]*+\*")
 _STEP_REPEAT = re.compile(r"SRX0*(\d+)Y0*(\d+)I")

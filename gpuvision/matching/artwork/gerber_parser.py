@@ -19,6 +19,11 @@ from gerbonara.apertures import CircleAperture, PolygonAperture
 from gerbonara.graphic_objects import Region
 from gerbonara.rs274x import GerberFile, GerberParser
 
+from gpuvision.host.reading import FileLimit
+
+MAX_BOARD_OBJECTS = FileLimit("GPUVISION_MAX_BOARD_OBJECTS", 100_000)
+"""Objects of a layer, repeated ones included. Chosen: 100 000, which take 110 MiB and 7 s to build. The largest layer
+of the boards in the tests has 23 000 objects; a panel of 100 boards with 1000 objects each is accepted."""
 _SHORT_CODE = re.compile(r"\AG(?=[1-3](?!\d))")  # G1, G2 and G3; gerbonara reads G01, G02 and G03
 # Name of a macro (section 3.4.5), and the statements with one; gerbonara expects two characters or more.
 _NAME = r"[a-zA-Z_$.][a-zA-Z_$.0-9+\-]*"
@@ -149,6 +154,9 @@ class _Parser(GerberParser):  # type: ignore[misc]  # gerbonara has no type anno
             columns, rows = int(match["X"]), int(match["Y"])
             if columns < 1 or rows < 1:
                 raise ValueError(f"a step-and-repeat of {columns} x {rows}, expected 1 x 1 or more")
+            # A % in other text hides the command from `check_gerber`, which splits the text otherwise.
+            copies = columns * rows
+            MAX_BOARD_OBJECTS.check(copies, f"a step-and-repeat of {copies} copies", ValueError)
             step = float(match["I"]), float(match["J"])
             self._block_start = len(self.target.objects)
             self._moves = [(step[0] * column, step[1] * row) for column in range(columns) for row in range(rows)]
@@ -160,6 +168,8 @@ class _Parser(GerberParser):  # type: ignore[misc]  # gerbonara has no type anno
     def _close_block(self) -> None:
         """Append the copies of the block, each as a whole: a later copy covers an earlier one."""
         block = self.target.objects[self._block_start :]
+        objects = len(self.target.objects) + len(block) * max(len(self._moves) - 1, 0)
+        MAX_BOARD_OBJECTS.check(objects, f"{objects} objects", ValueError)
         for move in self._moves[1:]:
             self.target.objects += [_moved(item, *move) for item in block]
         self._moves = []

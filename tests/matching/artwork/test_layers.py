@@ -14,7 +14,8 @@ from gpuvision.cli import main as cli
 from gpuvision.cli.arguments import layers_of
 from gpuvision.host.errors import ReadError
 from gpuvision.matching.artwork.artwork import read_artwork
-from gpuvision.matching.artwork.board_files import open_board, parsed
+from gpuvision.matching.artwork.board_files import check_gerber, open_board, parsed
+from gpuvision.matching.artwork.gerber_parser import parse_gerber
 
 HEAD = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\n"
 GERBER = f"{HEAD}%ADD10C,1.0*%\nD10*\nX5000000Y5000000D03*\nX9000000Y5000000D03*\nM02*\n"
@@ -95,6 +96,28 @@ def test_a_file_above_the_limit_is_named(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / "notes.txt").write_text("n" * (largest + 1))
     with pytest.raises(ReadError, match=rf"notes\.txt has {largest + 1} bytes"):
         read_artwork(tmp_path)
+
+
+def test_copies_are_limited_where_stray_text_hides_their_command(tmp_path: Path) -> None:
+    """A % in a coordinate makes the check before the parser take the command for other text."""
+    flash = "X5000000Y5000000D03*\n"
+    text = f"{HEAD}%ADD10C,1.0*%\nD10*\nX4%0000Y3000000D03*\n{flash}%SRX10000000Y2I1.0J1.0*%\n{flash}%SR*%\nM02*\n"
+    check_gerber(text, "board.gtl")
+    board(tmp_path)
+    (tmp_path / "board.gtl").write_text(text)
+    with pytest.raises(ReadError, match="a step-and-repeat of 20000000 copies, expected at most 100000") as error:
+        read_artwork(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_the_parser_limits_the_objects_of_all_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flash = "X5000000Y5000000D03*\n"
+    text = f"{HEAD}%ADD10C,1.0*%\nD10*\n{flash}%SRX4Y5I1.0J1.0*%\n{flash}{flash}%SR*%\nM02*\n"
+    monkeypatch.setenv("GPUVISION_MAX_BOARD_OBJECTS", "41")
+    assert len(parse_gerber(text, tmp_path / "board.gtl").objects) == 41
+    monkeypatch.setenv("GPUVISION_MAX_BOARD_OBJECTS", "40")
+    with pytest.raises(SyntaxError, match="41 objects, expected at most 40"):
+        parse_gerber(text, tmp_path / "board.gtl")
 
 
 def test_two_boards_in_one_folder_give_the_options_of_one(tmp_path: Path) -> None:

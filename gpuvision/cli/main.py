@@ -40,6 +40,7 @@ def application() -> typer.Typer:
     from gpuvision.cli.locate import locate
     from gpuvision.cli.locate_robot import locate_robot
     from gpuvision.cli.merge import merge
+    from gpuvision.cli.place import place
     from gpuvision.cli.profile import profile
     from gpuvision.cli.scan import scan
     from gpuvision.cli.select import select
@@ -64,6 +65,7 @@ def application() -> typer.Typer:
         select,
         locate,
         locate_robot,
+        place,
         inspect,
         delay,
         demo,

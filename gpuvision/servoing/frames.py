@@ -311,6 +311,34 @@ def placement_error(
     return chain
 
 
+def compose_poses(outer: Float64, inner: Float64) -> Float64:
+    """Return the poses (..., 3) of inner frames, given in an outer frame, in the frame in which the outer one is given.
+
+    Parameters
+    ----------
+    outer, inner : numpy.ndarray
+        (..., 3): x, y [m] and theta [rad].
+    """
+    c, s = np.cos(outer[..., 2]), np.sin(outer[..., 2])
+    x, y, theta = np.moveaxis(inner, -1, 0)
+    moved = (outer[..., 0] + c * x - s * y, outer[..., 1] + s * x + c * y, outer[..., 2] + theta)
+    return np.stack(moved, axis=-1)
+
+
+def invert_pose(pose: Float64) -> Float64:
+    """Return the pose (..., 3) of the outer frame in the frame whose pose is given."""
+    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    x, y, theta = np.moveaxis(pose, -1, 0)
+    return np.stack([-c * x - s * y, s * x - c * y, -theta], axis=-1)
+
+
+def move_covariance(covariance: Float64, outer: Float64, inner: Float64) -> Float64:
+    """Return the covariance (3, 3) of `compose_poses` for the covariance of the outer pose and an exact inner pose."""
+    x, y, _ = compose_poses(outer, inner) - outer
+    rows = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+    return np.asarray(rows @ covariance @ rows.T)
+
+
 def _from_pose(
     source: str, target: str, pose: Float64, scale: float, covariance: npt.ArrayLike | None, kind: Kind
 ) -> Transform:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pytransform3d.transform_manager import TransformManager
 
-from gpuvision.servoing.frames import Transform, placement_error
+from gpuvision.servoing.frames import Transform, compose_poses, invert_pose, move_covariance, placement_error
 
 POSES = {
     "pipette": (0.021, -0.003, 0.4),
@@ -106,6 +106,17 @@ def test_points_and_inverse_agree_with_monte_carlo(kind: str) -> None:
     sigma = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(np.cov(back.T) / sigma / sigma[:, None], expected / sigma / sigma[:, None], atol=0.05)
     np.testing.assert_allclose(inverse.apply(target), point, rtol=1e-12)
+
+
+def test_plain_poses_agree_with_transforms() -> None:
+    outer, inner = np.array(POSES["pipette"]), np.array(POSES["expected"])
+    transform = Transform.rigid("camera", "motion", outer, COVARIANCE)
+    product = transform @ Transform.rigid("expected", "camera", inner)
+    np.testing.assert_allclose(compose_poses(outer, inner), product.pose, atol=1e-15)
+    np.testing.assert_allclose(invert_pose(outer), transform.inverse().pose, atol=1e-15)
+    np.testing.assert_allclose(compose_poses(np.stack([outer, inner]), inner)[0], product.pose, atol=1e-15)
+    moved, expected = move_covariance(COVARIANCE, outer, inner), product.pose_covariance
+    np.testing.assert_allclose(moved, expected, atol=1e-9 * np.abs(expected).max())
 
 
 def test_pose_and_scale_come_back_with_their_covariance() -> None:

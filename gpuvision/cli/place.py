@@ -1,0 +1,113 @@
+"""``gpuvision place``: simulate placements of a part on a circuit board with the camera in the loop."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gpuvision.cli.arguments import (
+    DeviceLabel,
+    LayerNames,
+    Overwrite,
+    ReportFile,
+    echo,
+    layers_of,
+    named_path,
+    prints_report,
+    progress_bar,
+    quantities,
+    write_report,
+)
+
+_FILES = ("report.json", "placements.png", "features.png")
+
+Gerbers = Annotated[
+    Path,
+    typer.Argument(metavar="GERBERS", parser=named_path, help="Folder or ZIP of Gerber and Excellon files."),
+]
+MachineFile = Annotated[
+    str,
+    typer.Option(metavar="FILE.toml", help="Machine file, or the name of a machine in the package: look_while_place."),
+]
+Target = Annotated[
+    str,
+    typer.Option(metavar="X,Y,THETA", help="Place of the part on the board and its angle, such as 12mm,8mm,90deg."),
+]
+Rate = Annotated[float | None, typer.Option(min=1.0, help="Frames per second. Default: the value in the machine file.")]
+Results = Annotated[
+    Path,
+    typer.Option(
+        metavar="DIR", parser=named_path, help="Folder for report.json and the pictures placements.png, features.png."
+    ),
+]
+
+
+def place(
+    gerbers: Gerbers,
+    machine: MachineFile,
+    at: Target,
+    out: Results,
+    rate: Rate = None,
+    count: Annotated[int, typer.Option(min=1, max=10_000, help="Number of placements.")] = 20,
+    budget: Annotated[int, typer.Option(min=3, max=1000, help="Number of calipers (rulers).")] = 60,
+    seed: Annotated[int, typer.Option(min=0, max=(1 << 32) - 1, help="Seed of all random numbers.")] = 0,
+    layers: LayerNames = None,
+    as_json: ReportFile = None,
+    device: DeviceLabel = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Simulate placements of a part: the camera of the head steers the nozzle to its place on a rendered board.
+
+    Every frame is rendered, measured by calipers (rulers), and answered by the controller after the delay of the
+    machine. The report compares the error at the release and the number of frames with their predictions.
+    """
+    from gpuvision.formats.json import json_tree
+    from gpuvision.formats.machine_file import read_machine
+    from gpuvision.host import Device
+    from gpuvision.host.files import write_text_atomic
+    from gpuvision.host.outputs import Outputs
+    from gpuvision.matching.artwork.artwork import read_artwork
+    from gpuvision.matching.features.feature_set import edge_clearance
+    from gpuvision.plots.board import draw_features
+    from gpuvision.plots.placement import draw_placements
+    from gpuvision.servoing.placement.plan import placement_imaging
+    from gpuvision.workflows.placing import simulate_placements
+
+    target = quantities(at, "--at", "m,m,rad")
+    outputs = Outputs("place", inputs=[gerbers, machine], overwrite=overwrite)
+    outputs.claim(as_json)
+    outputs.claim_folder(out, _FILES)
+    described = read_machine(machine, rate=rate)
+    clearance = edge_clearance(placement_imaging(described))
+    artwork = read_artwork(gerbers, side="top", layers=layers_of(layers), clearance=clearance)
+    for each in artwork.warnings:
+        echo(f"warning: {each}", err=True)
+    with progress_bar("placing") as progress:
+        result = simulate_placements(
+            artwork,
+            target,
+            described,
+            count=count,
+            budget=budget,
+            seed=seed,
+            device=None if device is None else Device.named(device),
+            progress=progress,
+        )
+    report = result.report()
+    write_report(as_json, report, outputs)
+    with outputs.folder(out) as inside:
+        write_text_atomic(inside / "report.json", json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n")
+        draw_features(inside / "features.png", artwork, result.plan.features, result.plan.features.region)
+        draw_placements(
+            inside / "placements.png",
+            period=described.period,
+            motion=result.motion,
+            error=result.error,
+            sigmas=result.simulated_sigmas,
+            delay=described.delay.parts,
+            tolerance=described.tolerance.position,
+        )
+    echo(f"{result.summary()}\nlook at {out / 'placements.png'} and {out / 'report.json'}", err=prints_report(as_json))

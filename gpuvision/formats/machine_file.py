@@ -1,0 +1,169 @@
+"""Machine files: TOML with camera, calibration, axes, controller, delay and tolerances of a placement machine.
+
+The package contains the machines in `MACHINES`; ``docs/reference/machine_files.md`` lists the keys.
+"""
+
+from __future__ import annotations
+
+import math
+from importlib import resources
+from pathlib import Path
+
+from gpuvision.formats.cmos_sensor_file import CMOS_SENSORS, read_cmos_sensor
+from gpuvision.schema import Section, read_toml
+from gpuvision.servoing.axis import Axis, FineStage
+from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform
+from gpuvision.servoing.placement.machine import Machine, PlacementCamera, ThermalDrift, Tolerance
+
+MACHINES = ("look_while_place",)
+"""Names of the machines in the package."""
+
+_NO_COVARIANCE = ((0.0, 0.0, 0.0),) * 3
+_AXES = {"x": "m", "y": "m", "theta": "rad"}
+
+
+def read_machine(path: str | Path, *, rate: float | None = None) -> Machine:
+    """Read a placement machine.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of a file, or one of `MACHINES`.
+    rate : float, optional
+        Frames per second instead of the rate of the file.
+
+    Returns
+    -------
+    Machine
+
+    Raises
+    ------
+    OSError
+        The file, or the file of the sensor, cannot be read.
+    DescriptionError
+        A key is missing, unknown or has a wrong value; the message names the key.
+    """
+    if str(path) in MACHINES:
+        with resources.as_file(resources.files("gpuvision") / "presets" / "machines" / f"{path}.toml") as file:
+            return _machine(read_toml(file), rate)
+    return _machine(read_toml(Path(path)), rate)
+
+
+def _machine(top: Section, rate: float | None) -> Machine:
+    top.text("name", "")
+    camera, calibration = _camera(top.section("camera")), _calibration(top.section("calibration"))
+    axes = top.optional_section("axes")
+    loop, delay = top.section("loop"), top.optional_section("delay")
+    given_rate = loop.number("rate", "Hz", above=0.0)
+    gain = loop.number("gain", "", None, above=0.0)
+    loop.finish()
+    transfer, stages = (0.0, {}) if delay is None else _delay(delay)
+    tolerance, drift = _tolerance(top.section("tolerance")), top.optional_section("drift")
+    machine_drift = ThermalDrift() if drift is None else _drift(drift)
+    top.finish()
+    with top.checking():
+        return Machine(
+            camera=camera,
+            pipette_in_camera=calibration,
+            tolerance=tolerance,
+            axes=(Axis(), Axis(), Axis()) if axes is None else _axes(axes),
+            rate=given_rate if rate is None else rate,
+            transfer=transfer,
+            stages=stages,
+            gain=gain,
+            drift=machine_drift,
+        )
+
+
+def _camera(table: Section) -> PlacementCamera:
+    name = table.word("sensor", CMOS_SENSORS)
+    sensor = read_cmos_sensor(table.file("sensor") if name is None else name)
+    window = table.numbers("window", "px", (2,))
+    values = {
+        "pixel": table.number("pixel", "m", above=0.0),
+        "exposure": table.number("exposure", "s", above=0.0),
+        "electrons": table.number("electrons", "electrons", None, above=0.0),
+        "blur_px": table.number("blur_px", "px", 0.5, at_least=0.0),
+    }
+    table.finish()
+    with table.checking():
+        if any(each != int(each) for each in window):
+            raise ValueError(f"window is {list(window)}, expected whole numbers of rows and columns")
+        rows, columns = (int(each) for each in window)
+        return PlacementCamera(sensor=sensor, window=(rows, columns), **values)  # type: ignore[arg-type]
+
+
+def _calibration(table: Section) -> Transform:
+    pose = table.numbers("pipette", "m, m, rad", (3,))
+    covariance = table.rows("pipette_covariance", "m^2, m rad, rad^2", 3, _NO_COVARIANCE)
+    table.finish()
+    with table.checking():
+        return Transform.rigid(PIPETTE, CAMERA, pose, covariance)
+
+
+def _axes(table: Section) -> tuple[Axis, Axis, Axis]:
+    sections = {name: table.optional_section(name) for name in _AXES}
+    table.finish()
+    x, y, theta = (Axis() if section is None else _axis(section, _AXES[name]) for name, section in sections.items())
+    return x, y, theta
+
+
+def _axis(table: Section, unit: str) -> Axis:
+    fine = table.optional_section("fine")
+    values = {
+        "lag": table.number("lag", "s", 0.0, at_least=0.0),
+        "viscous": table.number("viscous", "1/s", 0.0, at_least=0.0),
+        "coulomb": table.number("coulomb", f"{unit}/s^2", 0.0, at_least=0.0),
+        "acceleration": _limit(table, "acceleration", f"{unit}/s^2"),
+        "speed": _limit(table, "speed", f"{unit}/s"),
+        "resonance": 2.0 * math.pi * table.number("resonance", "Hz", 0.0, at_least=0.0),
+        "damping": table.number("damping", "", 0.05, at_least=0.0, at_most=1.0),
+        "encoder": table.number("encoder", unit, 0.0, at_least=0.0),
+    }
+    stage = None if fine is None else _fine(fine, unit)
+    table.finish()
+    with table.checking():
+        return Axis(**values, fine=stage)
+
+
+def _limit(table: Section, key: str, unit: str) -> float:
+    """Return a limit; infinite without the key."""
+    value = table.number(key, unit, None, above=0.0)
+    return math.inf if value is None else value
+
+
+def _fine(table: Section, unit: str) -> FineStage:
+    values = {
+        "lag": table.number("lag", "s", above=0.0),
+        "stroke": table.number("stroke", unit, above=0.0),
+        "recentring": table.number("recentring", "1/s", 20.0, at_least=0.0),
+    }
+    table.finish()
+    return FineStage(**values)
+
+
+def _delay(table: Section) -> tuple[float, dict[str, float]]:
+    transfer = table.number("transfer", "s", 0.0, at_least=0.0)
+    stages = {key: table.number(key, "s", 0.0, at_least=0.0) for key in ("vision", "control", "drive")}
+    table.finish()
+    return transfer, {name: time for name, time in stages.items() if time}
+
+
+def _tolerance(table: Section) -> Tolerance:
+    values = {
+        "position": table.number("position", "m", above=0.0),
+        "angle": table.number("angle", "rad", above=0.0),
+        "landing_zone": table.number("landing_zone", "m", above=0.0),
+        "landing_angle": table.number("landing_angle", "rad", above=0.0),
+        "max_time": table.number("max_time", "s", 1.0, above=0.0),
+    }
+    refused = table.integer("max_refused", 20, at_least=1)
+    table.finish()
+    return Tolerance(**values, max_refused=refused)
+
+
+def _drift(table: Section) -> ThermalDrift:
+    expansion = table.numbers("expansion", "m/K", (2,))
+    sigma = table.number("temperature_sigma", "K", at_least=0.0)
+    table.finish()
+    return ThermalDrift(expansion=(expansion[0], expansion[1]), temperature_sigma=sigma)

@@ -1,0 +1,104 @@
+"""Error budget of a placement: calibration, vision, etch bias, servo and thermal drift.
+
+References
+----------
+.. [1] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, sections 5.4.4 and
+   8.7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.servoing.delay_response import step_response
+from gpuvision.servoing.frames import Transform, compose_poses, invert_pose
+from gpuvision.servoing.placement.machine import Machine
+from gpuvision.servoing.placement.placing import REMAINDER
+from gpuvision.servoing.placement.plan import PlacementPlan
+
+Float64 = npt.NDArray[np.float64]
+
+# Frames of the step response after which a stable loop has settled to rounding, per frame of delay (chosen).
+_FRAMES = 400
+
+
+class ErrorBudget(NamedTuple):
+    """Covariances of the sources of the placement error.
+
+    Attributes
+    ----------
+    sources : mapping of str to numpy.ndarray
+        Covariance (3, 3) of the pose of the nozzle on the board by source: "calibration", "vision", "etch bias",
+        "servo", "drift".
+    total : numpy.ndarray
+        (3, 3): sum of all sources.
+    """
+
+    sources: Mapping[str, Float64]
+    total: Float64
+
+    @property
+    def sigmas(self) -> dict[str, Float64]:
+        """Standard deviations (3,) of x, y [m] and theta [rad] by source, and of the "total"."""
+        each = {**self.sources, "total": self.total}
+        return {name: np.sqrt(np.diag(covariance)) for name, covariance in each.items()}
+
+
+def noise_gain(delay: float, gain: float) -> float:
+    """Return the variance of the position of a servo loop at rest over the variance of a measured position.
+
+    Parameters
+    ----------
+    delay : float
+        Delay [frames], 0 or more.
+    gain : float
+        Fraction of the error that one frame corrects; the loop must be stable.
+
+    Notes
+    -----
+    Independent errors of the frames add: the sum of the squared steps of the step response. Without delay it is
+    ``gain / (2 - gain)``.
+    """
+    error = step_response(delay, gain, int(_FRAMES * (1.0 + delay)))
+    return float(np.sum(np.diff(error) ** 2))
+
+
+def predict_budget(machine: Machine, plan: PlacementPlan) -> ErrorBudget:
+    """Predict the error of a placement at the release.
+
+    Parameters
+    ----------
+    machine : Machine
+        Machine; its calibration has a covariance.
+    plan : PlacementPlan
+        Plan of the placement.
+
+    Notes
+    -----
+    Calibration, etch bias and drift are common to all frames of a placement. "vision" is the motion by the errors of
+    the measured poses, which the loop follows (`noise_gain`). "servo" is the rest of the step response that
+    `ReleaseRule` allows, evenly distributed, and the step of the encoder.
+    """
+    variance = noise_gain(machine.delay.frames, machine.loop_gain)
+    steps = np.array([axis.encoder for axis in machine.axes])
+    rest = REMAINDER * np.array([machine.tolerance.position] * 2 + [machine.tolerance.angle])
+    sources = {
+        "calibration": _at_board(machine.pipette_in_camera, plan, machine.pipette_in_camera.pose_covariance),
+        "etch bias": plan.etch_bias,
+        "drift": _at_board(machine.pipette_in_camera, plan, machine.drift.covariance),
+        "vision": variance * plan.vision,
+        "servo": np.diag(rest**2 / 3.0 + steps**2 / 12.0),
+    }
+    return ErrorBudget(sources, np.sum(list(sources.values()), axis=0))
+
+
+def _at_board(calibrated: Transform, plan: PlacementPlan, covariance: Float64) -> Float64:
+    """Return the covariance of the nozzle on the board for a covariance of its pose in the camera frame."""
+    theta = float(compose_poses(plan.target, invert_pose(calibrated.pose))[2])
+    c, s = np.cos(theta), np.sin(theta)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(turn @ covariance @ turn.T)

@@ -1,0 +1,223 @@
+"""Description of a placement machine: camera, calibration, axes, controller, delay and tolerances."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.camera.cmos_sensor import CmosSensor
+from gpuvision.servoing.axis import Axis
+from gpuvision.servoing.delay import DelayBudget, gain_limit
+from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform
+from gpuvision.validation import finite, integer
+
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacementCamera:
+    """Camera of the head, which looks at the board at right angles.
+
+    Parameters
+    ----------
+    sensor : CmosSensor
+        Image sensor.
+    pixel : float
+        Size of a pixel on the board [m], above 0.
+    window : (int, int)
+        Rows and columns that are read.
+    exposure : float
+        Exposure time [s], above 0.
+    electrons : float, optional
+        Photoelectrons of a white board during the exposure. Default: 0.8 of the saturation of the sensor.
+    blur_px : float
+        Standard deviation of the blur of the lens [px], without the extent of a pixel; default 0.5.
+
+    Raises
+    ------
+    ValueError
+        A number is out of its range, or the window is larger than the sensor.
+    """
+
+    sensor: CmosSensor
+    pixel: float
+    window: tuple[int, int]
+    exposure: float
+    electrons: float | None = None
+    blur_px: float = 0.5
+
+    def __post_init__(self) -> None:
+        finite(self.pixel, "pixel", above=0.0)
+        finite(self.exposure, "exposure", above=0.0)
+        finite(self.blur_px, "blur_px", minimum=0.0)
+        if self.electrons is not None:
+            finite(self.electrons, "electrons", above=0.0)
+        for size, most, name in zip(self.window, self.sensor.shape, ("rows", "columns"), strict=True):
+            integer(size, f"window {name}", minimum=16, maximum=most)
+
+    @property
+    def white_electrons(self) -> float:
+        """Photoelectrons of a white board during the exposure."""
+        return 0.8 * self.sensor.saturation if self.electrons is None else self.electrons
+
+    @property
+    def edge_blur_px(self) -> float:
+        """Standard deviation of the blur of edges [px]: lens and extent of a pixel."""
+        return math.hypot(self.blur_px, 1.0 / math.sqrt(12.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tolerance:
+    """Limits of a placement.
+
+    Parameters
+    ----------
+    position : float
+        Largest distance from the target at the release [m], above 0. The settling rule waits for it.
+    angle : float
+        Largest angle from the target at the release [rad], above 0.
+    landing_zone : float
+        Largest offset, along x and along y, at which the camera takes over from the long move [m], above 0.
+    landing_angle : float
+        Largest angle at which the camera takes over [rad], above 0.
+    max_time : float
+        Time after which a placement is aborted [s], above 0; default 1 s.
+    max_refused : int
+        Number of frames in a row without a valid pose after which a placement is aborted; default 20.
+
+    Raises
+    ------
+    ValueError
+        A number is out of its range.
+    """
+
+    position: float
+    angle: float
+    landing_zone: float
+    landing_angle: float
+    max_time: float = 1.0
+    max_refused: int = 20
+
+    def __post_init__(self) -> None:
+        for name in ("position", "angle", "landing_zone", "landing_angle", "max_time"):
+            finite(getattr(self, name), name, above=0.0)
+        integer(self.max_refused, "max_refused", minimum=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThermalDrift:
+    """Drift of the nozzle against the camera by temperature since the calibration.
+
+    Parameters
+    ----------
+    expansion : (float, float)
+        Change of the nozzle's position in the camera frame along x and y per kelvin [m/K].
+    temperature_sigma : float
+        Standard deviation of the temperature since the calibration [K], 0 or more.
+    """
+
+    expansion: tuple[float, float] = (0.0, 0.0)
+    temperature_sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        for each in self.expansion:
+            finite(each, "expansion")
+        finite(self.temperature_sigma, "temperature_sigma", minimum=0.0)
+
+    @property
+    def covariance(self) -> Float64:
+        """Covariance (3, 3) of the nozzle's pose in the camera frame."""
+        moved = np.array([*self.expansion, 0.0]) * self.temperature_sigma
+        return np.outer(moved, moved)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Machine:
+    """Placement machine: what a placement needs to know of it.
+
+    Parameters
+    ----------
+    camera : PlacementCamera
+        Camera of the head.
+    pipette_in_camera : Transform
+        Calibrated pose of the nozzle ("pipette") in the camera frame ("camera"): origin at the image centre, x along
+        increasing columns, y along decreasing rows; see `gpuvision.servoing.machine_calibration`.
+    tolerance : Tolerance
+        Limits of a placement.
+    axes : tuple of Axis
+        Axes x, y and theta of the head, for the simulated machine. Default: axes that follow at once.
+    rate : float
+        Frames per second, above 0; default 1000.
+    transfer : float
+        Time of the transfer of a frame [s], default 0.
+    stages : mapping of str to float
+        Time of each stage of processing [s].
+    gain : float, optional
+        Fraction of the error that one frame corrects. Default: the largest one without oscillation.
+    drift : ThermalDrift
+        Default: none.
+
+    Raises
+    ------
+    ValueError
+        A frame or a number is wrong, the frame does not fit into its period, or the gain makes the loop unstable.
+    """
+
+    camera: PlacementCamera
+    pipette_in_camera: Transform
+    tolerance: Tolerance
+    axes: tuple[Axis, Axis, Axis] = (Axis(), Axis(), Axis())
+    rate: float = 1000.0
+    transfer: float = 0.0
+    stages: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    gain: float | None = None
+    drift: ThermalDrift = field(default_factory=ThermalDrift)
+
+    def __post_init__(self) -> None:
+        frames = (self.pipette_in_camera.source, self.pipette_in_camera.target, self.pipette_in_camera.kind)
+        if frames != (PIPETTE, CAMERA, "rigid"):
+            raise ValueError(f"pipette_in_camera is {frames}, expected a rigid transform from pipette to camera")
+        finite(self.rate, "rate", above=0.0)
+        timing = self.camera.sensor.timing(self.camera.window, exposure=self.camera.exposure)
+        if timing.period > 1.0 / self.rate * (1.0 + 1e-9):
+            rows, columns = self.camera.window
+            raise ValueError(
+                f"a frame of {rows} x {columns} px takes {1e3 * timing.period:.3f} ms, more than 1/rate = "
+                f"{1e3 * self.period:.3f} ms; read a smaller window, expose shorter, or lower the rate"
+            )
+        most = gain_limit(self.delay.frames)
+        if self.gain is not None and not 0.0 < self.gain < most:
+            raise ValueError(
+                f"gain is {self.gain}, expected above 0 and below {most:.4g}, the limit of stability for a delay of "
+                f"{self.delay.frames:.2f} frames"
+            )
+
+    @property
+    def period(self) -> float:
+        """Time between two frames [s]."""
+        return 1.0 / self.rate
+
+    @property
+    def delay(self) -> DelayBudget:
+        """Delay from the middle of the exposure to the motion that answers it."""
+        camera = self.camera
+        timing = camera.sensor.timing(camera.window, exposure=camera.exposure)
+        return DelayBudget(
+            period=self.period,
+            exposure=camera.exposure,
+            readout=timing.readout,
+            transfer=self.transfer,
+            stages=dict(self.stages),
+        )
+
+    @property
+    def loop_gain(self) -> float:
+        """Fraction of the error that one frame corrects."""
+        if self.gain is not None:
+            return self.gain
+        return self.delay.gain

@@ -1,0 +1,180 @@
+"""Pose of the nozzle from the frames of a camera: rulers at the predicted pose, camera pose, nozzle pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device, to_numpy
+from gpuvision.servoing.frames import compose_poses, invert_pose, move_covariance
+from gpuvision.servoing.observer import PoseMeasurement
+from gpuvision.servoing.placement.machine import Machine
+from gpuvision.servoing.placement.plan import PlacementPlan
+from gpuvision.simulation.board_image.board_image import RenderBoard
+from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
+
+Float64 = npt.NDArray[np.float64]
+
+# Times of a simulation that differ by less than this are equal [s]: rounding of multiples of the frame time.
+_SAME_TIME = 1e-9
+# Poses during an exposure that are averaged: motion of up to 1.5 px in an exposure is smooth (`RenderBoard`).
+_SUBPOSES = 3
+
+
+class Frame(NamedTuple):
+    """Frame of a camera.
+
+    Attributes
+    ----------
+    image : numpy.ndarray
+        (rows, columns) uint8 or uint16.
+    exposed : float
+        Middle of the exposure [s].
+    arrived : float
+        Time at which the pose of the frame is available [s], with the time of all stages of processing.
+    """
+
+    image: npt.NDArray[Any]
+    exposed: float
+    arrived: float
+
+
+class FrameSource(Protocol):
+    """Source of frames: a camera or its simulation."""
+
+    def __call__(self, time: float) -> Sequence[Frame]:
+        """Return the frames that arrived since the last call, up to a time [s]."""
+
+
+class SimulatedCamera:
+    """Camera over a rendered board that moves with a head.
+
+    Parameters
+    ----------
+    board : ReflectanceMap
+        Board in view.
+    machine : Machine
+        Camera, rate and delay.
+    nozzle : function
+        True poses (n, 3) of the nozzle on the board at times (n,) [s], such as `SimulatedPlant.pose`.
+    pipette_in_camera : numpy.ndarray
+        (3,): true pose of the nozzle in the camera frame; it differs from the calibrated one.
+    device : Device, optional
+        Where to render; None: `Device.best`.
+    seed : int
+        Seed of the noise of the sensor. Default 0.
+
+    Notes
+    -----
+    A frame arrives at each multiple of the frame time: the phase of a loop with the same rate.
+    """
+
+    def __init__(
+        self,
+        board: ReflectanceMap,
+        machine: Machine,
+        nozzle: Callable[[Float64], Float64],
+        pipette_in_camera: Float64,
+        *,
+        device: Device | None = None,
+        seed: int = 0,
+    ) -> None:
+        camera = machine.camera
+        render = RenderBoard(
+            board=board,
+            shape=camera.window,
+            sensor=camera.sensor,
+            electrons=camera.white_electrons,
+            exposure=camera.exposure,
+            seed=seed,
+        )
+        self._bound = render.bind(Device.best() if device is None else device, (1, _SUBPOSES, 3), np.dtype(np.float64))
+        self._period, self._latency, self._exposure = machine.period, machine.delay.latency, camera.exposure
+        self._nozzle, self._camera_in_pipette = nozzle, invert_pose(pipette_in_camera)
+        self.dtype = render.dtype
+        """Dtype of the frames."""
+        self._frame = self._first = 0
+
+    def follow(self, nozzle: Callable[[Float64], Float64], pipette_in_camera: Float64) -> None:
+        """Start again at time 0 with another motion and another true pose of the nozzle in the camera frame.
+
+        The numbers of the frames, and so their noise, go on.
+        """
+        self._nozzle, self._camera_in_pipette = nozzle, invert_pose(pipette_in_camera)
+        self._first = self._frame
+
+    def __call__(self, time: float) -> list[Frame]:
+        """Return the frames that arrived since the last call, up to a time [s]."""
+        frames = []
+        while (arrived := (self._frame - self._first) * self._period) <= time + _SAME_TIME:
+            frames.append(self._render(arrived))
+            self._frame += 1
+        return frames
+
+    def _render(self, arrived: float) -> Frame:
+        exposed = arrived - self._latency
+        parts = (np.arange(_SUBPOSES) + 0.5) / _SUBPOSES - 0.5
+        poses = compose_poses(self._nozzle(exposed + parts * self._exposure), self._camera_in_pipette)
+        self._bound.inputs[0].set(np.ascontiguousarray(poses[None]))
+        self._bound.inputs[1].set(np.array([self._frame], np.uint32))
+        result = self._bound.run()
+        return Frame(to_numpy(result.image)[0], exposed, arrived)
+
+
+class BoardPoseSensor:
+    """Sensor of the pose of the nozzle on the board: implements `gpuvision.servoing.loop.PoseSensor`.
+
+    Parameters
+    ----------
+    camera : FrameSource
+        Source of frames.
+    machine : Machine
+        Machine, with the calibrated pose of the nozzle in the camera frame.
+    plan : PlacementPlan
+        Features to measure.
+    dtype : dtype
+        Dtype of the frames.
+    device : Device, optional
+        Where to measure; None: `Device.best`.
+
+    Notes
+    -----
+    The rulers of a frame are placed at the pose of the last frame that was measured, at first at the target. The
+    covariance of a measurement is that of the vision; the error of the calibration is common to all frames.
+    """
+
+    def __init__(
+        self,
+        camera: FrameSource,
+        machine: Machine,
+        plan: PlacementPlan,
+        dtype: npt.DTypeLike,
+        *,
+        device: Device | None = None,
+    ) -> None:
+        self.camera, self._plan = camera, plan
+        self._calibrated = machine.pipette_in_camera.pose
+        self._bound = plan.features.bind(
+            device, machine.camera.window, dtype, copper="bright", threshold=plan.threshold, noise=plan.noise
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Place the rulers at the target again."""
+        self._predicted = self._plan.camera_pose.copy()
+
+    def __call__(self, time: float) -> list[PoseMeasurement]:
+        """Return the measurements that arrived since the last call, up to a time [s]."""
+        return [self._measure(frame) for frame in self.camera(time)]
+
+    def _measure(self, frame: Frame) -> PoseMeasurement:
+        found = self._bound(frame.image, self._predicted)
+        status = int(np.asarray(found.status))
+        pose, covariance = np.asarray(found.pose, np.float64), np.asarray(found.covariance, np.float64)
+        if status == 0:
+            self._predicted = pose.copy()
+        moved = move_covariance(covariance, pose, self._calibrated)
+        return PoseMeasurement(frame.exposed, frame.arrived, compose_poses(pose, self._calibrated), moved, status)

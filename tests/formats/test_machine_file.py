@@ -1,0 +1,115 @@
+"""Machine files: the machine of the package, every message, and the reference page of the keys."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+
+from gpuvision.formats.machine_file import MACHINES, read_machine
+from gpuvision.schema import DescriptionError, Section
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "machine_files.md"
+PRESET = tomllib.loads(
+    resources.files("gpuvision").joinpath("presets", "machines", "look_while_place.toml").read_text(encoding="utf-8")
+)
+
+
+def _written(folder: Path, table: dict[str, Any]) -> Path:
+    path = folder / "machine.toml"
+    path.write_text(tomli_w.dumps(table), encoding="utf-8")
+    return path
+
+
+def test_the_machine_of_the_package_is_what_its_file_says() -> None:
+    machine = read_machine("look_while_place")
+    assert MACHINES == ("look_while_place",)
+    assert machine.rate == PRESET["loop"]["rate"]
+    assert machine.camera.window == (256, 256)
+    assert machine.camera.sensor.columns == 1024
+    assert machine.pipette_in_camera.pose.tolist() == PRESET["calibration"]["pipette"]
+    np.testing.assert_allclose(machine.pipette_in_camera.pose_covariance[0, 0], 1.6e-13)
+    parts = machine.delay.parts
+    assert parts["stage vision"] == 0.5e-3
+    assert parts["half exposure"] == 0.1e-3
+    assert "stage drive" not in parts
+    assert machine.axes[0].speed == 0.5
+    assert machine.axes[2].encoder == 2e-5
+    assert machine.drift.temperature_sigma == 0.5
+    assert read_machine("look_while_place", rate=500.0).rate == 500.0
+
+
+def test_all_keys_of_an_axis_are_read(tmp_path: Path) -> None:
+    axis = {"lag": 2e-3, "viscous": 3.0, "coulomb": 0.01, "acceleration": 20.0, "resonance": 80.0, "damping": 0.1}
+    fine = {"lag": 1e-4, "stroke": 5e-5, "recentring": 10.0}
+    path = _written(tmp_path, PRESET | {"axes": {"y": axis | {"fine": fine}}, "loop": {"rate": 800.0, "gain": 0.1}})
+    machine = read_machine(path)
+    found = machine.axes[1]
+    assert (found.lag, found.viscous, found.coulomb, found.acceleration, found.damping) == (2e-3, 3.0, 0.01, 20.0, 0.1)
+    assert found.resonance == pytest.approx(2 * np.pi * 80.0)
+    assert found.fine is not None
+    assert (found.fine.lag, found.fine.stroke, found.fine.recentring) == (1e-4, 5e-5, 10.0)
+    assert machine.axes[0].lag == 0.0
+    assert (machine.rate, machine.loop_gain) == (800.0, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"loop": {"rte": 1000.0}}, "the key 'loop.rate' is missing"),
+        ({"loop": {"rate": 1000.0, "gian": 0.1}}, "did you mean 'loop.gain'"),
+        ({"loop": {"rate": 1000.0, "gain": 1.9}}, "limit of stability"),
+        ({"camera": PRESET["camera"] | {"window": [64.5, 64]}}, "expected whole numbers of rows and columns"),
+        ({"camera": PRESET["camera"] | {"window": [4096, 64]}}, "camera: window rows is 4096"),
+        ({"calibration": {"pipette": [0.0, 0.0]}}, "calibration.pipette is"),
+        (
+            {"calibration": PRESET["calibration"] | {"pipette_covariance": [[-1.0, 0, 0]] * 3}},
+            "calibration: covariance",
+        ),
+        ({"axes": {"z": {}}}, "unknown key 'axes.z'"),
+        ({"axes": {"x": {"coulomb": 1.0}}}, "axes.x: an axis with friction"),
+        ({"tolerance": PRESET["tolerance"] | {"max_refused": 0}}, "tolerance.max_refused is 0"),
+    ],
+)
+def test_wrong_files_are_refused_with_the_key(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(DescriptionError, match=re.escape(message)):
+        read_machine(_written(tmp_path, PRESET | change))
+
+
+def _documented() -> set[tuple[str, str]]:
+    """Return table and key of every row of the page."""
+    found, table = set(), ""
+    for line in PAGE.read_text(encoding="utf-8").splitlines():
+        if heading := re.fullmatch(r"### `\[([a-z.]+)\]`.*", line):
+            table = heading[1]
+        elif row := re.match(r"\| (`[^|]+`) \|", line):
+            found |= {(table, key) for key in re.findall(r"`(\w+)`", row[1])}
+    return found
+
+
+def test_the_page_lists_the_keys_of_the_reader(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: set[tuple[str, str]] = set()
+    value_of = Section._value
+
+    def recorded(section: Section, key: str, expected: str, default: Any) -> Any:
+        asked.add((section.name, key))
+        return value_of(section, key, expected, default)
+
+    fine = {"lag": 1e-4, "stroke": 5e-5}
+    full = PRESET | {"axes": {"x": {"lag": 1e-3, "fine": fine}}}
+    path = _written(tmp_path, full)
+    monkeypatch.setattr(Section, "_value", recorded)
+    read_machine(path)
+    sections = {"camera", "calibration", "axes", "loop", "delay", "tolerance", "drift", "x", "y", "theta", "fine"}
+    # The keys of the sensor are those of camera presets.
+    sensor = {"array", "response", "noise", "readout"}
+    keys = {(table, key) for table, key in asked if table not in sensor and key not in sections | sensor}
+    keys = {each for each in keys if each not in {("", "estimated")}} | {("camera", "sensor")}
+    assert {each for each in keys if each not in _documented()} == set()
+    assert _documented() <= keys

@@ -1,0 +1,100 @@
+"""Placements on a rendered board with the true image processing, by the function and by the command."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+
+from boards import LAYERS, board_folder
+from gpuvision.cli.main import application
+from gpuvision.formats.machine_file import read_machine
+from gpuvision.host import Device
+from gpuvision.matching.artwork.artwork import Artwork, read_artwork
+from gpuvision.matching.features.feature_set import edge_clearance
+from gpuvision.servoing.frames import move_covariance
+from gpuvision.servoing.placement.machine import Machine
+from gpuvision.servoing.placement.plan import placement_imaging, plan_placement
+from gpuvision.workflows.placing import simulate_placements
+
+PRESET = tomllib.loads(
+    resources.files("gpuvision").joinpath("presets", "machines", "look_while_place.toml").read_text(encoding="utf-8")
+)
+# The camera looks at a pad of 1.2 mm and a trace beside it, 1.1 mm from the nozzle.
+TARGET = (14.8e-3 + 1.0e-3, 5.9e-3 + 0.5e-3, 0.0)
+
+
+@pytest.fixture(scope="module")
+def machine_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("machine") / "machine.toml"
+    path.write_text(tomli_w.dumps(PRESET | {"camera": PRESET["camera"] | {"window": [128, 128], "pixel": 20e-6}}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def machine(machine_file: Path) -> Machine:
+    return read_machine(machine_file)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return board_folder(tmp_path_factory.mktemp("board"))
+
+
+@pytest.fixture(scope="module")
+def artwork(folder: Path, machine: Machine) -> Artwork:
+    return read_artwork(folder, layers=LAYERS, clearance=edge_clearance(placement_imaging(machine)))
+
+
+def test_parts_of_the_predicted_covariance_add_up(artwork: Artwork, machine: Machine) -> None:
+    plan = plan_placement(artwork, TARGET, machine)
+    expected = move_covariance(plan.features.covariance, plan.camera_pose, machine.pipette_in_camera.pose)
+    unit = np.sqrt(np.diag(expected))
+    total = (plan.vision + plan.etch_bias) / np.outer(unit, unit)
+    # The selection also counts the chance of a wrong edge, which lowers weights by some percent.
+    np.testing.assert_allclose(total, expected / np.outer(unit, unit), atol=0.1)
+    np.testing.assert_allclose(plan.camera_pose, (TARGET[0] - 1e-3, TARGET[1] - 0.5e-3, 0.0), atol=1e-12)
+
+
+def test_parts_land_where_and_when_the_prediction_says(artwork: Artwork, machine: Machine, device: Device) -> None:
+    done: list[int] = []
+    result = simulate_placements(
+        artwork, TARGET, machine, count=6, device=device, progress=lambda number, _: done.append(number)
+    )
+    assert done == [1, 2, 3, 4, 5, 6]
+    for placement in result.placements:
+        assert placement.released
+        assert placement.predicted_frames + 1 <= placement.frames <= placement.predicted_frames + 3
+    # The true error, not the measured one: five predicted sigmas in x, y and theta.
+    assert np.all(np.abs(result.error) <= 5.0 * result.simulated_sigmas)
+    # What calibration and drift do not explain is vision and servo, much less than the start errors of up to 90 um.
+    assert np.all(np.abs(result.sources["vision and servo"][:, :2]) < 2e-6)
+    assert max(np.abs(motion[0, :2]).max() for motion in result.motion) > 50e-6
+    report = result.report()
+    assert report["delay"]["frames"] == machine.delay.frames
+    assert len(report["placements"]) == 6
+    assert "6 of 6 parts placed" in result.summary()
+
+
+def test_the_command_writes_report_and_pictures(
+    folder: Path, machine_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    layers = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]
+    words = ["place", folder, "--machine", machine_file, "--count", 2, *layers]
+    near = [*words, "--at", "15.8mm,6.4mm,0deg", "--out", tmp_path / "out"]
+    application()([str(each) for each in near], standalone_mode=False)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert [each["released"] for each in report["placements"]] == [True, True]
+    assert report["target"] == pytest.approx(TARGET)
+    assert {each.name for each in (tmp_path / "out").glob("*.png")} == {"placements.png", "features.png"}
+    printed = capsys.readouterr().out
+    assert "2 of 2 parts placed" in printed
+    far = [*words, "--at", "1mm,1mm,0deg", "--out", tmp_path / "none"]
+    with pytest.raises(ValueError, match="expected 3 or more together"):
+        application()([str(each) for each in far], standalone_mode=False)
+    assert not (tmp_path / "none").exists()

@@ -25,6 +25,7 @@ from gpuvision.cli.select import Side
 
 if TYPE_CHECKING:
     from gpuvision.matching.artwork.artwork import Artwork
+    from gpuvision.matching.board.located_board import LocatedBoard
     from gpuvision.matching.features.feature_set import FeatureSet
 
 _BUDGET, _BLUR_PX, _ETCH_BIAS = 60, 1.0, "10um"
@@ -167,7 +168,6 @@ def locate(
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size, read_lens
     from gpuvision.formats.features_file import read_features
-    from gpuvision.formats.gcode_file import work_offset, work_offset_code
     from gpuvision.host import Device
     from gpuvision.host.recordings import read_image
     from gpuvision.plots.board import draw_located_board
@@ -176,9 +176,7 @@ def locate(
     check_image(image)
     outputs = claim_outputs("locate", (image, board, camera, features), out, as_json, overwrite)
     outputs.claim(gcode)
-    if gcode is None:
-        reject_unused("without --gcode", gcode_dialect=gcode_dialect)
-    machine = _camera_at(camera_at, gcode)
+    machine = _camera_at(camera_at, gcode, gcode_dialect)
     chosen = None if features is None else read_features(features)
     if chosen is not None:
         reject_unused("with --features, a file with a fixed selection of calipers", budget=budget)
@@ -214,16 +212,22 @@ def locate(
         echo(f"warning: {each}", err=True)
     report_pose(located, lambda path: draw_located_board(path, picture, artwork, located), out, as_json, outputs)
     if gcode is not None and machine is not None:
-        offset = work_offset(located.pose, machine, mirrored=artwork.side == "bottom")
         comment = f"gpuvision locate {image.name}".translate(_IN_COMMENTS)
-        dialect = GcodeDialect.linuxcnc if gcode_dialect is None else gcode_dialect
-        outputs.write_text(gcode, work_offset_code(offset, dialect.value, comment))
+        outputs.write_text(gcode, _gcode(located, machine, gcode_dialect, comment))
 
 
-def _camera_at(text: str | None, gcode: Path | None) -> tuple[float, ...] | None:
+def _gcode(located: LocatedBoard, machine: tuple[float, ...], dialect: GcodeDialect | None, comment: str) -> str:
+    """Return the G-code of a located board."""
+    from gpuvision.formats.gcode_file import work_offset, work_offset_code
+
+    offset = work_offset(located.pose, machine, mirrored=located.view.mirrored)
+    return work_offset_code(offset, (dialect or GcodeDialect.linuxcnc).value, comment)
+
+
+def _camera_at(text: str | None, gcode: Path | None, dialect: GcodeDialect | None) -> tuple[float, ...] | None:
     """Parse ``--camera-at``: x, y [m] and angle [rad]; None without the option."""
     if gcode is None:
-        reject_unused("without --gcode", camera_at=text)
+        reject_unused("without --gcode", camera_at=text, gcode_dialect=dialect)
         return None
     if text is None:
         raise ValueError("--gcode needs --camera-at: where on the machine the image was taken, such as 120mm,80mm,0deg")

@@ -139,8 +139,8 @@ class Axis:
         return state
 
 
-Mode = tuple[int, int, int, int]
-"""Signs of the friction (0 sticks, 2 without friction), of a saturated drive, of the stops of axis and fine stage."""
+# Signs of the friction (0 sticks, 2 without friction), of a saturated drive, of the stops of axis and fine stage.
+_Mode = tuple[int, int, int, int]
 
 
 class AxisStepper:
@@ -149,8 +149,8 @@ class AxisStepper:
     def __init__(self, axis: Axis) -> None:
         self.axis = axis
         self._recentring = 0.0 if axis.fine is None else axis.fine.recentring
-        self._matrices: dict[Mode, Float64] = {}
-        self._steps: dict[tuple[Mode, int], Float64] = {}
+        self._matrices: dict[_Mode, Float64] = {}
+        self._steps: dict[tuple[_Mode, int], Float64] = {}
         self._longest = max(int(min(axis.longest_step / TICK, 2.0**50)), 1)
 
     def command(self, state: Float64, velocity: float) -> Float64:
@@ -181,7 +181,7 @@ class AxisStepper:
     def _demand(self, state: Float64) -> float:
         return float(state[U] + self._recentring * state[S] - state[V]) / self.axis.lag if self.axis.lag else 0.0
 
-    def _mode(self, state: Float64) -> Mode:
+    def _mode(self, state: Float64) -> _Mode:
         axis, demand = self.axis, self._demand(state)
         drive = int(demand > axis.acceleration) - int(demand < -axis.acceleration)
         stop = self.at_stop(state)
@@ -200,7 +200,7 @@ class AxisStepper:
     def _pushes(self, state: Float64, stop: int) -> bool:
         return stop * float(state[U] + self._recentring * state[S]) >= 0.0
 
-    def _holds(self, mode: Mode, state: Float64) -> bool:
+    def _holds(self, mode: _Mode, state: Float64) -> bool:
         """Return whether a state still belongs to the mode in which it was reached."""
         axis, (sign, drive, stop, fine) = self.axis, mode
         demand = self._demand(state)
@@ -216,7 +216,7 @@ class AxisStepper:
             return True
         return bool(fine * (state[U] - state[V]) >= 0.0 if fine else abs(state[S]) <= axis.fine.stroke)
 
-    def _up_to_the_event(self, mode: Mode, state: Float64, ticks: int) -> tuple[Float64, int]:
+    def _up_to_the_event(self, mode: _Mode, state: Float64, ticks: int) -> tuple[Float64, int]:
         """Return the state just after the mode ends, with the values at which it ends, and the time in ticks.
 
         Binary search with the matrices of 2^k ticks: the time is the largest sum of them for which the mode holds, and
@@ -238,7 +238,7 @@ class AxisStepper:
             state[S], state[W] = math.copysign(axis.fine.stroke, state[S]), 0.0
         return state, done + 1
 
-    def _exponential(self, mode: Mode, ticks: int) -> Float64:
+    def _exponential(self, mode: _Mode, ticks: int) -> Float64:
         found = self._steps.get((mode, ticks))
         if found is None:
             if len(self._steps) >= _MAX_STEPS:
@@ -248,7 +248,7 @@ class AxisStepper:
             found = self._steps[mode, ticks] = expm(self._matrices[mode] * (TICK * ticks))
         return found
 
-    def _matrix(self, mode: Mode) -> Float64:
+    def _matrix(self, mode: _Mode) -> Float64:
         """Return the matrix (8, 8) of the differential equation in a mode."""
         axis, (sign, drive, stop, fine) = self.axis, mode
         matrix = np.zeros((8, 8))

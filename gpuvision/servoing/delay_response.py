@@ -160,7 +160,12 @@ def mean_square_growth(moments: JitterMoments, gain: float) -> float:
 
     Below 1 the loop is mean-square stable. With x the vector of the last n positions and A its random matrix, the
     second moment follows E[x x'] -> E[A x x' A']; the factor is the spectral radius of this
-    linear map of symmetric matrices [2]_.
+    linear map of symmetric matrices.
+
+    References
+    ----------
+    .. [1] O. L. V. Costa, M. D. Fragoso and R. P. Marques, *Discrete-Time Markov Jump Linear Systems*, Springer 2005,
+       chapter 3.
     """
     size = len(moments.mean)
     rows, columns = np.tril_indices(size)

@@ -250,22 +250,14 @@ class _Run:
         self.commanded, self.last = np.zeros(3), (self.start, np.zeros(3))
 
     def finish(self) -> LoopRecord:
-        """Run all frames and return the record."""
-        loop, outcome, frame, row = self.loop, None, 0, 0
-        while outcome is None and frame < self.count:
-            due = self.start + frame * loop.period
-            now = loop.clock.wait_until(due)
-            late = max(int((now - due) / loop.period), 0)
-            self.missed += late
-            self.faults.tick(late > 0)
-            outcome = self._frame(row, now)
-            self.computing[row] = loop.clock.now() - now
-            frame, row = frame + 1 + late, row + 1
-        if outcome is not None:  # otherwise the last command lasts for a frame
-            loop.plant.command(loop.clock.now(), np.zeros(3))
+        """Run all frames, stop the head, whatever happens, and return the record."""
+        try:
+            outcome, row = self._frames()
+        finally:
+            self.loop.plant.command(self.loop.clock.now(), np.zeros(3))
         target, pose, velocity, sigma, command, encoder = self.columns[:, :row]
         return LoopRecord(
-            outcome or Outcome.TIME_OVER,
+            outcome,
             self.times[:row],
             target,
             pose,
@@ -278,6 +270,23 @@ class _Run:
             self.missed,
             self.faults.glitches,
         )
+
+    def _frames(self) -> tuple[Outcome, int]:
+        """Run all frames; return the reason of the end and the number of recorded frames."""
+        loop, frame, row = self.loop, 0, 0
+        while frame < self.count:
+            due = self.start + frame * loop.period
+            now = loop.clock.wait_until(due)
+            late = max(int((now - due) / loop.period), 0)
+            self.missed += late
+            self.faults.tick(late > 0)
+            outcome = self._frame(row, now)
+            self.computing[row] = loop.clock.now() - now
+            frame, row = frame + 1 + late, row + 1
+            if outcome is not None:
+                return outcome, row
+        loop.clock.wait_until(self.start + self.count * loop.period)  # the last command lasts for a frame
+        return Outcome.TIME_OVER, row
 
     def _frame(self, row: int, now: float) -> Outcome | None:
         """Do one frame; return the reason to end the loop, or None."""

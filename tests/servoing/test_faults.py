@@ -72,6 +72,13 @@ def check_travel(record: LoopRecord, plant: SimulatedPlant, target: np.ndarray =
             assert np.all(plant.pose(now) == 0.0)
 
 
+def check_rest(record: LoopRecord, plant: SimulatedPlant) -> None:
+    """Check that the head moved at the end and was stopped."""
+    assert np.any(record.command[-3:] != 0.0)
+    after = plant.pose(record.time[-1] + np.array([0.03, 0.5]))
+    assert after[0] == pytest.approx(after[1], abs=1e-12)
+
+
 def dropped(frame: int, seen: PoseMeasurement) -> Sequence[PoseMeasurement]:
     return [seen] if frame % 3 == 0 else []
 
@@ -129,8 +136,6 @@ def test_camera_that_stays_blind_ends_the_loop(last: int, expected: Outcome) -> 
     assert record.outcome is expected
     check_travel(record, plant)
     assert record.time[-1] == pytest.approx(max(last * PERIOD - DELAY, 0.0) + LIMITS.abort_after, abs=2.1e-3)
-    after = plant.pose(record.time[-1] + np.array([0.02, 0.5]))
-    assert np.array_equal(after[0], after[1])  # the last command stops the head
 
 
 def test_wrong_match_that_stays_ends_the_loop() -> None:
@@ -175,6 +180,33 @@ def test_encoder_that_stays_wrong_ends_the_loop() -> None:
     assert record.outcome is Outcome.ENCODER
     assert record.time[-1] == pytest.approx(0.014)
     check_travel(record, plant)
+    check_rest(record, plant)
+
+
+def test_head_stops_when_the_time_is_over_and_when_the_camera_fails() -> None:
+    record, plant = run(duration=0.006)
+    assert record.outcome is Outcome.TIME_OVER
+    assert record.command[-1, 0] > 0.0
+    check_rest(record, plant)
+
+    class Broken(SimulatedPoseSensor):
+        def __call__(self, time: float) -> list[PoseMeasurement]:
+            if time > 5e-3:
+                raise OSError("no camera")
+            return super().__call__(time)
+
+    observer = PoseObserver(MODEL)
+    observer.reset(-DELAY, np.zeros(3), COVARIANCE)
+    plant = SimulatedPlant()
+    broken = Broken(plant.pose, period=PERIOD, delay=DELAY)
+    loop = ServoLoop(
+        plant, broken, observer, PidController(PidGains(proportional=150.0)), SimulatedClock(), period=PERIOD
+    )
+    with pytest.raises(OSError, match="no camera"):
+        loop.run(TARGET, 0.2)
+    after = plant.pose([0.0061, 0.5])
+    assert after[0, 0] > 1e-4
+    assert np.array_equal(after[0], after[1])
 
 
 def test_blocked_axis_ends_the_loop() -> None:

@@ -119,11 +119,14 @@ class FocusPeak(NamedTuple):
         uint8 `Status` flags: LOW_SIGNAL (the measure is never above the threshold), SATURATED (the sharpest frame is
         at the upper limit), OUT_OF_RANGE (sharpest before the first or after the last frame), AMBIGUOUS (another
         maximum of nearly the same strength, or no maximum at all), NOT_FINITE.
+    sigma
+        Standard deviation of ``frame`` by the noise of the stack; None if the stack gives no noise.
     """
 
     frame: Float64
     strength: Float32
     status: npt.NDArray[np.uint8]
+    sigma: Float64 | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,6 +154,10 @@ class FocusStack:
         Level at which a pixel is saturated [grey levels]; default: the largest code of integer frames.
     principal_point_px : (column, row), optional
         Image of the optical axis [px]; default: the middle of the frame.
+    read_noise : float, optional
+        Standard deviation of a pixel without quantisation [grey levels], above 0; requests the standard deviations of
+        the heights. Only with the measure ``"intensity"``: that of the Laplacian depends on the texture. Default: not
+        known.
 
     Raises
     ------
@@ -179,6 +186,7 @@ class FocusStack:
     ambiguity: float | None = None
     saturation: float | None = None
     principal_point_px: tuple[float, float] | None = None
+    read_noise: float | None = None
 
     def __post_init__(self) -> None:
         if self.measure not in MEASURES:
@@ -189,6 +197,11 @@ class FocusStack:
             raise ValueError(f"FocusStack.threshold is {self.threshold}, expected 0 or more [grey levels]")
         if self.ambiguity is not None and not 0.0 < self.ambiguity <= 1.0:
             raise ValueError(f"FocusStack.ambiguity is {self.ambiguity}, expected a number above 0 and at most 1")
+        if self.read_noise is not None:
+            if not finite(self.read_noise, "FocusStack.read_noise") > 0.0:
+                raise ValueError(f"FocusStack.read_noise is {self.read_noise}, expected a number above 0 [grey levels]")
+            if self.measure != "intensity":
+                raise ValueError(f"FocusStack.read_noise has no effect on the measure {self.measure!r}; leave it out")
 
     def sharpness(self, frame: npt.NDArray[Any]) -> Float32:
         """Compute the focus measure of each pixel of a frame, (rows, columns) [grey levels]."""
@@ -248,6 +261,10 @@ class FocusSearch:
     def __init__(self, stack: FocusStack, dtype: np.dtype[Any]) -> None:
         self._stack = stack
         self._limit = stack.saturation
+        self._noise = None
+        if stack.read_noise is not None:
+            quantisation = 1.0 / math.sqrt(12.0) if np.issubdtype(dtype, np.integer) else 0.0
+            self._noise = math.hypot(stack.read_noise, quantisation)
         if self._limit is None:
             self._limit = float(np.iinfo(dtype).max) if np.issubdtype(dtype, np.integer) else math.inf
         self._recent: list[Float32] = []
@@ -311,13 +328,16 @@ class FocusSearch:
             held[late] = measure[late]
         self._start[late] = self._count - size
         # The coordinate is the frame number, from 1; any focal length below 1 gives the same result.
-        fit = DepthFromFocus(first=1.0, spacing=1.0, focal_length=0.5)
+        fit = DepthFromFocus(first=1.0, spacing=1.0, focal_length=0.5, sigma_intensity=self._noise)
+        sigma = None if self._noise is None else np.full(self._best.shape, np.nan)
         place, status = np.empty(self._best.shape), np.empty(self._best.shape, np.uint8)
         rows = max(_BLOCK_PIXELS * len(place) // max(place.size, 1), 1)
         for first in range(0, len(place), rows):
             block = slice(first, first + rows)
             reading = fit(np.moveaxis(self._window[:, block], 0, -1))
             place[block], status[block] = reading.image_distance, reading.status
+            if sigma is not None and reading.sigma_image is not None:
+                sigma[block] = reading.sigma_image
         status[self._best <= stack.threshold] = Status.LOW_SIGNAL
         status[self._lost] = Status.NOT_FINITE
         frame = np.where(status == 0, self._start + place - 1.0, np.nan)
@@ -325,4 +345,6 @@ class FocusSearch:
         status[good & self._saturated] |= np.uint8(Status.SATURATED)
         if stack.ambiguity is not None:
             status[good & (self._second >= stack.ambiguity * self._best)] |= np.uint8(Status.AMBIGUOUS)
-        return FocusPeak(frame, self._best, status)
+        if sigma is not None:
+            sigma[np.isnan(frame)] = np.nan
+        return FocusPeak(frame, self._best, status, sigma)

@@ -157,7 +157,7 @@ class Sensor:
         the samples of the sweep.
     noise_known
         Whether the file gives the noise of the readout, so that a scan predicts its errors: ``read_noise``, ``gain`` or
-        ``speckle`` of a camera, ``[psd.noise]`` of a PSD.
+        ``speckle`` of a camera, ``[psd.noise]`` of a PSD, ``read_noise`` of a focus stack.
     rotating_sigma
         Standard deviations of the calibration of a rotating sheet, if the file has them (``[transport.sigma]``).
     files
@@ -294,6 +294,7 @@ class Sensor:
             output=output,
             recording=recording,
             frame=frame,
+            noise_known=stack.read_noise is not None,
             files=top.files,
         )
 

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.normal_distribution import MAD_TO_SIGMA
+from gpuvision.ranging.focus_stack import FocusPeak, FocusStack
 from gpuvision.ranging.polygon_scan import PolygonScan
 from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
 from gpuvision.sensor.sensor import Sensor
@@ -131,6 +132,37 @@ def predict_errors(
     return ScanErrors(
         position=fields["sigma"], readout=readout, transport=transport, random=random, systematic=systematic
     )
+
+
+def focus_errors(sensor: Sensor, stack: FocusStack, peak: FocusPeak, points: RangePoints) -> ScanErrors:
+    """Predict the random errors of the points of a focus stack.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Gives the directions in the scene.
+    stack : FocusStack
+    peak : FocusPeak
+        Sharpest frames with their standard deviations.
+    points : RangePoints
+        Points of the scan.
+
+    Returns
+    -------
+    ScanErrors
+        Displacements of the points by one standard deviation of the frame number: first order.
+    """
+    assert isinstance(sensor.transport, StraightTransport)  # the reader of [focus] gives no other
+    assert peak.sigma is not None  # the caller checks that
+    everywhere = ((-math.inf, math.inf),) * 3
+    x, y, z = (stack.points(peak, sensor.transport, everywhere, np.float64))[:3]
+    moved = stack.points(peak._replace(frame=peak.frame + peak.sigma), sensor.transport, everywhere, np.float64)
+    dtype = to_numpy(points.z).dtype
+    known = np.isfinite(to_numpy(points.z))
+    steps = (np.abs(to_numpy(new) - to_numpy(old)) for new, old in zip(moved[:3], (x, y, z), strict=True))
+    readout = PointSigma(*(np.where(known, step, np.nan).astype(dtype) for step in steps))
+    transport = PointSigma(*(np.where(known, 0.0, np.nan).astype(dtype) for _ in "xyz"))
+    return ScanErrors(position=peak.sigma, readout=readout, transport=transport, random=readout, systematic=None)
 
 
 def _jitter(sensor: Sensor) -> float:

@@ -31,7 +31,7 @@ from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.workflows.focus_frames import read_focus_peak
 from gpuvision.workflows.opened_recording import open_for_scan
-from gpuvision.workflows.scan_errors import ScanErrors, predict_errors, sigma_outputs
+from gpuvision.workflows.scan_errors import ScanErrors, focus_errors, predict_errors, sigma_outputs
 from gpuvision.workflows.scan_result import Scan, ScanLimits, scan_advice
 
 Array = npt.NDArray[Any]
@@ -171,8 +171,10 @@ def _scan_stack(
     )
     _drop_ambiguous(sensor, points)
     intensity = peak.strength.astype(points.z.dtype)
+    errors = None if peak.sigma is None else focus_errors(sensor, stack, peak, points)
     middle = time.perf_counter()
-    heights, grid = resample_heights(sensor, points, intensity, device, max_cells=limits.max_cells)
+    sigma = None if errors is None else errors.random.z
+    heights, grid = resample_heights(sensor, points, intensity, device, max_cells=limits.max_cells, sigma=sigma)
     return Scan(
         sensor=sensor,
         points=points,
@@ -185,6 +187,7 @@ def _scan_stack(
         seconds={"assemble": middle - start, "resample": time.perf_counter() - middle},
         metadata=_metadata(opened.name, sensor, None, opened.source),
         limits=limits,
+        errors=errors,
     )
 
 

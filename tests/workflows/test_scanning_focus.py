@@ -59,6 +59,38 @@ def test_a_slope(device: Device) -> None:
     assert report["valid_fraction"] == pytest.approx(25 / 30)
 
 
+@pytest.mark.parametrize("geometry", ["stage", "lens"])
+def test_noise_scatters_the_heights_by_their_sigma(
+    device: Device, geometry: str, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    """Noise of 1200 pixels determines the ratio of scatter and sigma to 2 %."""
+    exact, _ = slope_frames()
+    lens = {"focal_length": 0.05, "first": 0.055, "spacing": 5e-4, "pixel_pitch": 5e-6, "stand_off": 0.6}
+    focus = STAGE if geometry == "stage" else lens | {"measure": "intensity"}
+    described = {"kind": "focus", "focus": focus | {"read_noise": 150.0}, "output": {"cell": 20e-6}}
+    if geometry == "lens":
+        described["output"] = {"cell": 2e-3}
+    noisy = np.clip(np.rint(exact + rng.normal(0.0, 150.0, exact.shape)), 0, 65_535).astype(np.uint16)
+    made = Sensor.from_section(Section(described, "sensor.toml"))
+    done, true = scan(noisy, made, device=device, precision="double"), scan(exact, made, precision="double")
+    assert done.errors is not None
+    for axis in "xz":
+        error = to_numpy(getattr(done.points, axis)) - to_numpy(getattr(true.points, axis))
+        sigma = getattr(done.errors.random, axis)
+        used = np.isfinite(error) & (sigma > 1e-12)
+        if axis == "z" or geometry == "lens":
+            assert used.mean() > 0.7
+            assert np.sqrt(np.mean((error[used] / sigma[used]) ** 2)) == pytest.approx(1.0, abs=0.1)
+    assert done.report()["error_budget"]["random"]["total"]["z"] == pytest.approx(np.nanmedian(done.errors.random.z))
+    done.write(tmp_path / "out")
+    assert (tmp_path / "out" / "range_image_sigma.tiff").exists()
+
+
+def test_the_noise_of_a_laplacian_is_refused() -> None:
+    with pytest.raises(DescriptionError, match="read_noise has no effect on the measure 'laplacian'"):
+        sensor(measure="laplacian", read_noise=1.0)
+
+
 def test_the_command_writes_what_other_scans_write(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

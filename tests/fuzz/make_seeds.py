@@ -118,6 +118,7 @@ def main() -> None:
     cv2.imwrite(str(SEEDS / "levels.png"), (1000 * z).astype(np.uint16))
     (SEEDS / "surface.csv").write_text(_SURFACE)
     (SEEDS / "leads.csv").write_text(_LEADS)
+    (SEEDS / "loop.csv").write_text("time,command,measured\n0,0,\n0.001,1e-5,0\n0.002,-2.5e-5,1e-5\n")
     (SEEDS / "known_points.csv").write_text(_KNOWN_POINTS)
     write_npz(SEEDS / "map.npz", {"map_x": grid.x, "map_y": grid.y, "map_z": z}, dict.fromkeys(_MAP, "m"))
     _write_light(z)

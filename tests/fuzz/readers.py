@@ -19,6 +19,7 @@ from gpuvision.formats.field_file import read_field
 from gpuvision.formats.height_files import ImageScale, read_heights
 from gpuvision.formats.known_points_file import read_known_points
 from gpuvision.formats.leads_file import read_leads
+from gpuvision.formats.loop_recording import read_loop_recording
 from gpuvision.formats.materials_file import read_materials
 from gpuvision.formats.range_image import read_npz, read_ply, read_png16, read_tiff
 from gpuvision.host import GpuVisionError, open_recording
@@ -136,6 +137,7 @@ _ALL = (
     Reader("surface.csv", read_heights),
     Reader("map.npz", read_heights),
     Reader("leads.csv", read_leads),
+    Reader("loop.csv", read_loop_recording),
     Reader("known_points.csv", read_known_points),
     Reader("points.ply", read_ply),
     Reader("result.npz", read_npz),

@@ -1,12 +1,14 @@
-"""Digits of calibrated parameters, against the printed uncertainty."""
+"""Output of a calibration: digits of parameters against their uncertainty, skipped images, warnings."""
 
 from __future__ import annotations
 
 import math
+import types
+from typing import Any
 
 import pytest
 
-from gpuvision.cli.calibrate import _digits
+from gpuvision.cli.calibrate import _digits, _show
 
 
 @pytest.mark.parametrize(
@@ -25,3 +27,21 @@ from gpuvision.cli.calibrate import _digits
 )
 def test_digits_reach_below_the_uncertainty(value: float, error: float, digits: int) -> None:
     assert _digits(value, error) == digits
+
+
+def test_everything_that_was_found_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    alternative = types.SimpleNamespace(model="k1,k2", rms_px=0.05123, p_value=0.0321, centre_distance_px=1.5)
+    done: Any = types.SimpleNamespace(
+        summary=lambda: "12 images",
+        skipped_images=[("a.png", "no dots"), ("b.png", "too dark")],
+        parameters={"f": (1234.5678, 0.5), "k1": (-1e-7, 1e-9)},
+        alternatives=[alternative],
+        fit=types.SimpleNamespace(warnings=("add views", "tilt them")),
+    )
+    _show(done, to_stderr=False)
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert lines[:3] == ["12 images", "skipped a.png: no dots", "skipped b.png: too dark"]
+    assert {"f 1234.57 0.5", "k1 -1e-07 1e-09", "k1,k2 0.05123 0.032 1.5"} <= set(lines)
+    assert lines[-2:] == ["warning: add views", "warning: tilt them"]
+    _show(done, to_stderr=True)
+    assert capsys.readouterr().out == ""

@@ -19,7 +19,8 @@ from gpuvision.servoing.simulated_sensor import SimulatedPoseSensor
 
 PERIOD = 1e-3
 STEP = np.array([1e-3, 0.0, 0.0])
-DELAYS = (0, 1, 2, 3, 4, 5, 6, 0.3, 2.25)
+DELAYS = (0, 2, 6, 2.25)
+MORE_DELAYS = (1, 3, 4, 5, 0.3, 1.5, 4.7)
 
 
 def run(
@@ -51,7 +52,7 @@ def growth(errors: np.ndarray) -> float:
     return float((late / early) ** (1.0 / (len(errors) - quarter - half)))
 
 
-@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize("delay", [*DELAYS, *(pytest.param(each, marks=pytest.mark.slow) for each in MORE_DELAYS)])
 def test_simulated_loop_is_unstable_from_the_limit_on(delay: float) -> None:
     """1 % below the limit the error decays, 1 % above it grows; the factor is that of the slowest root."""
     for factor in (0.99, 1.01):

@@ -55,7 +55,7 @@ def compare(count: int, seed: int) -> tuple[float, float, float]:
 
 
 def test_rule_waits_30_percent_less_than_a_fixed_wait_with_as_many_misplacements() -> None:
-    wait, fixed, missed = compare(50, 1)
+    wait, fixed, missed = compare(30, 1)
     assert missed <= 0.05
     assert wait <= 0.7 * fixed
 

@@ -84,6 +84,7 @@ MODULES = (
     "gpuvision.reference.blob",
     "gpuvision.reference.board_image",
     "gpuvision.reference.camera",
+    "gpuvision.reference.deposits",
     "gpuvision.reference.field",
     "gpuvision.reference.light_clustering",
     "gpuvision.reference.line",

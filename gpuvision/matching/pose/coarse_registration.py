@@ -59,6 +59,8 @@ _VERIFICATION_RULERS = 512  # rulers of each candidate in step 3 (cost)
 _REFINEMENT_ROWS = 128  # rulers of each candidate in step 2 (cost)
 # Start candidates of a robust pose: of half bad rows all contain an outlier with a probability of 6e-8 (derived).
 _TRIALS = {"rigid": 128, "similarity": 256, "affine": 512}
+# With the etch bias, one more unknown: probability of 3e-4 (derived), for each of the verified candidates.
+_ETCH_TRIALS = {"rigid": 128, "similarity": 256, "affine": 1024}
 _SEPARATION = (3, 2)  # distances in cells and headings within which two candidates of the grid count as the same
 
 
@@ -380,8 +382,8 @@ class CoarseRegistration:
 
     @property
     def _trials(self) -> int:
-        """Number of start candidates: twice as many with the etch bias, one more unknown."""
-        return _TRIALS[self.transform] * (1 if self.etch_bias_sigma is None else 2)
+        """Number of start candidates of a robust pose."""
+        return (_TRIALS if self.etch_bias_sigma is None else _ETCH_TRIALS)[self.transform]
 
     @property
     def _etch_px(self) -> float:

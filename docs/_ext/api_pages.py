@@ -155,6 +155,7 @@ MODULES = (
     "gpuvision.workflows.inspecting_leads",
     "gpuvision.workflows.inspecting_paste",
     "gpuvision.workflows.locating_board",
+    "gpuvision.workflows.locating_part",
     "gpuvision.workflows.locating_robot",
     "gpuvision.workflows.placing",
     "gpuvision.workflows.scan_result",

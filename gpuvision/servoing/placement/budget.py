@@ -80,17 +80,18 @@ def predict_budget(machine: Machine, plan: PlacementPlan) -> ErrorBudget:
     Notes
     -----
     Calibration, etch bias and drift are common to all frames of a placement. "vision" is the motion by the errors of
-    the measured poses, which the loop follows (`noise_gain`). "servo" is the rest of the step response that
-    `ReleaseRule` allows, evenly distributed, and the step of the encoder.
+    the measured poses, which the loop follows: it averages the noise from frame to frame (`noise_gain`), but not the
+    differences between the pixels, which are the same in all frames of a head at rest. "servo" is the rest of the step
+    response that `ReleaseRule` allows, evenly distributed, and the step of the encoder.
     """
-    variance = noise_gain(machine.delay.frames, machine.loop_gain)
+    averaged = noise_gain(machine.delay.frames, machine.loop_gain)
     steps = np.array([axis.encoder for axis in machine.axes])
     rest = REMAINDER * np.array([machine.tolerance.position] * 2 + [machine.tolerance.angle])
     sources = {
         "calibration": _at_board(machine.pipette_in_camera, plan, machine.pipette_in_camera.pose_covariance),
         "etch bias": plan.etch_bias,
         "drift": _at_board(machine.pipette_in_camera, plan, machine.drift.covariance),
-        "vision": variance * plan.vision,
+        "vision": (averaged * (1.0 - plan.fixed_pattern) + plan.fixed_pattern) * plan.vision,
         "servo": np.diag(rest**2 / 3.0 + steps**2 / 12.0),
     }
     return ErrorBudget(sources, np.sum(list(sources.values()), axis=0))

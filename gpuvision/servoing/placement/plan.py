@@ -46,6 +46,9 @@ class PlacementPlan:
         Least height of an edge, and standard deviation of a pixel [grey levels].
     vision : numpy.ndarray
         (3, 3): predicted covariance of the pose of the nozzle by the noise of one frame.
+    fixed_pattern : float
+        Part of the variance of ``vision`` by the differences between the pixels, 0 to 1: frames of a head at rest have
+        this error in common.
     etch_bias : numpy.ndarray
         (3, 3): predicted covariance of the pose of the nozzle by the etch bias of the board, common to all frames.
     """
@@ -56,6 +59,7 @@ class PlacementPlan:
     threshold: float
     noise: float
     vision: Float64
+    fixed_pattern: float
     etch_bias: Float64
 
 
@@ -103,13 +107,15 @@ def plan_placement(
     white = machine.camera.white_electrons
     step = abs(board.copper_masked - board.laminate_masked) * white * sensor.gain
     bright = max(board.copper_masked, board.laminate_masked) * white
+    total, temporal = (float(sensor.noise(bright, machine.camera.exposure, spatial=each)) for each in (True, False))
     return PlacementPlan(
         target=place,
         camera_pose=camera_pose,
         features=features,
         threshold=_THRESHOLD * step,
-        noise=float(sensor.noise(bright, machine.camera.exposure)) * sensor.gain,
+        noise=total * sensor.gain,
         vision=move_covariance(noise, camera_pose, calibrated),
+        fixed_pattern=1.0 - (temporal / total) ** 2,
         etch_bias=move_covariance(etch_bias, camera_pose, calibrated),
     )
 

@@ -127,6 +127,9 @@ class Layer:
         start, end
             (2,) ends of the segment [m]; the crossings are 0 at the start and 1 at the end.
         """
+        if not self.shapes:
+            self.comparisons += _PER_QUERY
+            return []
         low, high = np.minimum(start, end), np.maximum(start, end)
         near = self._boxes.near(low, high)
         overlaps = (self._low[near] <= high) & (self._high[near] >= low)
@@ -139,9 +142,11 @@ class Layer:
         self.comparisons += len(sides) + _PER_SHAPE * len(near)
         # Few sides cross the line: only these are sorted by shape.
         side_a, side_b = (_side(ends[sides] - start, along) for ends in (self._from, self._to))
-        crossing = sides[(side_a > 0) != (side_b > 0)]
+        crosses = (side_a > 0) != (side_b > 0)
+        crossing = sides[crosses]
         if not len(crossing):
             return []
+        points = _on_line(self._from[crossing] - start, self._to[crossing] - start, side_a[crosses], side_b[crosses])
         owner = np.searchsorted(self._stop, crossing, side="right")
         first = np.searchsorted(owner, near)
         last = np.searchsorted(owner, near, side="right")
@@ -150,8 +155,7 @@ class Layer:
             if begin == stop:
                 continue
             self.comparisons += _PER_CROSSING
-            span = crossing[begin:stop]
-            where = _places_on_line(self._from[span] - start, self._to[span] - start, along)
+            where = np.sort(points[begin:stop] @ along / (along @ along))
             shape = self.shapes[index]
             if shape.holes:
                 holes = [
@@ -234,10 +238,15 @@ def _side(points: Float64, along: Float64) -> Float64:
 def _places_on_line(a: Float64, b: Float64, along: Float64) -> Float64:
     """Return where the sides from a to b cross the line from the origin along a vector (1 at its end), ascending."""
     side_a, side_b = _side(a, along), _side(b, along)
-    crossing = (side_a > 0) != (side_b > 0)
-    share = side_a[crossing] / (side_a[crossing] - side_b[crossing])
-    points = a[crossing] + share[:, None] * (b[crossing] - a[crossing])
+    crosses = (side_a > 0) != (side_b > 0)
+    points = _on_line(a[crosses], b[crosses], side_a[crosses], side_b[crosses])
     return np.sort(points @ along / (along @ along))
+
+
+def _on_line(a: Float64, b: Float64, side_a: Float64, side_b: Float64) -> Float64:
+    """Return where the sides from a to b cross a line, from the cross products of a and b with it."""
+    share = side_a / (side_a - side_b)
+    return np.asarray(a + share[:, None] * (b - a))
 
 
 def _without(where: Float64, holes: list[Float64]) -> Float64:

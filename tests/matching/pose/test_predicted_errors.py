@@ -93,7 +93,7 @@ def test_no_wrong_pose_of_a_disturbed_board(
     drawn: BoardFix, kind: str, device: Device, rng: np.random.Generator, draws: Callable[[int, int], int]
 ) -> None:
     count = draws(30, 60)
-    board = replace(drawn, motion_px=5.0 if kind == "motion" else 0.0)
+    board = replace(drawn, motion_px=5.0) if kind == "motion" else drawn  # with the rulers that it has selected
     pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else draws(2, 4))]
     fixes = board.fixes(pictures, count, device, rng)
     if kind == "reversed":

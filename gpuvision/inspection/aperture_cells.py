@@ -81,7 +81,7 @@ def cells_of(bounds: Float64, grid: Grid, margin: float) -> tuple[slice, slice]:
 
 
 def owner_map(windows: Sequence[Window | None], shape: tuple[int, int]) -> npt.NDArray[np.int32]:
-    """Return the number of the window that each cell belongs to, as `MeasureDeposits` takes it.
+    """Return the number of the window that each cell belongs to, as `gpuvision.MeasureDeposits` takes it.
 
     Parameters
     ----------

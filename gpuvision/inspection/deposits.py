@@ -65,8 +65,9 @@ class MeasureDeposits(VisionOperation[DepositSums]):
     """Area, volume, mean height and offset of deposits: ``op(z, sigma, owner, boxes, surfaces) -> DepositSums``.
 
     The heights z [m] (NaN in holes) and their standard deviations sigma [m] (above 0) are float32 or float64 of shape
-    (rows, columns). ``owner`` is int32 (rows, columns), the result of `owner_map`. ``boxes``, int32 (n, 4), and
-    ``surfaces``, real (n, 49), are the results of `deposit_boxes` and `deposit_surfaces`.
+    (rows, columns). ``owner`` is int32 (rows, columns), the result of `gpuvision.inspection.aperture_cells.owner_map`.
+    ``boxes``, int32 (n, 4), and ``surfaces``, real (n, 49), are the results of
+    `gpuvision.inspection.deposits.deposit_boxes` and `gpuvision.inspection.deposits.deposit_surfaces`.
 
     Parameters
     ----------
@@ -161,7 +162,7 @@ class MeasureDeposits(VisionOperation[DepositSums]):
 
 
 def deposit_boxes(windows: Sequence[Window]) -> npt.NDArray[np.int32]:
-    """Return the bounding boxes of windows in cells, int32 (n, 4), as `MeasureDeposits` takes them.
+    """Return the bounding boxes of windows in cells, int32 (n, 4), as `gpuvision.MeasureDeposits` takes them.
 
     Columns: first row, row after the last, first column, column after the last.
     """
@@ -176,7 +177,7 @@ def deposit_surfaces(
     centroids: Float64,
     pad_height: float = 0.0,
 ) -> Float64:
-    """Return the reference surfaces as `MeasureDeposits` takes them.
+    """Return the reference surfaces as `gpuvision.MeasureDeposits` takes them.
 
     Parameters
     ----------

@@ -160,6 +160,7 @@ MODULES = (
     "gpuvision.workflows.placing",
     "gpuvision.workflows.scan_result",
     "gpuvision.workflows.scanning",
+    "gpuvision.workflows.sensor_calibration_result",
     "gpuvision.workflows.sensor_pair",
     "gpuvision.workflows.simulating",
     "gpuvision.workflows.undistorting",

@@ -14,7 +14,8 @@ from gpuvision.cli.arguments import echo, named_path, prints_report, progress_ba
 if TYPE_CHECKING:
     from gpuvision.camera.calibration import Calibration
     from gpuvision.host.recordings import Channel as RecordingChannel
-    from gpuvision.workflows.calibrating_sensor import BlockViews, SensorCalibration, TransportViews
+    from gpuvision.workflows.calibrating_sensor import BlockViews, TransportViews
+    from gpuvision.workflows.sensor_calibration_result import SensorCalibration
 
 
 class Axis(StrEnum):
@@ -147,7 +148,7 @@ def calibrate_sensor(
     """
     from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.calibrating_sensor import calibrate_sensor as run
-    from gpuvision.workflows.calibrating_sensor import sensor_calibration_files, write_sensor_calibration
+    from gpuvision.workflows.sensor_calibration_result import sensor_calibration_files, write_sensor_calibration
 
     channel = _checked_channel(options.channel)
     _check(options, camera)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import tomllib
 from importlib import resources
@@ -98,3 +99,27 @@ def test_the_command_writes_report_and_pictures(
     with pytest.raises(ValueError, match="expected 3 or more together"):
         application()([str(each) for each in far], standalone_mode=False)
     assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "window", "target"),
+    [
+        ("eagle", 256, (43.547e-3, 4.252e-3)),
+        # Reading these boards takes seconds.
+        pytest.param("upverter", 512, (-48.98e-3, 35.925e-3), marks=pytest.mark.slow),
+        pytest.param("kicad-x2-tests/x2ap", 512, (75.934e-3, -47.0486e-3), marks=pytest.mark.slow),
+    ],
+)
+def test_three_sigma_on_real_boards_are_below_half_a_pixel(
+    data: Path, name: str, window: int, target: tuple[float, float]
+) -> None:
+    """Pixels of 10 um at 1 kHz: 5 um, and the number of frames of theory."""
+    preset = read_machine("look_while_place")
+    machine = dataclasses.replace(preset, camera=dataclasses.replace(preset.camera, window=(window, window)))
+    board = read_artwork(data / "gerber" / name, clearance=edge_clearance(placement_imaging(machine)))
+    result = simulate_placements(board, (*target, 0.0), machine, count=10)
+    assert all(each.released for each in result.placements)
+    assert np.all(3.0 * np.sqrt(np.mean(result.error[:, :2] ** 2, axis=0)) <= 5e-6)
+    waited = [each.frames - each.predicted_frames - 1 for each in result.placements]
+    assert np.mean(waited) <= 1.0

@@ -26,7 +26,7 @@ Kind = Literal["rigid", "similarity", "affine"]
 _KINDS: tuple[Kind, ...] = get_args(Kind)
 
 ARTWORK, EXPECTED, CAMERA, PIPETTE, MOTION, IMAGE = "artwork", "expected", "camera", "pipette", "motion", "image"
-"""Frames of the thesis [1]_: F_a, F_e, F_c, F_p [m], the motion axes [m]; and the image [px]."""
+"""Frames F_a, F_e, F_c, F_p of the thesis [m], the motion axes [m]; and the image [px]."""
 
 # Rounding of float64 in a matrix whose entries were computed by some products; relative to its largest entry.
 _ROUNDING = 1e-9
@@ -274,7 +274,7 @@ class Transform:
 def placement_error(
     pipette_in_camera: Transform, expected_in_camera: Transform, artwork_in_expected: Transform
 ) -> Transform:
-    """Return the target of a placement as the pipette sees it: ``(Fc_Fp)^-1 Fc_Fe Fe_Fa`` of [1]_, section 5.4.2.
+    """Return the target of a placement as the pipette sees it: ``(Fc_Fp)^-1 Fc_Fe Fe_Fa``.
 
     Parameters
     ----------

@@ -19,8 +19,8 @@ from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, Holes
 from gpuvision.matching.artwork.edges import board_edges
 from gpuvision.matching.artwork.shapes import Layer, Shape, area
-from gpuvision.matching.board.edge_measurement import Copper
 from gpuvision.matching.board.located_board import LocatedBoard
+from gpuvision.matching.board.measurement_result import Copper
 from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform, compose_poses, invert_pose
 from gpuvision.workflows.locating_board import locate_board
 

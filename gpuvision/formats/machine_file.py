@@ -10,6 +10,7 @@ from importlib import resources
 from pathlib import Path
 
 from gpuvision.formats.cmos_sensor_file import CMOS_SENSORS, read_cmos_sensor
+from gpuvision.host.reading import one_line
 from gpuvision.schema import Section, read_toml
 from gpuvision.servoing.axis import Axis, FineStage
 from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform
@@ -39,9 +40,10 @@ def read_machine(path: str | Path, *, rate: float | None = None) -> Machine:
     Raises
     ------
     OSError
-        The file, or the file of the sensor, cannot be read.
+        The file cannot be read.
     DescriptionError
-        A key is missing, unknown or has a wrong value; the message names the key.
+        A key is missing, unknown or has a wrong value, or the file of the sensor cannot be read; the message names the
+        key.
     """
     if str(path) in MACHINES:
         with resources.as_file(resources.files("gpuvision") / "presets" / "machines" / f"{path}.toml") as file:
@@ -77,7 +79,12 @@ def _machine(top: Section, rate: float | None) -> Machine:
 
 def _camera(table: Section) -> PlacementCamera:
     name = table.word("sensor", CMOS_SENSORS)
-    sensor = read_cmos_sensor(table.file("sensor") if name is None else name)
+    file = table.file("sensor") if name is None else name
+    try:
+        sensor = read_cmos_sensor(file)
+    except OSError as error:
+        shown, presets = one_line(str(file)), ", ".join(CMOS_SENSORS)
+        raise table.error(f"camera.sensor: {shown}: {error.strerror}; expected {presets} or a sensor file") from error
     window = table.numbers("window", "px", (2,))
     values = {
         "pixel": table.number("pixel", "m", above=0.0),

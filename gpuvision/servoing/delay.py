@@ -35,6 +35,8 @@ Float64 = npt.NDArray[np.float64]
 # Points of the search for crossings of the unit circle, per root of the polynomial: the phase of the loop changes by
 # less than a tenth of a turn between two points.
 _POINTS_PER_ROOT = 64
+# Longest delay [frames] (chosen: a second at 1 kHz); memory and time of the analyses grow with it.
+_MAX_DELAY = 1000.0
 
 
 def delay_taps(delay: float) -> tuple[int, float]:
@@ -43,9 +45,9 @@ def delay_taps(delay: float) -> tuple[int, float]:
     Raises
     ------
     ValueError
-        The delay is negative or not finite.
+        The delay is negative, not finite, or longer than 1000 frames.
     """
-    delay = finite(delay, "delay", minimum=0.0)
+    delay = finite(delay, "delay", minimum=0.0, maximum=_MAX_DELAY)
     whole = math.floor(delay)
     return whole, delay - whole
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from gpuvision.host import Device, Source
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import write_text_atomic
-from gpuvision.host.reading import reading
+from gpuvision.host.reading import FileLimit, reading
 from gpuvision.matching.field.distance_map import Field
 from gpuvision.matching.field.odometry import PoseEstimate
 from gpuvision.matching.field.robot_filter import RobotFilter, RobotFilterLimits, RobotState
@@ -34,6 +34,10 @@ Float64 = npt.NDArray[np.float64]
 TRACK_FILES = ("track.csv", "track.json", "track.png")
 _COLUMNS = ("frame", "time", "x", "y", "theta", "sigma_x", "sigma_y", "sigma_theta", "probability", "status")
 _ODOMETRY = "forward,left,turn"
+_LONGEST_LINE, _LONGEST_SHOWN = 1000, 60  # characters of a line that is read, and of a header in a message
+
+MAX_MOTIONS = FileLimit("GPUVISION_MAX_MOTIONS", 1_000_000)
+"""Motions of a CSV file of odometry. Chosen: 1 000 000, 9 hours at 30 frames per second."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,13 +234,19 @@ def read_odometry(path: Path) -> Float64:
     OSError
         The file cannot be read.
     RecordingError
-        The file has another header or content.
+        The file has another header or content, or more than `MAX_MOTIONS` motions.
     """
-    with reading(path, "list of motions", RecordingError):
-        head, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
+    motions: list[list[float]] = []
+    with reading(path, "list of motions", RecordingError), path.open(encoding="utf-8-sig") as file:
+        head = file.readline(_LONGEST_LINE).strip()
         if head.replace(" ", "") != _ODOMETRY:
-            raise RecordingError(f"{path}: the header is {head[:60]!r}, expected {_ODOMETRY}")
-        motions = np.array([[float(each) for each in line.split(",")] for line in lines if line], np.float64)
-    if motions.size and (motions.ndim != 2 or motions.shape[1] != 3 or not np.isfinite(motions).all()):
-        raise RecordingError(f"{path}: expected three finite numbers in each line")
-    return motions.reshape(-1, 3)
+            raise RecordingError(f"{path}: the header is {head[:_LONGEST_SHOWN]!r}, expected {_ODOMETRY}")
+        for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), ""), 2):
+            if not line.strip():
+                continue
+            MAX_MOTIONS.check(len(motions) + 1, f"{path}: {len(motions) + 1} motions or more", RecordingError)
+            motion = [float(each) for each in line.split(",")]
+            if len(motion) != 3 or not np.isfinite(motion).all():
+                raise RecordingError(f"{path}: line {number}: expected three finite numbers, {_ODOMETRY}")
+            motions.append(motion)
+    return np.array(motions, np.float64).reshape(-1, 3)

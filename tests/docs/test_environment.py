@@ -76,4 +76,4 @@ def test_the_page_on_file_limits_lists_the_defaults_of_the_code() -> None:
     listed = re.findall(r"^\|[^|]+\| `(\w+)` \| ([0-9. ]+) \|", page, re.MULTILINE)
     assert {variable: float(default.replace(" ", "")) for variable, default in listed} == limits()
     made = sum(each.read_text().count("= FileLimit(") for each in files())
-    assert made == len(listed) == 13
+    assert made == len(listed) == 14

@@ -66,6 +66,10 @@ def test_all_keys_of_an_axis_are_read(tmp_path: Path) -> None:
         ({"loop": {"rate": 1000.0, "gian": 0.1}}, "did you mean 'loop.gain'"),
         ({"loop": {"rate": 1000.0, "gain": 1.9}}, "limit of stability"),
         ({"camera": PRESET["camera"] | {"window": [64.5, 64]}}, "expected whole numbers of rows and columns"),
+        (
+            {"camera": PRESET["camera"] | {"sensor": "p\n1"}},
+            "1: No such file or directory; expected lupa300, pb1024",
+        ),
         ({"camera": PRESET["camera"] | {"window": [4096, 64]}}, "camera: window rows is 4096"),
         ({"calibration": {"pipette": [0.0, 0.0]}}, "calibration.pipette is"),
         (

@@ -119,6 +119,7 @@ def main() -> None:
     (SEEDS / "surface.csv").write_text(_SURFACE)
     (SEEDS / "leads.csv").write_text(_LEADS)
     (SEEDS / "loop.csv").write_text("time,command,measured\n0,0,\n0.001,1e-5,0\n0.002,-2.5e-5,1e-5\n")
+    (SEEDS / "odometry.csv").write_text("forward,left,turn\n0.1,0,0.02\n0.12,-5e-3,-0.1\n")
     (SEEDS / "known_points.csv").write_text(_KNOWN_POINTS)
     write_npz(SEEDS / "map.npz", {"map_x": grid.x, "map_y": grid.y, "map_z": z}, dict.fromkeys(_MAP, "m"))
     _write_light(z)
@@ -161,6 +162,7 @@ def _write_tables() -> None:
     presets = Path(__file__).resolve().parents[2] / "gpuvision" / "presets"
     (SEEDS / "sensor.toml").write_bytes((presets / "sensors" / "camera_line.toml").read_bytes())
     (SEEDS / "cmos_sensor.toml").write_bytes((presets / "cameras" / "lupa300.toml").read_bytes())
+    (SEEDS / "machine.toml").write_bytes((presets / "machines" / "look_while_place.toml").read_bytes())
     identity = np.eye(3).tolist()
     features = {
         "side": "top",

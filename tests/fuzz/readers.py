@@ -20,6 +20,7 @@ from gpuvision.formats.height_files import ImageScale, read_heights
 from gpuvision.formats.known_points_file import read_known_points
 from gpuvision.formats.leads_file import read_leads
 from gpuvision.formats.loop_recording import read_loop_recording
+from gpuvision.formats.machine_file import read_machine
 from gpuvision.formats.materials_file import read_materials
 from gpuvision.formats.range_image import read_npz, read_ply, read_png16, read_tiff
 from gpuvision.host import GpuVisionError, open_recording
@@ -30,6 +31,7 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.workflows.light_cache import LightBlock
 from gpuvision.workflows.locating_robot import read_points
+from gpuvision.workflows.tracking_robot import read_odometry
 
 SEEDS = Path(__file__).parent / "seeds"
 LAYERS = {"(copper|pad).gbr": "top copper", "outline.gbr": "mechanical outline", "holes.drl": "drill plated"}
@@ -124,6 +126,7 @@ _ALL = (
     *(Reader(f"encoder.{kind}", read_encoder) for kind in ("csv", "npz")),
     Reader("camera.toml", _camera),
     Reader("cmos_sensor.toml", read_cmos_sensor),
+    Reader("machine.toml", read_machine),
     Reader("features.toml", read_features),
     Reader("field.toml", read_field),
     Reader("materials.toml", read_materials),
@@ -138,6 +141,7 @@ _ALL = (
     Reader("map.npz", read_heights),
     Reader("leads.csv", read_leads),
     Reader("loop.csv", read_loop_recording),
+    Reader("odometry.csv", read_odometry),
     Reader("known_points.csv", read_known_points),
     Reader("points.ply", read_ply),
     Reader("result.npz", read_npz),

@@ -110,3 +110,9 @@ def test_budget_refuses(given: dict[str, float], message: str) -> None:
 def test_negative_delay_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"delay is -0\.5"):
         gain_limit(-0.5)
+
+
+def test_longest_delay() -> None:
+    assert gain_limit(999.5) == pytest.approx(math.pi / 2.0 / 1000.0, rel=1e-3)
+    with pytest.raises(ValueError, match=r"delay is 1000\.5"):
+        gain_limit(1000.5)

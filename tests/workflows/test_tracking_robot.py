@@ -113,3 +113,25 @@ def test_wrong_odometry_is_refused(drive: tuple[np.ndarray, np.ndarray], tmp_pat
     (tmp_path / "b.csv").write_text("forward,left,turn\n1,2,nan\n")
     with pytest.raises(RecordingError, match="three finite numbers"):
         read_odometry(tmp_path / "b.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("forward,left,turn\n1,2,3\n1,2\n", "line 3: expected three finite numbers"),
+        ("forward,left,turn\n1,2,a\n", "not a readable list of motions"),
+        ("forward,left,turn\n1,2,3\n\n4,5,6\n7,8,9\n", "3 motions or more, .* set GPUVISION_MAX_MOTIONS"),
+    ],
+)
+def test_damaged_odometry_is_refused(text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GPUVISION_MAX_MOTIONS", "2")
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(RecordingError, match=message):
+        read_odometry(tmp_path / "a.csv")
+
+
+def test_odometry_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("\ufeffforward, left, turn\n0.1,0,-2e-2\n\n0.2,0.3,0.4\n", encoding="utf-8")
+    assert read_odometry(tmp_path / "a.csv").tolist() == [[0.1, 0.0, -0.02], [0.2, 0.3, 0.4]]
+    (tmp_path / "b.csv").write_text("forward,left,turn\n")
+    assert read_odometry(tmp_path / "b.csv").shape == (0, 3)

@@ -1,4 +1,4 @@
-"""Stability margins of a servo loop, and the sensitivity of a predictor to a wrong model.
+"""Stability margins of a servo loop, and the sensitivity of a predictor and of an observer to a wrong model.
 
 References
 ----------
@@ -10,14 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import solve_discrete_are
 from scipy.optimize import brentq
 
 from gpuvision.servoing.controllers import PidGains
 from gpuvision.servoing.delay import delay_taps
+from gpuvision.servoing.observer import MotionModel
 from gpuvision.validation import finite
 
 Float64 = npt.NDArray[np.float64]
@@ -25,6 +28,8 @@ Float64 = npt.NDArray[np.float64]
 # Frequencies of the search for margins, from the frame rate / 1e6 to half the frame rate (chosen): the phase changes by
 # less than a degree from one to the next for delays up to 20 frames.
 _FREQUENCIES = 8192
+# Steps of the search for the first unstable error of an observer's model (chosen): the next one lies within 0.5 frames.
+_OBSERVER_STEPS = 40
 # Steps of the bisection for the tolerated error of a model.
 _BISECTIONS = 30
 
@@ -184,9 +189,137 @@ def predictor_tolerance(gain: float, delay: float) -> PredictorTolerance:
     )
 
 
-def _first_unstable(is_stable: Callable[[float], bool], largest: float) -> float:
+def observer_matrix(
+    gain: float,
+    delay: float,
+    *,
+    lag: float = 0.0,
+    noise_ratio: float = 1.0,
+    plant_delay: float | None = None,
+    plant_lag: float | None = None,
+    plant_gain: float = 1.0,
+) -> Float64:
+    """Return the closed-loop matrix of a proportional loop with a Kalman observer and a wrong model.
+
+    Parameters
+    ----------
+    gain : float
+        Fraction of the estimated error that one frame corrects.
+    delay : float
+        Delay of the measurements by their time stamps [frames], 0 or more; fractions are exact.
+    lag : float
+        Time constant of the velocity in the `MotionModel` of the observer [frames]. Default 0.
+    noise_ratio : float
+        Standard deviation of the random motion of the model during a frame, over that of a measurement. Default 1.
+    plant_delay, plant_lag : float, optional
+        Delay and time constant of the plant [frames]. Default: those of the model.
+    plant_gain : float
+        Motion of the plant over that of the model. Default 1.
+
+    Returns
+    -------
+    numpy.ndarray
+        Square matrix that maps the state of a frame to that of the next frame: position and velocity of the plant and
+        of the observer at their times of the exposure, and the last commands, newest first. The loop is stable if all
+        eigenvalues lie within the unit circle.
+
+    Notes
+    -----
+    `PoseObserver` has this response in its steady state: the constant gain of the correction follows from the discrete
+    algebraic Riccati equation. The prediction from the exposure to the command is that of the model.
+    """
+    model = MotionModel(lag=(lag,) * 3, position_noise=(finite(noise_ratio, "noise_ratio", above=0.0) ** 2,) * 3)
+    plant = model if plant_lag is None else MotionModel(lag=(plant_lag,) * 3)
+    (whole, part), (true_whole, true_part) = (
+        delay_taps(delay),
+        delay_taps(delay if plant_delay is None else plant_delay),
+    )
+    size = 4 + max(whole, true_whole) + 2
+    estimated, true, commands = slice(2, 4), slice(0, 2), 3  # columns; the command i frames ago is at commands + i
+    rows = np.zeros((4, size))
+    moved, driven = _response(plant, 1.0 - true_part), _response(plant, true_part)
+    rows[true, true] = moved[0] @ driven[0]
+    rows[true, commands + true_whole + 1] = plant_gain * moved[1]
+    rows[true, commands + true_whole + 2] = plant_gain * moved[0] @ driven[1]
+    first, last = _response(model, part), _response(model, 1.0 - part)
+    predicted = np.zeros((2, size))
+    predicted[:, estimated] = last[0] @ first[0]
+    predicted[:, commands + whole + 1] = last[1]
+    predicted[:, commands + whole + 2] = last[0] @ first[1]
+    rows[estimated] = predicted + np.outer(_steady_gain(model), rows[0] - predicted[0])
+    now = first[0] @ rows[estimated]  # the estimate of the exposure, moved to the time of the command
+    now[:, commands + whole + 1] += first[1]
+    full = _response(model, 1.0)
+    for each in range(whole, 0, -1):
+        now = full[0] @ now
+        now[:, commands + each] += full[1]
+    return np.vstack([rows, -gain * now[:1], np.eye(size)[4:-1]])
+
+
+@lru_cache(maxsize=256)
+def _response(model: MotionModel, step: float) -> tuple[Float64, Float64]:
+    """Return the matrices of position and velocity of one axis (2, 2), and of its command (2,), over a time step."""
+    state, command, _ = model.transition(step)
+    return state[::3, ::3], command[::3, 0]
+
+
+@lru_cache(maxsize=16)
+def _steady_gain(model: MotionModel) -> Float64:
+    """Return the gain (2,) of the correction by measurements of the variance 1 in every frame."""
+    state, _, noise = model.transition(1.0)
+    covariance = solve_discrete_are(state[::3, ::3].T, np.eye(2)[:, :1], noise[::3, ::3], np.eye(1))
+    return np.asarray(covariance[:, 0] / (covariance[0, 0] + 1.0), np.float64)
+
+
+class ObserverTolerance(NamedTuple):
+    """Errors of the model at which a loop with a Kalman observer becomes unstable.
+
+    Attributes
+    ----------
+    shorter, longer : float
+        Delay of the plant below and above that of the time stamps [frames]; ``shorter`` is the whole delay where every
+        shorter delay is stable, and 10 is the longest that is searched.
+    lag : float
+        Time constant of the plant above that of the model [frames]; at most 20 are searched.
+    plant_gain : float
+        Largest motion of the plant over that of the model; at most 10 is searched.
+    """
+
+    shorter: float
+    longer: float
+    lag: float
+    plant_gain: float
+
+
+def observer_tolerance(gain: float, delay: float, *, lag: float = 0.0, noise_ratio: float = 1.0) -> ObserverTolerance:
+    """Return the errors of the model at which a loop with a Kalman observer becomes unstable.
+
+    Parameters
+    ----------
+    gain, delay, lag, noise_ratio
+        As for `observer_matrix`; the gain is above 0 and below 2.
+
+    Notes
+    -----
+    Each error is scanned in 40 steps, and the first unstable one is refined by bisection.
+    """
+    finite(gain, "gain", above=0.0, maximum=2.0)
+
+    def is_stable(**plant: float) -> bool:
+        matrix = observer_matrix(gain, delay, lag=lag, noise_ratio=noise_ratio, **plant)
+        return bool(np.abs(np.linalg.eigvals(matrix)).max() < 1.0)
+
+    return ObserverTolerance(
+        _first_unstable(lambda error: is_stable(plant_delay=max(delay - error, 0.0)), delay, _OBSERVER_STEPS),
+        _first_unstable(lambda error: is_stable(plant_delay=delay + error), 10.0, _OBSERVER_STEPS),
+        _first_unstable(lambda error: is_stable(plant_lag=lag + error), 20.0, _OBSERVER_STEPS),
+        1.0 + _first_unstable(lambda more: is_stable(plant_gain=1.0 + more), 9.0, _OBSERVER_STEPS),
+    )
+
+
+def _first_unstable(is_stable: Callable[[float], bool], largest: float, count: int = 200) -> float:
     """Return the smallest error that is not stable, or the largest one."""
-    steps = np.linspace(0.0, largest, 201)
+    steps = np.linspace(0.0, largest, count + 1)
     found = next((k for k, each in enumerate(steps) if not is_stable(float(each))), None)
     if found is None:
         return largest

@@ -27,7 +27,7 @@ from gpuvision.servoing.delay_response import (
     settling_frames,
     step_response,
 )
-from gpuvision.servoing.margins import margins, predictor_tolerance
+from gpuvision.servoing.margins import margins, observer_tolerance, predictor_tolerance
 from gpuvision.validation import finite
 
 DELAY_FILES = ("delay.png", "report.json")
@@ -35,8 +35,9 @@ DELAY_FILES = ("delay.png", "report.json")
 MEASURED_PICTURE = "measured_delay.png"
 """Name of the picture of a recording."""
 
-# Gains of a loop with a predictor whose tolerated model errors are reported: fractions of the predicted error.
-_PREDICTOR_GAINS = (0.2, 0.5, 0.8)
+# Gains of a loop with a predictor or an observer whose tolerated model errors are reported: fractions of the predicted
+# error. The observer's model has no lag; its random motion in a frame is as large as the noise of a measurement.
+_PREDICTOR_GAINS, _NOISE_RATIO = (0.2, 0.5, 0.8), 1.0
 # Remaining error of the reported settling time, and frames of the drawn step responses.
 _SETTLED, _FRAMES = 0.01, 40
 
@@ -111,6 +112,7 @@ class DelayAnalysis:
             "continuous_critical_per_s": continuous.critical,
             "rules": {name: self._rule(gains) for name, gains in self.gains().items()},
             "predictor": [self._predictor(gain) for gain in _PREDICTOR_GAINS],
+            "observer": [self._observer(gain) for gain in _PREDICTOR_GAINS],
         }
         if self.measured is not None:
             tree["measured"] = {
@@ -146,6 +148,17 @@ class DelayAnalysis:
             "gain_per_frame": gain,
             "unstable_from_shorter_by_s": found.shorter * period,
             "unstable_from_longer_by_s": found.longer * period,
+            "unstable_from_plant_gain": found.plant_gain,
+        }
+
+    def _observer(self, gain: float) -> dict[str, float]:
+        found, period = observer_tolerance(gain, self.frames, noise_ratio=_NOISE_RATIO), self.budget.period
+        return {
+            "gain_per_frame": gain,
+            "noise_ratio": _NOISE_RATIO,
+            "unstable_from_shorter_by_s": found.shorter * period,
+            "unstable_from_longer_by_s": found.longer * period,
+            "unstable_from_lag_s": found.lag * period,
             "unstable_from_plant_gain": found.plant_gain,
         }
 

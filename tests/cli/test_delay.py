@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from gpuvision.cli.main import application
 from gpuvision.servoing.delay import gain_limit
 from gpuvision.servoing.delay_measurement import excitation
+from gpuvision.servoing.margins import observer_tolerance
 from gpuvision.workflows import analysing_delay
 
 PERIOD = 1e-3
@@ -53,6 +54,11 @@ def test_parts_and_a_recording(tmp_path: Path) -> None:
     assert report["rules"]["non_oscillating"]["gain_margin"] == pytest.approx(
         report["limit_per_frame"] / report["non_oscillating_per_frame"], rel=1e-6
     )
+    for observer, predictor in zip(report["observer"], report["predictor"], strict=True):
+        assert observer["gain_per_frame"] == predictor["gain_per_frame"]
+        expected = observer_tolerance(observer["gain_per_frame"], report["delay_frames"])
+        assert observer["unstable_from_longer_by_s"] == pytest.approx(1e-3 * expected.longer, rel=0.01)
+        assert observer["unstable_from_plant_gain"] > predictor["unstable_from_plant_gain"]
     for name in ("delay.png", "measured_delay.png"):
         assert (tmp_path / "out" / name).stat().st_size > 10_000
 

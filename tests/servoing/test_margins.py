@@ -7,9 +7,20 @@ import math
 import numpy as np
 import pytest
 
+from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.controllers import PidController, PidGains, gains_without_oscillation, simc_gains
 from gpuvision.servoing.delay import gain_limit, non_oscillating_gain
-from gpuvision.servoing.margins import margins, predictor_polynomial, predictor_tolerance
+from gpuvision.servoing.loop import ServoLoop, SimulatedClock
+from gpuvision.servoing.margins import (
+    margins,
+    observer_matrix,
+    observer_tolerance,
+    predictor_polynomial,
+    predictor_tolerance,
+)
+from gpuvision.servoing.observer import MotionModel, PoseMeasurement, PoseObserver
+from gpuvision.servoing.plant import SimulatedPlant
+from gpuvision.servoing.simulated_sensor import SimulatedPoseSensor
 
 PERIOD = 1e-3
 
@@ -114,3 +125,94 @@ def test_derivative_and_feed_forward() -> None:
 def test_gains_are_checked(given: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="expected a number"):
         PidGains(**given)
+
+
+class ScaledPlant(SimulatedPlant):
+    """Plant that moves by a multiple of its command."""
+
+    factor = 1.0
+
+    def command(self, time: float, velocity: np.ndarray) -> None:
+        super().command(time, self.factor * velocity)
+
+
+def observer_radius(
+    gain: float, delay: float, lag: float, *, plant_delay: float, plant_lag: float, factor: float
+) -> float:
+    """Return the factor per frame of the error of a simulated loop with a `PoseObserver`, from its last frames."""
+    frames = 500
+    model = MotionModel(lag=(lag * PERIOD,) * 3, position_noise=(1e-12 / PERIOD,) * 3)
+    observer = PoseObserver(model, gate=1e300)
+    plant = ScaledPlant((Axis(lag=plant_lag * PERIOD), Axis(), Axis()))
+    plant.factor = factor
+    observer.reset(-0.02, np.zeros(3), 1e-12 * np.eye(3))
+    late = SimulatedPoseSensor(plant.pose, period=PERIOD, delay=plant_delay * PERIOD, is_noisy=False)
+
+    def sensor(time: float) -> list[PoseMeasurement]:
+        """Return the measurements with the time stamps of the model's delay."""
+        shift = (plant_delay - delay) * PERIOD
+        return [each._replace(exposed=each.exposed + shift) for each in late(time)]
+
+    controller = PidController(PidGains(proportional=gain / PERIOD))
+    loop = ServoLoop(plant, sensor, observer, controller, SimulatedClock(), period=PERIOD, limits=None)
+    error = np.abs(loop.run((1e-3, 0.0, 0.0), frames * PERIOD).pose[:, 0] - 1e-3)
+    windows = [error[a : a + 100].max() for a in (200, 400)]
+    return float((windows[1] / windows[0]) ** (1 / 200))
+
+
+@pytest.mark.parametrize(
+    ("gain", "delay", "lag", "plant"),
+    [
+        (0.5, 3.0, 0.0, {"plant_delay": 5.4}),
+        (0.8, 2.2, 3.0, {"plant_lag": 12.0}),
+        (0.8, 2.0, 3.0, {"plant_delay": 2.7, "plant_lag": 2.0}),
+        (0.5, 3.6, 0.0, {"plant_gain": 2.2}),
+        (0.8, 2.0, 0.0, {"plant_lag": 3.0}),
+    ],
+)
+def test_matrix_of_a_wrong_observer_is_the_loop(gain: float, delay: float, lag: float, plant: dict[str, float]) -> None:
+    radius = float(np.abs(np.linalg.eigvals(observer_matrix(gain, delay, lag=lag, **plant))).max())
+    found = observer_radius(
+        gain,
+        delay,
+        lag,
+        plant_delay=plant.get("plant_delay", delay),
+        plant_lag=plant.get("plant_lag", lag),
+        factor=plant.get("plant_gain", 1.0),
+    )
+    assert found == pytest.approx(radius, abs=0.002)
+
+
+@pytest.mark.parametrize("delay", [0.0, 2.0, 3.4])
+def test_right_observer_leaves_the_loop_without_delay(delay: float) -> None:
+    """The poles are that of the loop, 1 - K, that of the estimate, which the noise alone determines, and 0.
+
+    The scalar Riccati equation p = p / (p + 1) + q has the solution p = (q + sqrt(q^2 + 4 q)) / 2.
+    """
+    q = 0.3**2
+    prior = 0.5 * (q + math.sqrt(q**2 + 4.0 * q))
+    poles = np.sort(np.abs(np.linalg.eigvals(observer_matrix(0.6, delay, noise_ratio=0.3))))[::-1]
+    expected = sorted((0.4, 1.0 - prior / (prior + 1.0)), reverse=True)
+    assert poles[:2] == pytest.approx(expected, abs=1e-9)
+    assert (poles[2:] < 0.02).all()  # multiple poles at 0 are computed with a large error
+
+
+def test_tolerance_of_an_observer_is_where_the_matrix_leaves_the_circle() -> None:
+    found = observer_tolerance(1.5, 4.0)
+    cases = [
+        ("plant_delay", 4.0, 4.0 - found.shorter),
+        ("plant_delay", 4.0, 4.0 + found.longer),
+        ("plant_lag", 0.0, found.lag),
+        ("plant_gain", 1.0, found.plant_gain),
+    ]
+    for name, right, limit in cases:
+        inside, outside = (observer_matrix(1.5, 4.0, **{name: right + f * (limit - right)}) for f in (0.999, 1.001))
+        assert np.abs(np.linalg.eigvals(inside)).max() < 1.0 < np.abs(np.linalg.eigvals(outside)).max()
+    assert observer_tolerance(0.2, 4.0).longer > found.longer
+
+
+def test_observer_that_trusts_the_measurements_alone_is_the_predictor() -> None:
+    found, predictor = observer_tolerance(0.8, 4.0, noise_ratio=1e4), predictor_tolerance(0.8, 4.0)
+    assert (found.shorter, found.longer) == pytest.approx((predictor.shorter, predictor.longer), abs=1e-4)
+    assert found.plant_gain == pytest.approx(predictor.plant_gain, abs=1e-4)
+    assert found.longer < observer_tolerance(0.8, 4.0).longer < observer_tolerance(0.8, 4.0, noise_ratio=0.3).longer

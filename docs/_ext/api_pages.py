@@ -106,6 +106,7 @@ MODULES = (
     "gpuvision.reference.undistort_image",
     "gpuvision.reference.visible_intervals",
     "gpuvision.servoing.frames",
+    "gpuvision.servoing.machine_calibration.calibrated_plant",
     "gpuvision.servoing.machine_calibration.camera_frame",
     "gpuvision.servoing.machine_calibration.motion_frame",
     "gpuvision.servoing.machine_calibration.next_measurement",

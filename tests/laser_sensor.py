@@ -22,11 +22,12 @@ from gpuvision.camera.views.pose_response import pose_responses
 from gpuvision.ranging.sensor_geometry import SensorGeometry
 from gpuvision.ranging.sheet_calibration import LaserLine, fit_sheet
 from gpuvision.ranging.transport_calibration import fit_transport
-from target_images import dots
+from target_images import chessboard, dots
 
 Float64 = npt.NDArray[np.float64]
 SIZE = (480, 360)
 GRID = (11, 8)  # columns and rows of the target's points
+CORNERS = (9, 6)  # columns and rows of a chessboard's inner corners: its border lies on the outer points
 PITCH = 0.01
 STEP = 0.2e-3
 PROFILES_BETWEEN = 40
@@ -185,9 +186,24 @@ class TargetView:
         return np.exp(-0.5 * ((d - gg * g * g - gh * g * h - hh * h * h) / thickness) ** 2)
 
 
-def photographs(view: TargetView, rng: np.random.Generator) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return images of a target of dots without and with the laser."""
-    cover = dots(view, np.ones(GRID[::-1], bool))
+@dataclass(frozen=True)
+class Chessboard:
+    """View of a chessboard whose inner corners are the target's points without the outer ones."""
+
+    view: TargetView
+
+    width = SIZE[0]
+    height = SIZE[1]
+
+    def pattern(self, pixels: Float64) -> Float64:
+        return self.view.pattern(pixels) - 1.0
+
+
+def photographs(
+    view: TargetView, rng: np.random.Generator, pattern: str = "dots"
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+    """Return images of a target of dots, or of a chessboard of the same size, without and with the laser."""
+    cover = dots(view, np.ones(GRID[::-1], bool)) if pattern == "dots" else chessboard(Chessboard(view), CORNERS)
     level = 30.0 + 130.0 * (1.0 - cover)
     lit = level + 90.0 * view.light() * (1.0 - 0.7 * cover)
     dark, bright = (
@@ -197,16 +213,18 @@ def photographs(view: TargetView, rng: np.random.Generator) -> tuple[npt.NDArray
     return dark.astype(np.uint8), bright.astype(np.uint8)
 
 
-def write_images(folder: Path, truth: LaserSensor, rng: np.random.Generator, views: int, moved: int) -> None:
+def write_images(
+    folder: Path, truth: LaserSensor, rng: np.random.Generator, views: int, moved: int, pattern: str = "dots"
+) -> None:
     """Write images of a calibration: pairs without and with laser, and a folder ``moved`` of transport views."""
     (folder / "moved").mkdir()
     for number, (rotation, translation) in enumerate(poses(truth, rng, views)):
-        dark, lit = photographs(TargetView(truth, rotation, translation), rng)
+        dark, lit = photographs(TargetView(truth, rotation, translation), rng, pattern)
         cv2.imwrite(str(folder / f"pose{number}.png"), dark)
         cv2.imwrite(str(folder / f"pose{number}_laser.png"), lit)
     for number in range(moved):
         pose = on_stage(truth, (number - 1) * PROFILES_BETWEEN)
-        cv2.imwrite(str(folder / "moved" / f"{number}.png"), photographs(TargetView(truth, *pose), rng)[0])
+        cv2.imwrite(str(folder / "moved" / f"{number}.png"), photographs(TargetView(truth, *pose), rng, pattern)[0])
 
 
 def calibrated(

@@ -134,6 +134,11 @@ class Calibration:
         return self.fit.lens if isinstance(self.fit, LensFit) else self.fit.camera
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """Parameters that the data do not determine, and other doubts."""
+        return self.fit.warnings
+
+    @property
     def coverage(self) -> float:
         """Part of the image inside the convex hull of all points, 0 to 1; outside the model is extrapolated."""
         return image_coverage(self.detected_targets, self.image_size)

@@ -6,7 +6,7 @@ import math
 import os
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -26,6 +26,7 @@ from gpuvision.cli.arguments import (
 from gpuvision.cli.calibrate_sensor import (
     BlockFolder,
     BlockHeights,
+    CameraFile,
     Channel,
     KnownPoints,
     LaserFolder,
@@ -126,6 +127,7 @@ def calibrate(
     focal_length: FocalLength = None,
     loss: Loss = RobustLoss.squared,
     sensor: SensorOption = False,
+    camera: CameraFile = None,
     laser: LaserFolder = None,
     transport_views: TransportFolder = None,
     profiles_between: ProfilesBetween = None,
@@ -145,61 +147,61 @@ def calibrate(
     parameters that the images do not determine.
     """
     options = SensorOptions(
-        laser, transport_views, profiles_between, on_stage, block, block_heights, points, step, along, channel
+        camera, laser, transport_views, profiles_between, on_stage, block, block_heights, points, step, along, channel
     )
     if not sensor:
         reject_unused("without --sensor", **options._asdict())
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    from gpuvision.host.outputs import Outputs
-    from gpuvision.workflows.calibrating import calibrate as run
-    from gpuvision.workflows.calibrating import calibration_files, write_calibration
+    _check_unused(pattern, method, inner_corners, pitch, focal_length)
+    settings: dict[str, Any] = {
+        "pattern": pattern.value,
+        "model": model,
+        "inner_corners": None if inner_corners is None else _corners(inner_corners),
+        "pitch": pitch,
+        "focal_length": focal_length,
+        "loss": loss.value,
+    }
+    if out.suffix in (".json", ".png"):
+        raise ValueError(
+            f"--out is {out}, but the report and the plot get the suffixes .json and .png; give a name such as "
+            "lens.toml"
+        )
+    if not sensor:
+        _calibrate_camera(images, out, settings | {"method": method.value}, as_json, overwrite)
+        return
+    if method is CalibrationMethod.lines or pattern is TargetPattern.lines:
+        raise ValueError("--sensor needs poses of the target; leave out --method lines and --pattern lines")
+    calibrate_sensor(images, out, options, settings, as_json=as_json, overwrite=overwrite, show=_show)
 
+
+def _check_unused(
+    pattern: TargetPattern,
+    method: CalibrationMethod,
+    inner_corners: str | None,
+    pitch: float | None,
+    focal_length: float | None,
+) -> None:
+    """Refuse options that the pattern or the method does not use."""
     if pattern is not TargetPattern.chessboard:
         reject_unused(f"with --pattern {pattern.value}, only with chessboard", inner_corners=inner_corners)
     if method is CalibrationMethod.lines:
         reject_unused("with --method lines, which finds no poses", pitch=pitch, focal_length=focal_length)
     elif method is CalibrationMethod.auto and pattern is TargetPattern.lines:
         reject_unused("with --pattern lines, which gives no poses", pitch=pitch, focal_length=focal_length)
-    corners = None if inner_corners is None else _corners(inner_corners)
-    if out.suffix in (".json", ".png"):
-        raise ValueError(
-            f"--out is {out}, but the report and the plot get the suffixes .json and .png; give a name such as "
-            "lens.toml"
-        )
-    if sensor:
-        if method is CalibrationMethod.lines or pattern is TargetPattern.lines:
-            raise ValueError("--sensor needs poses of the target; leave out --method lines and --pattern lines")
-        calibrate_sensor(
-            images,
-            out,
-            options,
-            {
-                "pattern": pattern.value,
-                "model": model,
-                "inner_corners": corners,
-                "pitch": pitch,
-                "focal_length": focal_length,
-                "loss": loss.value,
-            },
-            as_json=as_json,
-            overwrite=overwrite,
-            show=_show,
-        )
-        return
+
+
+def _calibrate_camera(
+    images: list[Path], out: Path, settings: dict[str, Any], as_json: Path | None, overwrite: bool
+) -> None:
+    """Calibrate a lens or a camera, print and write its results."""
+    from gpuvision.host.outputs import Outputs
+    from gpuvision.workflows.calibrating import calibrate as run
+    from gpuvision.workflows.calibrating import calibration_files, write_calibration
+
     outputs = Outputs("calibrate", inputs=images, overwrite=overwrite)
     outputs.claim(*calibration_files(out), as_json)
-    with progress_bar(f"detecting {pattern.value}") as progress:
-        done = run(
-            images,
-            pattern=pattern.value,
-            method=method.value,
-            model=model,
-            inner_corners=corners,
-            pitch=pitch,
-            focal_length=focal_length,
-            loss=loss.value,
-            progress=progress,
-        )
+    with progress_bar(f"detecting {settings['pattern']}") as progress:
+        done = run(images, progress=progress, **settings)
     _show(done, to_stderr=prints_report(as_json))
     write_calibration(done, out, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from gpuvision.cli.arguments import echo, named_path, prints_report, progress_bar, quantities, write_report
+from gpuvision.cli.arguments import (
+    echo,
+    named_path,
+    prints_report,
+    progress_bar,
+    quantities,
+    reject_unused,
+    write_report,
+)
 
 if TYPE_CHECKING:
     from gpuvision.camera.calibration import Calibration
@@ -30,6 +38,15 @@ SensorOption = Annotated[
     typer.Option(
         "--sensor",
         help="Calibrate a laser sensor: camera, sheet of light and transport. --out is then the sensor file for scan.",
+    ),
+]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE.toml",
+        parser=named_path,
+        help="With --sensor: camera file that gpuvision calibrate wrote for this camera. The images then give only the "
+        "poses of the target. Default: the images calibrate the camera.",
     ),
 ]
 LaserFolder = Annotated[
@@ -107,6 +124,7 @@ Channel = Annotated[
 class SensorOptions(NamedTuple):
     """Options of the command that only ``--sensor`` uses."""
 
+    camera: Path | None
     laser: Path | None
     transport_views: Path | None
     profiles_between: float | None
@@ -123,7 +141,7 @@ def calibrate_sensor(
     images: Sequence[Path],
     out: Path,
     options: SensorOptions,
-    camera: dict[str, Any],
+    settings: dict[str, Any],
     *,
     as_json: Path | None,
     overwrite: bool,
@@ -139,8 +157,9 @@ def calibrate_sensor(
         Sensor file.
     options : SensorOptions
         Options of ``--sensor``.
-    camera : dict
-        Options of the camera's calibration, as parameters of `gpuvision.workflows.calibrating_sensor`.
+    settings : dict
+        Options of the target and of the camera's calibration, as parameters of
+        `gpuvision.workflows.calibrating_sensor`.
     as_json, overwrite
         Common options.
     show : callable
@@ -151,17 +170,15 @@ def calibrate_sensor(
     from gpuvision.workflows.sensor_calibration_result import sensor_calibration_files, write_sensor_calibration
 
     channel = _checked_channel(options.channel)
-    _check(options, camera)
-    inputs = [
-        *images,
-        *(each for each in (options.laser, options.transport_views, options.block, options.points) if each is not None),
-    ]
+    _check(options, settings)
+    inputs = [*images, *(each for each in options if isinstance(each, Path))]
     outputs = Outputs("calibrate", inputs=inputs, overwrite=overwrite)
     outputs.claim(*sensor_calibration_files(out), as_json)
     _check_place(out, options)
-    with progress_bar(f"detecting {camera['pattern']}") as progress:
+    with progress_bar(f"detecting {settings['pattern']}") as progress:
         done = run(
             images,
+            camera=options.camera,
             laser=options.laser,
             transport=_transport_views(options),
             block=_block_views(options),
@@ -171,7 +188,7 @@ def calibrate_sensor(
             channel=channel,
             name=out.stem,
             progress=progress,
-            **camera,
+            **settings,
         )
     _show(done, show, to_stderr=prints_report(as_json))
     write_sensor_calibration(done, out, inputs=inputs, overwrite=overwrite)
@@ -182,9 +199,16 @@ def calibrate_sensor(
     )
 
 
-def _check(options: SensorOptions, camera: dict[str, Any]) -> None:
+def _check(options: SensorOptions, settings: dict[str, Any]) -> None:
     """Check the options of ``--sensor`` that depend on each other."""
-    if camera["pitch"] is None:
+    if options.camera is not None:
+        reject_unused(
+            "with --camera, which gives the camera",
+            model=None if settings["model"] == "auto" else settings["model"],
+            focal_length=settings["focal_length"],
+            loss=None if settings["loss"] == "squared" else settings["loss"],
+        )
+    if settings["pitch"] is None:
         raise ValueError("--sensor needs --pitch, the distance of the target's points [m]: it scales all heights")
     if (options.transport_views is None) == (options.step is None):
         raise ValueError(
@@ -243,7 +267,16 @@ def _block_views(options: SensorOptions) -> BlockViews | None:
 
 def _show(done: SensorCalibration, show: Callable[[Calibration, bool], None], *, to_stderr: bool) -> None:
     """Print the camera, then the sheet, the transport and their warnings."""
-    show(done.calibration, to_stderr)
+    from gpuvision.camera.calibration import Calibration
+
+    camera = done.calibration
+    if isinstance(camera, Calibration):
+        show(camera, to_stderr)
+    else:
+        for line in (camera.summary(), *(f"skipped {path}: {reason}" for path, reason in camera.skipped_images)):
+            echo(line, err=to_stderr)
+        for each in camera.warnings:
+            echo(f"warning: {each}", err=to_stderr)
     echo(done.summary(), err=to_stderr)
     test = done.geometry.sheet.bend_test
     if test is not None:
@@ -253,5 +286,5 @@ def _show(done: SensorCalibration, show: Callable[[Calibration, bool], None], *,
             for name, value, sigma in zip(("gg", "gh", "hh"), test.bend, test.sigma, strict=True)
         )
         echo(f"bend of the sheet [1/m]: {bends}; p = {test.p_value:.2g} (F test): {verdict}", err=to_stderr)
-    for each in done.warnings[len(done.calibration.fit.warnings) :]:
+    for each in done.warnings[len(camera.warnings) :]:
         echo(f"warning: {each}", err=to_stderr)

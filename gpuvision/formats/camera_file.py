@@ -2,17 +2,20 @@
 
 A file holds one of two tables: ``[lens]``, the radial distortion of measured pixels (`Lens`), as in a sensor file; or
 ``[camera]``, a camera matrix and OpenCV's coefficients (`Camera`). The table ``[image]`` holds the size of the
-calibrated images (`read_calibrated_size`). The tables ``[uncertainty]`` and ``[fit]`` document the calibration; no
+calibrated images (`read_calibrated_size`). The table ``[covariance]`` of a ``[camera]`` holds the covariance of its
+fitted parameters (`read_calibrated_camera`). The tables ``[uncertainty]`` and ``[fit]`` document the calibration; no
 reader uses them. A table ``[mount]`` describes a `gpuvision.camera.ground_plane.MountedCamera`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 import tomli_w
 
 from gpuvision.camera.camera import COEFFICIENT_NAMES, Camera
@@ -21,7 +24,32 @@ from gpuvision.camera.lens import Lens
 from gpuvision.host.files import atomic_write
 from gpuvision.schema import Section, read_toml
 
-_UNREAD_TABLES = ("image", "uncertainty", "fit", "mount")
+_OTHER_TABLES = ("image", "covariance", "uncertainty", "fit", "mount")
+_PARAMETERS = ("f", "fx", "fy", "cx", "cy", *COEFFICIENT_NAMES)
+# Asymmetry and negative eigenvalue of a correlation matrix that count as rounding. Chosen: far above double rounding,
+# far below a correlation that matters.
+_ROUNDING = 1e-9
+
+
+class CalibratedCamera(NamedTuple):
+    """Camera of a camera file with the covariance of its parameters.
+
+    Attributes
+    ----------
+    camera : Camera
+        Camera.
+    size : (int, int) or None
+        Columns and rows of the calibrated images; None if the file does not say.
+    names : tuple of str
+        Fitted parameters, as in `gpuvision.camera.views.camera_fit.CameraFit`; empty without ``[covariance]``.
+    covariance : numpy.ndarray
+        (m, m): covariance of these parameters [px], [rad].
+    """
+
+    camera: Camera
+    size: tuple[int, int] | None
+    names: tuple[str, ...]
+    covariance: npt.NDArray[np.float64]
 
 
 def read_lens(path: str | Path) -> Lens | Camera:
@@ -45,7 +73,7 @@ def read_lens(path: str | Path) -> Lens | Camera:
     """
     top = read_toml(Path(path))
     lens, camera = top.optional_section("lens"), top.optional_section("camera")
-    for name in _UNREAD_TABLES:
+    for name in _OTHER_TABLES:
         top.optional_section(name)
     top.finish()
     if lens is not None and camera is None:
@@ -53,6 +81,55 @@ def read_lens(path: str | Path) -> Lens | Camera:
     if camera is not None and lens is None:
         return camera_of(camera)
     raise top.error("expected one table, [lens] or [camera]")
+
+
+def read_calibrated_camera(path: str | Path) -> CalibratedCamera:
+    """Read camera, size of the images and covariance of a camera file with a table ``[camera]``.
+
+    Parameters
+    ----------
+    path : str or Path
+        File that ``gpuvision calibrate`` wrote from views of a grid.
+
+    Returns
+    -------
+    CalibratedCamera
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    DescriptionError
+        A key or table is missing, unknown or has a wrong value, or the file has a ``[lens]`` instead of a ``[camera]``.
+    """
+    model, top = read_lens(path), read_toml(Path(path))
+    if not isinstance(model, Camera):
+        raise top.error("[lens] is the distortion alone, expected a [camera]; calibrate with --method views")
+    table = top.optional_section("covariance")
+    names, covariance = ((), np.zeros((0, 0))) if table is None else _covariance(table)
+    return CalibratedCamera(model, read_calibrated_size(path), names, covariance)
+
+
+def covariance_table(names: Sequence[str], covariance: npt.ArrayLike) -> dict[str, Any]:
+    """Return the table ``[covariance]`` of a camera file, which `read_calibrated_camera` reads."""
+    return {"names": ",".join(names), "matrix": np.asarray(covariance).tolist()}
+
+
+def _covariance(table: Section) -> tuple[tuple[str, ...], npt.NDArray[np.float64]]:
+    """Return names and matrix of a table ``[covariance]``; refuse a matrix that is no covariance."""
+    names = tuple(table.text("names").split(","))
+    if len(set(names)) < len(names) or not set(names) <= set(_PARAMETERS):
+        raise table.error(f"names is {','.join(names)!r}, expected different ones of {', '.join(_PARAMETERS)}")
+    matrix = np.array(table.rows("matrix", "", len(names)))
+    table.finish()
+    if len(matrix) != len(names):
+        raise table.error(f"matrix has {len(matrix)} rows for {len(names)} names")
+    sigmas = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    correlation = matrix / np.outer(sigmas, sigmas)
+    values = np.linalg.eigvalsh(correlation)
+    if not np.allclose(correlation, correlation.T, rtol=0.0, atol=_ROUNDING) or values[0] < -_ROUNDING * values[-1]:
+        raise table.error("matrix is no covariance, expected a symmetric matrix without negative eigenvalues")
+    return names, matrix
 
 
 def read_calibrated_size(path: str | Path) -> tuple[int, int] | None:
@@ -147,7 +224,7 @@ def write_lens(
     model : Lens or Camera
         Model that `read_lens` reads back.
     documentation : mapping
-        Tables ``image``, ``uncertainty`` and ``fit``, which no reader uses.
+        Further tables: ``image``, ``covariance``, ``uncertainty`` and ``fit``.
     overwrite : bool
         Whether an existing file may be replaced. Default False.
     """

@@ -28,7 +28,7 @@ from gpuvision.camera.patterns.line_pattern import find_lines
 from gpuvision.camera.views.camera_fit import CameraFit
 from gpuvision.camera.views.planar_calibration import fit_camera
 from gpuvision.camera.views.target_views import make_view
-from gpuvision.formats.camera_file import write_lens
+from gpuvision.formats.camera_file import covariance_table, write_lens
 from gpuvision.formats.json import json_tree
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import write_text_atomic
@@ -270,6 +270,8 @@ def write_calibration(calibration: Calibration, path: Path, *, overwrite: bool =
             "warnings": list(calibration.fit.warnings),
         },
     }
+    if isinstance(calibration.fit, CameraFit):
+        documentation["covariance"] = covariance_table(calibration.fit.names, calibration.fit.covariance)
     images = [each.image for each in calibration.detected_targets] + [each for each, _ in calibration.skipped_images]
     outputs = Outputs("calibrate", inputs=images, overwrite=overwrite)
     with outputs.folder(path.parent) as inside:

@@ -1,7 +1,8 @@
 """Calibration of a laser sensor from image files: camera, sheet of light and transport in one sensor file.
 
-Images of a target in several poses calibrate the camera (`gpuvision.workflows.calibrating`). A second image of each
-pose with the laser on gives points of the sheet of light. Images of the target on the moving stage give the direction
+Images of a target in several poses calibrate the camera (`gpuvision.workflows.calibrating`), or a camera file gives the
+camera, and the images only the poses. A second image of each pose with the laser on gives points of the sheet of light.
+Images of the target on the moving stage give the direction
 and the step of the transport.
 """
 
@@ -16,12 +17,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.calibration import Calibration, DetectedTarget, TargetPattern
+from gpuvision.camera.calibration import DetectedTarget, TargetPattern
 from gpuvision.camera.lines.line_statistics import Loss
-from gpuvision.camera.lines.vanishing_points import straightness_px
-from gpuvision.camera.views.camera_fit import CameraFit
-from gpuvision.camera.views.planar_calibration import fit_camera
-from gpuvision.camera.views.pose_response import PoseResponse, pose_responses
 from gpuvision.camera.views.target_views import make_view
 from gpuvision.formats.known_points_file import read_known_points
 from gpuvision.host import Device
@@ -43,7 +40,8 @@ from gpuvision.workflows.laser_images import (
     read_line,
     target_light,
 )
-from gpuvision.workflows.sensor_calibration_result import SensorCalibration, known_grid
+from gpuvision.workflows.sensor_calibration_result import SensorCalibration
+from gpuvision.workflows.sensor_camera import DetectedViews, SensorCamera, fitted_camera, known_camera, known_grid
 
 Float64 = npt.NDArray[np.float64]
 Progress = Callable[[int, int | None], object]
@@ -97,6 +95,7 @@ def calibrate_sensor(
     images: Sequence[str | Path],
     *,
     pitch: float,
+    camera: str | Path | None = None,
     laser: str | Path | None = None,
     transport: TransportViews | None = None,
     block: BlockViews | None = None,
@@ -122,6 +121,10 @@ def calibrate_sensor(
         (``pose1.png``, ``pose1_laser.png``).
     pitch : float
         Distance between neighbouring points on the target [m].
+    camera : path, optional
+        Camera file with a table ``[camera]`` of this camera, as ``gpuvision calibrate`` writes it. The images then give
+        the poses of the target alone; the covariance of the file enters the joint covariance. Default: the images
+        calibrate the camera.
     laser : path, optional
         Folder of the laser images, matched by name or by the last number in the name.
     transport : TransportViews, optional
@@ -136,7 +139,8 @@ def calibrate_sensor(
         Transport per profile [m]; required without `transport`, which measures it. The part moves along -(g x h) of the
         sheet, or along g x h if the step is negative.
     pattern, model, inner_corners, focal_length, loss
-        As in `gpuvision.workflows.calibrating.calibrate`; the pattern is a grid ("dots" or "chessboard").
+        As in `gpuvision.workflows.calibrating.calibrate`; the pattern is a grid ("dots" or "chessboard"). A camera
+        file replaces `model`, `focal_length` and `loss`.
     along : {"columns", "rows"}, optional
         Image axis along which the laser line runs. Default: found in the images.
     channel : str
@@ -161,6 +165,54 @@ def calibrate_sensor(
     RecordingError
         A file is no image, or the images differ in size.
     """
+    _check_settings(pattern, transport, block, step)
+    if camera is not None and (model != "auto" or focal_length is not None or loss != "squared"):
+        raise ValueError("a camera file replaces the calibration of the camera: leave out model, focal_length and loss")
+    folder = None if laser is None else Path(laser)
+    pairs = pair_images([Path(each) for each in images], folder, required=block is None and points is None)
+    if points is not None and (block is not None or any(pairs.lasers)):
+        raise ValueError("known points replace laser images and the block; give one of them")
+    moved = [] if transport is None else image_files(transport.folder)
+    detected, skipped, size = detect_targets([*pairs.targets, *moved], pattern, inner_corners, progress)
+    _check_transport_targets(detected, skipped, moved)
+    views = DetectedViews(pattern, pitch, tuple(detected), tuple(skipped), size)
+    if camera is None:
+        found = fitted_camera(views, model=model, focal_length=focal_length, loss=loss)
+    else:
+        found = known_camera(views, Path(camera))
+    if points is None:
+        lit = _lit_targets(detected, dict(zip(pairs.targets, pairs.lasers, strict=True)), at_least=0 if block else 2)
+        light = _read_light(lit, block, along, channel, device)
+        sheet = _fit_light(light, found, moved)
+    else:
+        light, sheet = _sheet_of_points(Path(points), found, along)
+    motion = None if transport is None else _motion(transport, views, found, moved)
+    geometry = SensorGeometry(
+        camera=found.camera,
+        camera_names=found.names,
+        camera_covariance=found.covariance,
+        sheet=sheet,
+        transport=motion,
+        step=motion.length if motion is not None else float(step or 0.0),
+        zero_at_stage=transport is not None and transport.on_stage,
+    )
+    return SensorCalibration(
+        name=name,
+        calibration=found.calibration,
+        geometry=geometry,
+        along=light.along,
+        channel=channel,
+        lines=tuple(light.lines.get(each.image) for each in detected),
+        other_lines=light.others,
+        cell=_cell(geometry, light.readings, light.along),
+        warnings=(*found.calibration.warnings, *_warnings(geometry, light.readings)),
+    )
+
+
+def _check_settings(
+    pattern: TargetPattern, transport: TransportViews | None, block: BlockViews | None, step: float | None
+) -> None:
+    """Refuse settings that miss each other or determine no sensor."""
     if pattern == "lines":
         raise ValueError("pattern 'lines' gives no poses of the target; use 'dots' or 'chessboard'")
     if (transport is None) == (step is None):
@@ -173,44 +225,6 @@ def calibrate_sensor(
         raise ValueError(f"the block has {len(block.heights)} height, expected the heights of at least two steps")
     if transport is not None and finite(transport.profiles_between, "profiles_between") == 0.0:
         raise ValueError("profiles_between is 0, expected the number of profiles from one transport view to the next")
-    folder = None if laser is None else Path(laser)
-    pairs = pair_images([Path(each) for each in images], folder, required=block is None and points is None)
-    if points is not None and (block is not None or any(pairs.lasers)):
-        raise ValueError("known points replace laser images and the block; give one of them")
-    moved = [] if transport is None else image_files(transport.folder)
-    detected, skipped, size = detect_targets([*pairs.targets, *moved], pattern, inner_corners, progress)
-    _check_transport_targets(detected, skipped, moved)
-    views = [make_view(known_grid(each), pitch) for each in detected]
-    fit = fit_camera(views, size, model=model, focal_length=focal_length, loss=loss)
-    targets = dict(zip((each.image for each in detected), pose_responses(fit, views), strict=True))
-    if points is None:
-        lit = _lit_targets(detected, dict(zip(pairs.targets, pairs.lasers, strict=True)), at_least=0 if block else 2)
-        light = _read_light(lit, block, along, channel, device)
-        sheet = _fit_light(light, fit, targets, moved)
-    else:
-        light, sheet = _sheet_of_points(Path(points), fit, along)
-    middle = views[[each.image for each in detected].index(moved[0])].target.mean(axis=0) if moved else np.zeros(3)
-    motion = None if transport is None else _motion(transport, [targets[each] for each in moved], middle)
-    geometry = SensorGeometry(
-        camera=fit.camera,
-        camera_names=fit.names,
-        camera_covariance=fit.covariance,
-        sheet=sheet,
-        transport=motion,
-        step=motion.length if motion is not None else float(step or 0.0),
-        zero_at_stage=transport is not None and transport.on_stage,
-    )
-    return SensorCalibration(
-        name=name,
-        calibration=_camera_calibration(fit, detected, skipped, size, pattern),
-        geometry=geometry,
-        along=light.along,
-        channel=channel,
-        lines=tuple(light.lines.get(each.image) for each in detected),
-        other_lines=light.others,
-        cell=_cell(geometry, light.readings, light.along),
-        warnings=(*fit.warnings, *_warnings(geometry, light.readings)),
-    )
 
 
 class _Light(NamedTuple):
@@ -250,21 +264,21 @@ def _read_light(
     return _Light(along, lines, blocks)
 
 
-def _fit_light(light: _Light, fit: CameraFit, targets: dict[Path, PoseResponse], moved: Sequence[Path]) -> SheetFit:
+def _fit_light(light: _Light, found: SensorCamera, moved: Sequence[Path]) -> SheetFit:
     """Fit the sheet to the laser lines; the first transport view has the plane of the block."""
     lines = [
-        *(LaserLine(line.points, targets[image]) for image, line in light.lines.items()),
-        *(LaserLine(line.points, targets[moved[0]], heights) for line, heights in light.blocks),
+        *(LaserLine(line.points, found.targets[image]) for image, line in light.lines.items()),
+        *(LaserLine(line.points, found.targets[moved[0]], heights) for line, heights in light.blocks),
     ]
-    return fit_sheet(fit.camera, lines, along=light.along, names=fit.names, camera_covariance=fit.covariance)
+    return fit_sheet(found.camera, lines, along=light.along, names=found.names, camera_covariance=found.covariance)
 
 
-def _sheet_of_points(file: Path, fit: CameraFit, along: Along | None) -> tuple[_Light, SheetFit]:
+def _sheet_of_points(file: Path, found: SensorCamera, along: Along | None) -> tuple[_Light, SheetFit]:
     """Fit the sheet to the known points of a file."""
     pixels, places = read_known_points(file)
     if along is None:
         along = "columns" if np.var(pixels[:, 0]) >= np.var(pixels[:, 1]) else "rows"
-    sheet = sheet_from_points(fit.camera, places, pixels, along=along, names=fit.names)
+    sheet = sheet_from_points(found.camera, places, pixels, along=along, names=found.names)
     return _Light(along, {}, (), LineImage(image=file, points=pixels, threshold=math.nan, note="")), sheet
 
 
@@ -295,27 +309,14 @@ def _other_lines(
     return tuple(found)
 
 
-def _motion(transport: TransportViews, targets: Sequence[PoseResponse], middle: Float64) -> TransportFit:
+def _motion(
+    transport: TransportViews, views: DetectedViews, found: SensorCamera, moved: Sequence[Path]
+) -> TransportFit:
     """Fit the transport to the poses of the transport views."""
+    first = next(each for each in views.detected if each.image == moved[0])
+    middle = make_view(known_grid(first), views.pitch).target.mean(axis=0)
+    targets = [found.targets[each] for each in moved]
     return fit_transport(targets, np.arange(len(targets)) * transport.profiles_between, middle)
-
-
-def _camera_calibration(
-    fit: CameraFit,
-    detected: list[DetectedTarget],
-    skipped: list[tuple[Path, str]],
-    size: tuple[int, int],
-    pattern: TargetPattern,
-) -> Calibration:
-    families = tuple(family for each in detected for family in each.families)
-    return Calibration(
-        fit=fit,
-        pattern=pattern,
-        image_size=size,
-        detected_targets=tuple(detected),
-        skipped_images=tuple(skipped),
-        straightness_px=(straightness_px(families), straightness_px(families, fit.camera)),
-    )
 
 
 def _check_transport_targets(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.calibration import Calibration, DetectedTarget
+from gpuvision.camera.calibration import Calibration
 from gpuvision.formats.json import json_tree
 from gpuvision.formats.sensor_file import sensor_text
 from gpuvision.host.files import write_text_atomic
@@ -23,6 +23,7 @@ from gpuvision.ranging.sensor_geometry import SensorGeometry
 from gpuvision.ranging.sheet_calibration import Along, SheetFit
 from gpuvision.ranging.transport_calibration import TransportFit
 from gpuvision.workflows.laser_images import LineImage
+from gpuvision.workflows.sensor_camera import KnownCamera, known_grid
 
 Float64 = npt.NDArray[np.float64]
 
@@ -38,7 +39,7 @@ class SensorCalibration:
     ----------
     name : str
         Name of the sensor.
-    calibration : Calibration
+    calibration : Calibration or KnownCamera
         Camera with its target views: first the views of `lines`, then the transport views.
     geometry : SensorGeometry
         Camera, sheet of light and transport with their covariance.
@@ -57,7 +58,7 @@ class SensorCalibration:
     """
 
     name: str
-    calibration: Calibration
+    calibration: Calibration | KnownCamera
     geometry: SensorGeometry
     along: Along
     channel: Channel
@@ -123,12 +124,6 @@ class SensorCalibration:
         }
 
 
-def known_grid(target: DetectedTarget) -> Float64:
-    """Return the grid of a target with one (rows, columns, 2) [px]; only grids have poses."""
-    assert target.grid is not None, "only grids have poses"
-    return target.grid
-
-
 def _sheet_report(sheet: SheetFit, camera_covariance: Float64) -> dict[str, Any]:
     test = sheet.bend_test
     sigmas = np.sqrt(np.diag(sheet.covariance(camera_covariance)))
@@ -176,6 +171,7 @@ def write_sensor_calibration(
     used = calibration.calibration
     images = [each.image for each in used.detected_targets] + [each for each, _ in used.skipped_images]
     images += [each.image for each in calibration.readings]
+    images += [used.file] if isinstance(used, KnownCamera) else []
     text = sensor_text(
         calibration.geometry,
         name=calibration.name,

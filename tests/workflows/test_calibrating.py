@@ -16,7 +16,7 @@ from gpuvision.camera.calibration import Calibration
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.cli.main import application
-from gpuvision.formats.camera_file import read_lens, write_lens
+from gpuvision.formats.camera_file import read_calibrated_camera, read_lens, write_lens
 from gpuvision.host import Device
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.outputs import MANIFEST
@@ -100,6 +100,10 @@ def test_three_views_calibrate_the_camera(tmp_path: Path) -> None:
     value, sigma = done.parameters["f"]
     assert abs(value - 1.4 * 640) < max(5.0 * sigma, 1.0)
     assert done.report()["poses"][0]["translation"][2] > 0.0
+    write_calibration(done, tmp_path / "out" / "camera.toml")
+    known = read_calibrated_camera(tmp_path / "out" / "camera.toml")
+    assert known[:3] == (done.model, done.image_size, done.fit.names)
+    np.testing.assert_array_equal(known.covariance, done.fit.covariance)
 
 
 @pytest.mark.parametrize("model", [LENS, CAMERA, Lens(k1=-1e-7), Lens(k1=-1e-7, k2=2e-14, k3=-1e-21, k4=3e-28)])

@@ -18,7 +18,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from gpuvision.camera.camera import Camera
 from gpuvision.cli.main import application
+from gpuvision.formats.camera_file import covariance_table, write_lens
 from gpuvision.host import Device
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.calibrating_sensor import BlockViews, TransportViews, _warnings, calibrate_sensor
@@ -30,6 +32,7 @@ Float64 = npt.NDArray[np.float64]
 BEND = (0.06, -0.02, 0.03)
 TRUTH = sensor(25.0, BEND)
 VIEWS, MOVED = 7, 3
+CAMERA = "[camera]\nmatrix = [[750.0, 0.0, 240.0], [0.0, 750.0, 180.0], [0.0, 0.0, 1.0]]\n"
 
 
 @pytest.fixture(scope="module")
@@ -217,6 +220,9 @@ def test_settings_are_checked_before_the_images_are_read(
         (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--block", "x"), "--block and --block-heights need each other"),
         (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--block", "x", "--block-heights", "0,1mm"), "--block needs"),
         (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--channel", "pink"), "--channel is 'pink'"),
+        (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--camera", "x", "--model", "k1"), "--model has no effect with"),
+        (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--camera", "x", "--focal-length", 9), "--focal-length has no"),
+        (("--camera", "x"), "--camera has no effect without --sensor"),
         (("--sensor", "--pitch", 0.01, "--step", 1e-3, "--method", "lines"), "--sensor needs poses|--pitch has no"),
         (("--step", 1e-3), "--step has no effect without --sensor"),
         (("--laser", "x"), "--laser has no effect without --sensor"),
@@ -276,6 +282,97 @@ def test_cut_off_transport_view_is_refused(images: Path, tmp_path: Path) -> None
     pair = [images / "pose0.png", images / "pose0_laser.png"]
     with pytest.raises(ValueError, match=r"1\.png: .* needs the whole target in every view"):
         calibrate_sensor(pair, pitch=PITCH, transport=TransportViews(folder=moved, profiles_between=1.0))
+
+
+def written_camera(file: Path, f: float, names: tuple[str, ...] = ("f", "cx")) -> Path:
+    """Write the camera of the truth with another focal length, and a covariance of f and cx."""
+    matrix = TRUTH.matrix.copy()
+    matrix[[0, 1], [0, 1]] = f
+    camera = Camera(matrix=tuple(map(tuple, matrix.tolist())), distortion=tuple(TRUTH.distortion.tolist()))
+    tables: dict[str, Any] = {"image": {"size": [480, 360]}}
+    if names:
+        tables["covariance"] = covariance_table(names, [[0.25, 0.03], [0.03, 0.16]])
+    write_lens(file, camera, tables)
+    return file
+
+
+def test_camera_file_replaces_the_calibration_of_the_camera(images: Path, tmp_path: Path) -> None:
+    """Two lit poses suffice; the joint covariance has the derivatives that a file with another f shows."""
+    shots = [images / f"pose{number}{end}.png" for number in (0, 2, 4) for end in ("", "_laser")]
+    moved = TransportViews(folder=images / "moved", profiles_between=PROFILES_BETWEEN)
+    low, high = (
+        calibrate_sensor(shots, pitch=PITCH, transport=moved, camera=written_camera(tmp_path / f"{f}.toml", f)).geometry
+        for f in (749.9, 750.1)
+    )
+    assert low.camera.matrix[0][0] == 749.9
+    assert low.names[:3] == ("f", "cx", "offset")
+    np.testing.assert_allclose(low.covariance[:2, :2], [[0.25, 0.03], [0.03, 0.16]])
+    by_f = (low.covariance[:, :2] @ np.linalg.inv(low.covariance[:2, :2]))[:, 0]
+    axes = np.stack([low.sheet.g_axis, low.sheet.h_axis, low.sheet.normal])
+    shift = axes[2] @ (high.sheet.origin - low.sheet.origin)
+    assert shift == pytest.approx(0.2 * by_f[low.names.index("offset")], rel=0.02)
+    assert low.transport is not None
+    assert high.transport is not None
+    change = axes @ (high.transport.step - low.transport.step)
+    rows = [low.names.index(name) for name in ("step_g", "step_h", "step_d")]
+    np.testing.assert_allclose(change, 0.2 * by_f[rows], rtol=0.02, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_camera_file_without_covariance_counts_as_exact(images: Path, tmp_path: Path) -> None:
+    shots = [images / f"pose{number}{end}.png" for number in (0, 2, 4) for end in ("", "_laser")]
+    camera = written_camera(tmp_path / "camera.toml", 750.0, ())
+    moved = ["--transport-views", images / "moved", "--profiles-between", PROFILES_BETWEEN, "--on-stage"]
+    out = tmp_path / "out" / "sensor.toml"
+    run("calibrate", *shots, "--sensor", "--camera", camera, "--pitch", PITCH, *moved, "--out", out)
+    table, report = read(out)
+    assert report["camera"]["file"] == "camera.toml"
+    assert report["covariance"]["names"][0] == "offset"
+    assert report["warnings"] == report["camera"]["warnings"]
+    assert "camera.toml has no table [covariance]" in report["warnings"][0]
+    heights = [
+        float(np.mean(scene_points(table, readings(TRUTH, height, 0.0), 0.0)[:, 2])) for height in (0.0, 0.006, 0.012)
+    ]
+    assert np.abs(np.diff(heights) - 0.006).max() < 0.02 * 0.73e-3
+    with pytest.raises(FileExistsError, match=r"camera\.toml"):
+        run("calibrate", *shots, "--sensor", "--camera", camera, "--pitch", PITCH, *moved, "--out", camera)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[lens]\nk1 = 1e-7\n", r"\[lens\] is the distortion alone"),
+        ("[image]\nsize = [640, 480]\n" + CAMERA, "480 x 360 pixels, the model was calibrated at 640 x 480"),
+        (CAMERA + '[covariance]\nnames = "f,f"\nmatrix = [[1.0, 0.0], [0.0, 1.0]]\n', "names is 'f,f'"),
+        (CAMERA + '[covariance]\nnames = "f,z"\nmatrix = [[1.0, 0.0], [0.0, 1.0]]\n', "names is 'f,z'"),
+        (CAMERA + '[covariance]\nnames = "f,cx"\nmatrix = [[1.0, 0.0]]\n', "matrix has 1 rows for 2 names"),
+        (CAMERA + '[covariance]\nnames = "f,cx"\nmatrix = [[1.0, 2.0], [2.0, 1.0]]\n', "matrix is no covariance"),
+        (CAMERA + '[covariance]\nnames = "f,cx"\nmatrix = [[1.0, 0.5], [0.0, 1.0]]\n', "matrix is no covariance"),
+    ],
+)
+def test_camera_file_that_does_not_fit_is_refused(images: Path, tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "camera.toml").write_text(text)
+    pair = [images / "pose0.png", images / "pose0_laser.png"]
+    with pytest.raises(ValueError, match=said):
+        calibrate_sensor(pair, pitch=PITCH, camera=tmp_path / "camera.toml", step=1e-3)
+
+
+@pytest.mark.slow
+def test_chessboard_calibrates_the_sensor(tmp_path: Path) -> None:
+    """The laser line crosses black and white squares; steps of 6 mm are measured as from a target of dots."""
+    write_images(tmp_path, TRUTH, np.random.default_rng(4), VIEWS, MOVED, "chessboard")
+    out = tmp_path / "out" / "sensor.toml"
+    run(*command(tmp_path), "--pattern", "chessboard", "--inner-corners", "9x6", "--out", out)
+    table, report = read(out)
+    assert len(report["camera"]["images"]) == VIEWS + MOVED
+    assert report["sheet"]["readings"] > 1000
+    heights = [
+        float(np.mean(scene_points(table, readings(TRUTH, height, 0.0), 0.0)[:, 2]))
+        for height in (-0.006, 0.0, 0.006, 0.012)
+    ]
+    assert np.abs(np.diff(heights) - 0.006).max() < 0.02 * 0.73e-3
+    step = float(np.linalg.norm(TRUTH.step))
+    assert abs(table["transport"]["step"] - step) < 4.0 * report["transport"]["step_sigma_m"] < 4e-7
 
 
 @pytest.mark.slow

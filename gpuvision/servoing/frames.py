@@ -170,27 +170,37 @@ class Transform:
 
     @property
     def scale(self) -> float:
-        """Scale of a rigid (1) or similarity transform; of an affine one the scale of the nearest similarity."""
-        (a, b), (c, d) = self.linear
-        return 0.5 * math.hypot(a + d, c - b)
+        """Scale of a rigid (1) or similarity transform; of an affine one the scale of the nearest similarity.
+
+        Raises
+        ------
+        ValueError
+            The transform reflects: its determinant is below 0, and no similarity is near.
+        """
+        return math.hypot(*self._nearest)
 
     @property
     def pose(self) -> Float64:
         """Pose (3,): translation [m] and angle [rad] of the source frame in the target frame.
 
         Of an affine transform the angle of the nearest similarity.
+
+        Raises
+        ------
+        ValueError
+            The transform reflects, as in `scale`.
         """
-        (a, b), (c, d) = self.linear
-        return np.array([*self.translation, math.atan2(c - b, a + d)])
+        along, across = self._nearest
+        return np.array([*self.translation, math.atan2(across, along)])
 
     @property
     def pose_covariance(self) -> Float64:
-        """Covariance (3, 3) of `pose`."""
+        """Covariance (3, 3) of `pose`; it raises the same error."""
         return self._pose_rows[:3] @ self._elements_covariance @ self._pose_rows[:3].T
 
     @property
     def scale_sigma(self) -> float:
-        """Standard deviation of `scale`."""
+        """Standard deviation of `scale`; it raises the same error."""
         row = self._pose_rows[3]
         return math.sqrt(max(float(row @ self._elements_covariance @ row), 0.0))
 
@@ -199,10 +209,17 @@ class Transform:
         return np.zeros((6, 6)) if self.covariance is None else self.covariance
 
     @property
+    def _nearest(self) -> tuple[float, float]:
+        """Scale times cosine and sine of the angle, of the nearest similarity."""
+        (a, b), (c, d) = self.linear
+        if a * d - b * c < 0.0:
+            raise ValueError(f"{self.target!r} <- {self.source!r} reflects, expected a transform with a pose and scale")
+        return float(0.5 * (a + d)), float(0.5 * (c - b))
+
+    @property
     def _pose_rows(self) -> Float64:
         """Derivatives (4, 6) of x, y, theta and the scale by the elements."""
-        (a, b), (c, d) = self.linear
-        along, across = 0.5 * (a + d), 0.5 * (c - b)  # scale times cosine and sine of theta
+        along, across = self._nearest
         square, scale = along**2 + across**2, math.hypot(along, across)
         to_along = np.array([0.5, 0.0, 0.0, 0.0, 0.5, 0.0])
         to_across = np.array([0.0, -0.5, 0.0, 0.5, 0.0, 0.0])

@@ -173,3 +173,14 @@ def test_wrong_composition_is_an_error_not_a_number() -> None:
 def test_wrong_transforms_are_refused(make: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("name", ["pose", "scale", "pose_covariance", "scale_sigma"])
+def test_a_reflection_has_no_pose(name: str) -> None:
+    reflected = Transform.affine("image", "camera", [[1e-5, 0, 0], [0, -1.1e-5, 0]], 1e-18 * np.eye(6))
+    with pytest.raises(ValueError, match="'camera' <- 'image' reflects"):
+        getattr(reflected, name)
+    np.testing.assert_allclose(reflected.apply([2.0, 3.0]), [2e-5, -3.3e-5])
+    turned = Transform.affine("image", "camera", [[0, 1e-5, 0], [1e-5, 0, 0]])
+    with pytest.raises(ValueError, match="reflects"):
+        getattr(turned, name)

@@ -25,6 +25,7 @@ import numpy.typing as npt
 from gpuvision.matching.field.distance_map import Field
 from gpuvision.matching.field.field_pose import PoseCandidate
 from gpuvision.matching.field.odometry import PoseEstimate, correct, predict, squared_mahalanobis_distance
+from gpuvision.matching.pose.motion import rotation
 from gpuvision.status import Status
 from gpuvision.validation import finite
 
@@ -52,6 +53,9 @@ class RobotFilterLimits:
         Largest number of hypotheses (cost).
     merged : float
         Squared Mahalanobis distance below which two hypotheses are one (chosen).
+    view_delay : float
+        Longest time from the exposure of a view until it is given to the filter [s], above 0; an older view is not
+        used (chosen: 10 frame times at 5 frames per second).
     """
 
     wrong_view: float = 0.05
@@ -61,6 +65,7 @@ class RobotFilterLimits:
     dropped: float = 1e-6
     max_hypotheses: int = 16
     merged: float = 1.0
+    view_delay: float = 2.0
 
 
 class Hypothesis(NamedTuple):
@@ -103,10 +108,17 @@ class _Motion(NamedTuple):
     motion: Float64
     covariance: Float64
 
-    def part(self, start: float, end: float) -> _Motion:
-        """Return a part of the motion, at constant velocity; the covariance grows with time."""
-        share = (end - start) / (self.end - self.start)
-        return _Motion(start, end, share * self.motion, share * self.covariance)
+    def until(self, time: float) -> _Motion:
+        """Return the first part of the motion, at constant velocity; the covariance grows with time."""
+        share = (time - self.start) / (self.end - self.start)
+        return _Motion(self.start, time, share * self.motion, share * self.covariance)
+
+    def since(self, time: float) -> _Motion:
+        """Return the second part of the motion: after the first one it gives the pose of the whole motion."""
+        first, share = self.until(time).motion, (self.end - time) / (self.end - self.start)
+        back = np.eye(3)
+        back[:2, :2] = rotation(-float(first[2]))
+        return _Motion(time, self.end, back @ (self.motion - first), share * back @ self.covariance @ back.T)
 
 
 class RobotFilter:
@@ -122,6 +134,11 @@ class RobotFilter:
         Time of the first pose [s], default 0.
     limits : RobotFilterLimits
         Probabilities and thresholds.
+
+    Notes
+    -----
+    Motions are kept for ``limits.view_delay`` seconds, so that a late view counts at its time. Memory and time of a
+    call grow with the number of motions in this time, not with the time since the last view.
     """
 
     def __init__(
@@ -131,6 +148,7 @@ class RobotFilter:
         time: float = 0.0,
         limits: RobotFilterLimits = RobotFilterLimits(),
     ) -> None:
+        finite(limits.view_delay, "view_delay [s]", above=0.0)
         self.limits = limits
         self._time = self._end = finite(time, "time [s]")
         self._hypotheses: list[Hypothesis] = [] if initial is None else [Hypothesis(initial, 1.0)]
@@ -159,6 +177,10 @@ class RobotFilter:
         values = np.asarray(motion, np.float64), np.asarray(covariance, np.float64)
         self._motions.append(_Motion(self._end, time, *values))
         self._end = time
+        oldest = time - self.limits.view_delay
+        kept = next(number for number, each in enumerate(self._motions) if each.end > oldest)
+        if kept:
+            self._advance(self._motions[:kept], self._motions[kept:])
 
     def see(self, time: float, candidates: Sequence[PoseCandidate]) -> bool:
         """Take the candidates of a view that was exposed at a time, which may lie before later motions.
@@ -173,7 +195,8 @@ class RobotFilter:
         Returns
         -------
         bool
-            False for a view that is not newer than the last one: it is not used.
+            False for a view that is not used: it is not newer than the last one, or older than
+            ``limits.view_delay`` and the motions of its time are no longer kept.
 
         Raises
         ------
@@ -185,9 +208,8 @@ class RobotFilter:
         if time < self._time or time <= self._seen:
             return False
         self._seen = time
-        before, after = self._split(time)
-        self._hypotheses = [_moved(each, before) for each in self._hypotheses]
-        self._motions, self._time = after, time
+        self._advance(*self._split(time))
+        self._time = time
         known = [each for each in candidates if not each.status & Status.AMBIGUOUS]
         if known:
             self._hypotheses = self._reduced(self._children(known))
@@ -196,7 +218,10 @@ class RobotFilter:
         return True
 
     def state(self, time: float | None = None) -> RobotState:
-        """Return the state at a time between the last view and the last motion; None: after the last motion."""
+        """Return the state at a time up to the last motion; None: after the last motion.
+
+        The time is not before the last view, nor more than ``limits.view_delay`` before the last motion.
+        """
         time = self._end if time is None else finite(time, "time [s]", minimum=self._time, maximum=self._end)
         motions, _ = self._split(time)
         found = tuple(_moved(each, motions) for each in self._hypotheses)
@@ -207,15 +232,22 @@ class RobotFilter:
         status = Status.OK if best.probability >= self.limits.min_probability else Status.AMBIGUOUS
         return RobotState(time, best.estimate.pose, best.estimate.covariance, best.probability, status, found)
 
+    def _advance(self, before: Sequence[_Motion], after: list[_Motion]) -> None:
+        """Move the hypotheses by the first motions, and keep the others."""
+        self._hypotheses = [_moved(each, before) for each in self._hypotheses]
+        self._motions = after
+        if before:
+            self._time = before[-1].end
+
     def _split(self, time: float) -> tuple[list[_Motion], list[_Motion]]:
-        """Return the motions from the last view to a time, and after it."""
+        """Return the kept motions until a time, and after it."""
         before: list[_Motion] = []
         after: list[_Motion] = []
         for each in self._motions:
             if each.start < time:
-                before.append(each if each.end <= time else each.part(each.start, time))
+                before.append(each if each.end <= time else each.until(time))
             if each.end > time:
-                after.append(each if each.start >= time else each.part(time, each.end))
+                after.append(each if each.start >= time else each.since(time))
         return before, after
 
     def _children(self, candidates: Sequence[PoseCandidate]) -> list[Hypothesis]:

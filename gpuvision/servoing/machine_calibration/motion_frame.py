@@ -68,7 +68,10 @@ class MotionFrame:
     unobservable : tuple of str
         Names of parameters that the moves do not determine.
     transform : Transform
-        From "motion" (commands at the head angle 0) to "artwork" (camera positions on the board).
+        From "motion" (commands at the head angle ``head_angle``) to "artwork" (camera positions on the board).
+    head_angle : float
+        Angle of the head [rad] at which the translation of ``transform`` holds: 0, and the angle of all commands where
+        the head did not turn, since the turned offset of the camera is then part of the place of the board.
     camera_to_motion : Transform
         From "camera" to "motion": command that moves the head by a vector seen in the camera frame. It has no
         translation.
@@ -81,6 +84,7 @@ class MotionFrame:
     covariance: Float64
     unobservable: tuple[str, ...]
     transform: Transform
+    head_angle: float
     camera_to_motion: Transform
     residual_scale: float
 
@@ -116,7 +120,8 @@ def fit_motion_frame(commands: npt.ArrayLike, seen: npt.ArrayLike, covariance: n
     Notes
     -----
     Without turns of the head the offset of the camera cannot be told from the place of the board: it is NaN and named
-    in ``unobservable``; everything else does not depend on it.
+    in ``unobservable``. The translation of ``transform`` then holds at ``head_angle`` alone; everything else does not
+    depend on the offset.
     """
     given, poses = np.asarray(commands, np.float64), np.asarray(seen, np.float64)
     for name, values in (("commands", given), ("seen", poses)):
@@ -140,6 +145,7 @@ def fit_motion_frame(commands: npt.ArrayLike, seen: npt.ArrayLike, covariance: n
         covariance=spread,
         unobservable=() if turned else _NAMES[7:9],
         transform=_to_board(fit.values, fit.covariance),
+        head_angle=0.0 if turned else float(given[0, 2]),
         camera_to_motion=_camera_to_motion(fit.values, fit.covariance),
         residual_scale=fit.residual_scale,
     )
@@ -239,7 +245,7 @@ def _parameter_rows(values: Float64) -> Float64:
 
 
 def _to_board(values: Float64, covariance: Float64) -> Transform:
-    """Return the transform from commands at the head angle 0 to camera positions on the board."""
+    """Return the transform from commands to camera positions on the board, at the head angle 0 or the only one."""
     rows = np.zeros((6, len(values)))
     for element, parameter in ((0, 0), (1, 2), (2, 4), (3, 1), (4, 3), (5, 5)):
         rows[element, parameter] = 1.0

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from gpuvision.formats.field_file import read_field
+from gpuvision.matching.field import robot_filter
 from gpuvision.matching.field.field_pose import PoseCandidate
 from gpuvision.matching.field.odometry import PoseEstimate, predict
 from gpuvision.matching.field.robot_filter import RobotFilter, RobotFilterLimits
@@ -70,7 +71,8 @@ def test_a_delayed_view_counts_at_its_time() -> None:
     view = candidate(np.add(START.pose, (0.12, 0.02, 0.06)))
     prompt.move(0.05, half * motion, half * STEP)
     prompt.see(0.05, [view])
-    prompt.move(0.1, half * motion, half * STEP)
+    # The other half of the way, in the frame of the robot after half the turn.
+    prompt.move(0.1, [0.1 * math.cos(0.05), -0.1 * math.sin(0.05), 0.05], half * STEP)
     prompt.move(0.2, motion, STEP)
     late.move(0.1, motion, STEP)
     late.move(0.2, motion, STEP)
@@ -79,6 +81,36 @@ def test_a_delayed_view_counts_at_its_time() -> None:
         np.testing.assert_allclose(ours, theirs, rtol=1e-9)
     assert not late.see(0.05, [view])  # the same view twice
     assert not late.see(0.01, [view])  # older than the last one
+
+
+def test_a_refused_view_within_a_motion_leaves_the_robot_where_it_is() -> None:
+    whole, split = RobotFilter(FIELD, START), RobotFilter(FIELD, START)
+    for robot in (whole, split):
+        robot.move(1.0, (1.0, -0.2, 1.2), 1e-6 * np.diag([4.0, 1.0, 0.0]))
+    for number in range(1, 10):
+        assert split.see(0.1 * number, [])
+    np.testing.assert_allclose(split.state().pose, whole.state().pose, atol=1e-12)
+    np.testing.assert_allclose(split.state().covariance, whole.state().covariance, atol=1e-12)
+
+
+def test_motions_without_views_are_kept_for_the_longest_delay_of_a_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    predicted: list[int] = []
+    monkeypatch.setattr(robot_filter, "predict", lambda *of: (predicted.append(1), predict(*of))[1])
+    # 0.125 s: exact in binary, so that no motion ends at the limit by rounding.
+    robot = RobotFilter(FIELD, START, limits=RobotFilterLimits(view_delay=1.0))
+    expected = START
+    for number in range(1, 401):
+        robot.move(0.125 * number, (0.01, 0.0, 0.01), 1e-8 * np.eye(3))
+        expected = predict(expected, (0.01, 0.0, 0.01), 1e-8 * np.eye(3))
+    predicted.clear()
+    state = robot.state()
+    assert len(predicted) == 8
+    np.testing.assert_allclose(state.pose, expected.pose, rtol=1e-12)
+    np.testing.assert_allclose(state.covariance, expected.covariance, rtol=1e-12)
+    assert not robot.see(48.9, [])
+    assert robot.see(49.0, [])
+    with pytest.raises(ValueError, match="view_delay"):
+        RobotFilter(FIELD, START, limits=RobotFilterLimits(view_delay=0.0))
 
 
 def test_errors_are_as_predicted(rng: np.random.Generator) -> None:

@@ -50,6 +50,7 @@ def test_exact_poses_give_back_the_planted_machine() -> None:
     frame = fit_motion_frame(COMMANDS, _seen(COMMANDS), COVARIANCE)
     np.testing.assert_allclose(frame.parameters, PLANTED, atol=1e-12)
     assert frame.unobservable == ()
+    assert frame.head_angle == 0.0
     # Camera positions at the head angle 0, and the command that moves the camera by a vector that it sees.
     commands = np.array([[3e-3, 5e-3, 0.0], [9e-3, -2e-3, 0.0]])
     seen = _seen(commands)
@@ -114,6 +115,10 @@ def test_without_turns_the_offset_is_named_and_the_rest_is_found() -> None:
     assert np.all(np.isnan(frame.sigmas[5:]))
     np.testing.assert_allclose(frame.parameters[:5], PLANTED[:5], atol=1e-12)
     assert np.all(frame.sigmas[:5] > 0)
+    # Camera positions are those at the only angle of the head.
+    assert frame.head_angle == 0.25
+    there = np.array([[3e-3, 5e-3, 0.25], [9e-3, -2e-3, 0.25]])
+    np.testing.assert_allclose(frame.transform.apply(there[:, :2]), _seen(there)[:, :2], atol=1e-14)
 
 
 @pytest.mark.parametrize(

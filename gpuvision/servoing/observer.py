@@ -367,6 +367,11 @@ class LatestPose:
         self._exposed = time
         self._pose, self._covariance = np.array(pose, np.float64), np.array(covariance, np.float64)
 
+    @property
+    def exposed(self) -> float:
+        """Time of the exposure of the pose [s]."""
+        return self._exposed
+
     def command(self, time: float, velocity: Float64) -> None:
         """Ignore a command."""
 

@@ -4,6 +4,7 @@ References
 ----------
 .. [1] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, sections 5.4.4 and
    8.7.
+.. [2] K. J. Astrom, *Introduction to Stochastic Control Theory*, Academic Press 1970, chapter 5, section 2.
 """
 
 from __future__ import annotations
@@ -14,16 +15,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.servoing.delay_response import step_response
+from gpuvision.servoing.delay import characteristic_polynomial
 from gpuvision.servoing.frames import Transform, compose_poses, invert_pose
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.placing import REMAINDER
 from gpuvision.servoing.placement.plan import PlacementPlan
 
 Float64 = npt.NDArray[np.float64]
-
-# Frames of the step response after which a stable loop has settled to rounding, per frame of delay (chosen).
-_FRAMES = 400
 
 
 class ErrorBudget(NamedTuple):
@@ -60,11 +58,25 @@ def noise_gain(delay: float, gain: float) -> float:
 
     Notes
     -----
-    Independent errors of the frames add: the sum of the squared steps of the step response. Without delay it is
-    ``gain / (2 - gain)``.
+    Independent errors of the frames add: the sum of the squared steps of the step response, in closed form by the
+    recursion of [2]_. Without delay it is ``gain / (2 - gain)``.
+
+    Raises
+    ------
+    ValueError
+        The loop is not stable, or the gain is 0.
     """
-    error = step_response(delay, gain, int(_FRAMES * (1.0 + delay)))
-    return float(np.sum(np.diff(error) ** 2))
+    poles = characteristic_polynomial(delay, gain)
+    zeros = np.zeros(len(poles))
+    zeros[1] = gain
+    total = 0.0
+    while len(poles) > 1:
+        if abs(poles[-1]) >= poles[0]:
+            raise ValueError(f"the loop with delay {delay:g} frames and gain {gain:g} is not stable: no variance")
+        total += zeros[-1] ** 2 / poles[0]
+        mirrored = poles[::-1] / poles[0]
+        poles, zeros = (poles - poles[-1] * mirrored)[:-1], (zeros - zeros[-1] * mirrored)[:-1]
+    return float(total + zeros[0] ** 2 / poles[0])
 
 
 def predict_budget(machine: Machine, plan: PlacementPlan) -> ErrorBudget:
@@ -84,7 +96,7 @@ def predict_budget(machine: Machine, plan: PlacementPlan) -> ErrorBudget:
     differences between the pixels, which are the same in all frames of a head at rest. "servo" is the rest of the step
     response that `ReleaseRule` allows, evenly distributed, and the step of the encoder.
     """
-    averaged = noise_gain(machine.delay.frames, machine.loop_gain)
+    averaged = noise_gain(machine.response_frames, machine.loop_gain)
     steps = np.array([axis.encoder for axis in machine.axes])
     rest = REMAINDER * np.array([machine.tolerance.position] * 2 + [machine.tolerance.angle])
     sources = {

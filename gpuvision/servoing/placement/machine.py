@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from gpuvision.camera.cmos_sensor import CmosSensor
 from gpuvision.servoing.axis import Axis
-from gpuvision.servoing.delay import DelayBudget, gain_limit
+from gpuvision.servoing.delay import DelayBudget, gain_limit, non_oscillating_gain
 from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform
 from gpuvision.validation import finite, integer
 
@@ -80,7 +80,7 @@ class Tolerance:
     position : float
         Largest distance from the target at the release [m], above 0. The settling rule waits for it.
     angle : float
-        Largest angle from the target at the release [rad], above 0.
+        Largest angle from the target at the release [rad], above 0. The settling rule waits for it.
     landing_zone : float
         Largest offset, along x and along y, at which the camera takes over from the long move [m], above 0.
     landing_angle : float
@@ -150,7 +150,8 @@ class Machine:
     tolerance : Tolerance
         Limits of a placement.
     axes : tuple of Axis
-        Axes x, y and theta of the head, for the simulated machine. Default: axes that follow at once.
+        Axes x, y and theta of the head. Gain and predicted frames count the longest lag as a delay; the rest is for the
+        simulated machine. Default: axes that follow at once.
     rate : float
         Frames per second, above 0; default 1000.
     transfer : float
@@ -190,11 +191,12 @@ class Machine:
                 f"a frame of {rows} x {columns} px takes {1e3 * timing.period:.3f} ms, more than 1/rate = "
                 f"{1e3 * self.period:.3f} ms; read a smaller window, expose shorter, or lower the rate"
             )
-        most = gain_limit(self.delay.frames)
+        # Below half a frame a delay raises the limit, a lag does not.
+        most = gain_limit(max(self.response_frames, 0.5) if self.lag else self.response_frames)
         if self.gain is not None and not 0.0 < self.gain < most:
             raise ValueError(
                 f"gain is {self.gain}, expected above 0 and below {most:.4g}, the limit of stability for a delay of "
-                f"{self.delay.frames:.2f} frames"
+                f"{self.response_frames:.2f} frames"
             )
 
     @property
@@ -204,20 +206,35 @@ class Machine:
 
     @property
     def delay(self) -> DelayBudget:
-        """Delay from the middle of the exposure to the motion that answers it."""
+        """Delay from the middle of the exposure to the command that answers it.
+
+        The readout counts from the end of the exposure of the middle row, and includes the frame buffers of the sensor.
+        """
         camera = self.camera
         timing = camera.sensor.timing(camera.window, exposure=camera.exposure)
+        # The sensor counts its buffers at its highest rate, the machine reads it at its own.
+        buffers = camera.sensor.readout.buffers * (self.period - timing.period)
         return DelayBudget(
             period=self.period,
-            exposure=camera.exposure,
-            readout=timing.readout,
+            exposure=timing.exposure,
+            readout=timing.delay - timing.exposure / 2.0 + buffers,
             transfer=self.transfer,
             stages=dict(self.stages),
         )
+
+    @property
+    def lag(self) -> float:
+        """Longest lag of an axis [s]."""
+        return max(axis.lag for axis in self.axes)
+
+    @property
+    def response_frames(self) -> float:
+        """Delay of the loop in frames: the latency of the camera, and the longest lag of an axis as a delay."""
+        return self.delay.frames + self.lag / self.period
 
     @property
     def loop_gain(self) -> float:
         """Fraction of the error that one frame corrects."""
         if self.gain is not None:
             return self.gain
-        return self.delay.gain
+        return non_oscillating_gain(self.response_frames)

@@ -31,21 +31,25 @@ class ReleaseRule:
     """Settling rule: the part is released when theory and measurement say that the head has settled.
 
     The first measured error and the gain of the loop give the number of frames after which the rest of the step
-    response is `REMAINDER` of the tolerance; from then on the first measured error within the tolerance releases.
+    response is `REMAINDER` of the tolerance; from then on the first measured error within the tolerance releases. If an
+    axis has a lag, all new errors of a latency and a lag must be within the tolerance.
 
     Parameters
     ----------
     machine : Machine
-        Delay, gain and tolerance.
+        Delay, lag, gain and tolerance.
+    observer : LatestPose
+        Observer of the loop. An error releases only if its pose is new: not while poses are missing or refused.
 
     Notes
     -----
     Implements `gpuvision.servoing.loop.SettlingRule`. A start near the target waits for fewer frames.
     """
 
-    def __init__(self, machine: Machine) -> None:
-        self._machine = machine
-        self._limit = np.array([machine.tolerance.position] * 2 + [machine.tolerance.angle])
+    def __init__(self, machine: Machine, observer: LatestPose) -> None:
+        self._machine, self._observer = machine, observer
+        self._within = math.ceil(machine.response_frames) + 1 if machine.lag else 1
+        self._row, self._exposed = 0, -math.inf
         self.start: Float64 | None = None
         """Error (3,) of the first measured pose; None before it."""
         self.frames = 0
@@ -59,15 +63,24 @@ class ReleaseRule:
                 return False  # no pose was measured yet
             self.start, self._first = error.copy(), time
             self.frames = predicted_frames(self._machine, error)
+        if self._observer.exposed == self._exposed:
+            return False  # no new pose
+        self._exposed = self._observer.exposed
+        self._row = self._row + 1 if _share(self._machine, error) <= 1.0 else 0
         waited = time - self._first >= (self.frames - 0.5) * self._machine.period
-        return waited and bool(np.all(np.abs(error) <= self._limit))
+        return waited and self._row >= self._within
 
 
 def predicted_frames(machine: Machine, error: npt.ArrayLike, fraction: float = REMAINDER) -> int:
     """Return the number of frames in which the loop reduces an error (3,) to a fraction of the tolerance, by theory."""
-    limit = fraction * np.array([machine.tolerance.position] * 2 + [machine.tolerance.angle])
-    share = float(np.max(np.abs(np.asarray(error, np.float64)) / limit))
-    return settling_frames(machine.delay.frames, machine.loop_gain, 1.0 / share) if share > 1.0 else 0
+    share = _share(machine, np.asarray(error, np.float64)) / fraction
+    return settling_frames(machine.response_frames, machine.loop_gain, 1.0 / share) if share > 1.0 else 0
+
+
+def _share(machine: Machine, error: Float64) -> float:
+    """Return an error (3,) as a fraction of the tolerance: the larger one of distance and angle."""
+    x, y, theta = error.tolist()
+    return max(math.hypot(x, y) / machine.tolerance.position, abs(theta) / machine.tolerance.angle)
 
 
 class Placement(NamedTuple):
@@ -126,6 +139,7 @@ def place_part(machine: Machine, target: npt.ArrayLike, plant: Plant, sensor: Po
         The part is not released if no pose is valid for `Tolerance.max_refused` frames, if the loop gives up, or after
         `Tolerance.max_time`; ``reason`` says why.
     """
+    x, y, theta = (axis.lag for axis in machine.axes)
     goal = np.asarray(target, np.float64)
     observer = LatestPose()
     observer.reset(-math.inf, goal, np.full((3, 3), math.inf))
@@ -137,9 +151,9 @@ def place_part(machine: Machine, target: npt.ArrayLike, plant: Plant, sensor: Po
         PidController(PidGains(proportional=machine.loop_gain * machine.rate)),
         clock,
         period=machine.period,
-        limits=LoopLimits(hold_after=blind, abort_after=blind),
+        limits=LoopLimits(hold_after=blind, abort_after=blind, lag=(x, y, theta)),
     )
-    rule = ReleaseRule(machine)
+    rule = ReleaseRule(machine, observer)
     record = loop.run(goal, machine.tolerance.max_time, settling=rule)
     released = record.outcome is Outcome.ARRIVED
     start = np.full(3, math.nan) if rule.start is None else rule.start

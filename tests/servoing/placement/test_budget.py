@@ -30,3 +30,16 @@ def test_more_delay_and_more_gain_give_more_noise() -> None:
     values = [noise_gain(delay, gain) for delay, gain in ((0.0, 0.1), (2.0, 0.1), (2.0, 0.3))]
     assert values == sorted(values)
     assert math.isfinite(values[-1])
+
+
+@pytest.mark.parametrize("gain", [1e-8, 1e-4])
+@pytest.mark.parametrize("delay", [0.0, 1.4, 6.0])
+def test_noise_of_a_slow_loop_is_not_cut_off(delay: float, gain: float) -> None:
+    # A slow loop is a first-order low-pass filter: half its gain, with corrections of the relative size gain * delay.
+    assert noise_gain(delay, gain) == pytest.approx(gain / 2.0, rel=3.0 * gain * (1.0 + delay))
+
+
+def test_noise_of_an_unstable_loop_is_refused() -> None:
+    for gain in (0.62, 0.0):
+        with pytest.raises(ValueError, match="not stable"):
+            noise_gain(2.0, gain)

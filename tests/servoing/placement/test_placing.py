@@ -6,14 +6,17 @@ import math
 import numpy as np
 import pytest
 
+from gpuvision.camera.cmos_sensor import CmosSensor
+from gpuvision.camera.sensor_readout import SensorReadout
 from gpuvision.formats.machine_file import read_machine
+from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.delay_response import settling_frames
 from gpuvision.servoing.frames import Transform
 from gpuvision.servoing.loop import SimulatedClock
-from gpuvision.servoing.observer import PoseMeasurement
+from gpuvision.servoing.observer import LatestPose, PoseMeasurement
 from gpuvision.servoing.placement.budget import noise_gain
 from gpuvision.servoing.placement.machine import Machine, PlacementCamera, ThermalDrift, Tolerance
-from gpuvision.servoing.placement.placing import REMAINDER, Placement, place_part, predicted_frames
+from gpuvision.servoing.placement.placing import REMAINDER, Placement, ReleaseRule, place_part, predicted_frames
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.servoing.simulated_sensor import Fault, SimulatedPoseSensor
 
@@ -120,3 +123,98 @@ def test_machines_that_cannot_work_are_refused() -> None:
     np.testing.assert_allclose(
         ThermalDrift(expansion=(1e-6, -2e-6), temperature_sigma=3.0).covariance[:2, :2] * 1e12, [[9, -18], [-18, 36]]
     )
+
+
+@pytest.mark.parametrize("lag", [0.3e-3, 1e-3, 3e-3, 10e-3])
+def test_an_axis_with_a_lag_rests_within_the_tolerance_after_the_release(lag: float) -> None:
+    machine = dataclasses.replace(MACHINE, axes=(Axis(lag=lag),) * 3, gain=None)
+    plant = SimulatedPlant(machine.axes, start=TARGET + np.array([80e-6, 0.0, 0.0]))
+    sensor = SimulatedPoseSensor(
+        plant.pose, period=machine.period, delay=machine.delay.latency, covariance=COVARIANCE, is_noisy=False
+    )
+    placement = place_part(machine, TARGET, plant, sensor, SimulatedClock())
+    assert placement.released
+    end = placement.record.time[-1]
+    after = plant.pose(np.linspace(end, end + 10.0 * lag, 50))[:, 0] - TARGET[0]
+    assert np.all(np.abs(after) < machine.tolerance.position)
+    before = plant.pose(np.linspace(0.0, end, 500))[:, 0] - TARGET[0]
+    assert before.min() > -0.03 * 80e-6  # hardly an overshoot
+    assert placement.predicted_frames <= placement.frames <= 1.5 * placement.predicted_frames + 10
+
+
+@pytest.mark.parametrize("lag", [0.2e-3, 1e-3, 5e-3])
+@pytest.mark.parametrize("transfer", [0.0, 1.7e-3])
+def test_the_largest_gain_is_stable_with_a_lag(lag: float, transfer: float) -> None:
+    slow = dataclasses.replace(MACHINE, axes=(Axis(lag=lag),) * 3, transfer=transfer, gain=None)
+    with pytest.raises(ValueError, match="limit of stability") as refused:
+        dataclasses.replace(slow, gain=10.0)
+    limit = float(str(refused.value).split("below ")[1].split(",")[0])
+    machine = dataclasses.replace(slow, gain=0.98 * limit)
+    error = velocity = 0.0
+    # Recursion of the axis in fine steps of the frame, apart from the code of the plant.
+    steps, errors = 200, []
+    seen, error = round(machine.delay.frames * steps), 1.0
+    history = [error] * (seen + 1)
+    for _ in range(400):
+        command = -machine.loop_gain * history[-1 - seen] * machine.rate
+        for _ in range(steps):
+            velocity += (command - velocity) * (1.0 - math.exp(-machine.period / steps / lag))
+            error += velocity * machine.period / steps
+            history.append(error)
+        errors.append(abs(error))
+    assert max(errors[300:]) < 0.5
+
+
+def test_the_delay_is_that_of_the_sensor() -> None:
+    """Readout of a window of 128 x 128: 0.41 ms at 40 MHz; 1 kHz; an exposure of 0.2 ms."""
+
+    def latency(readout: SensorReadout, **pixel: object) -> float:
+        described = {"rows": 256, "columns": 256, "pitch": 1e-5, "quantum_efficiency": 0.5, "gain": 0.1}
+        sensor = CmosSensor(**described, dark_noise=10.0, full_well=2e4, bits=10, readout=readout, **pixel)  # type: ignore[arg-type]
+        camera = dataclasses.replace(MACHINE.camera, sensor=sensor, window=(128, 128), exposure=0.2e-3)
+        machine = dataclasses.replace(MACHINE, camera=camera, rate=1000.0, transfer=0.0, stages={}, gain=None)
+        if not readout.buffers:
+            assert machine.delay.latency == pytest.approx(sensor.timing((128, 128), 0.2e-3).delay, rel=1e-12)
+        return machine.delay.latency
+
+    row = 128 / 40e6
+    assert latency(SensorReadout(pixel_clock=40e6)) == pytest.approx(0.1e-3 + 128 * row, rel=1e-12)
+    # The buffers are read at the rate of the machine, not at the highest one of the sensor.
+    assert latency(SensorReadout(pixel_clock=40e6, buffers=2)) == pytest.approx(2.1e-3 + 128 * row, rel=1e-12)
+    rolling = SensorReadout(pixel_clock=40e6, shutter="rolling")
+    assert latency(rolling) == pytest.approx(0.1e-3 + 64.5 * row, rel=1e-12)
+    direct = latency(SensorReadout(pixel_clock=40e6), pixel="direct_read", response_time=20e-6)
+    assert direct == pytest.approx(10e-6 + 64.5 * row, rel=1e-12)
+
+
+def test_the_position_tolerance_is_a_distance() -> None:
+    side = 0.9 * MACHINE.tolerance.position
+    assert ReleaseRule(MACHINE, _at(0.0))(0.0, np.zeros(3), COVARIANCE)
+    late = 1.0
+    for error, expected in (((side, 0.0, 0.0), True), ((side, side, 0.0), False)):
+        observer = _at(0.0)
+        rule = ReleaseRule(MACHINE, observer)
+        assert not rule(0.0, np.array([90e-6, 0.0, 0.0]), COVARIANCE)
+        observer.add(_pose(late))
+        assert rule(late, np.array(error), COVARIANCE) is expected
+    assert predicted_frames(MACHINE, (40e-6, 40e-6, 0.0)) == predicted_frames(MACHINE, (40e-6 * math.sqrt(2), 0.0, 0.0))
+
+
+def test_an_error_of_an_old_pose_does_not_release() -> None:
+    observer = _at(0.0)
+    rule = ReleaseRule(MACHINE, observer)
+    small = np.array([0.5 * MACHINE.tolerance.position, 0.0, 0.0])
+    assert not rule(0.0, small, COVARIANCE)  # the rest of the step response is still too large
+    assert not any(rule(time, small, COVARIANCE) for time in (0.5, 0.6))
+    observer.add(_pose(0.6))
+    assert rule(0.61, small, COVARIANCE)
+
+
+def _pose(exposed: float) -> PoseMeasurement:
+    return PoseMeasurement(exposed, exposed, TARGET, COVARIANCE, 0)
+
+
+def _at(exposed: float) -> LatestPose:
+    observer = LatestPose()
+    observer.add(_pose(exposed))
+    return observer

@@ -102,11 +102,8 @@ def find_ruler_candidates(
     if place.shape != (2,) or not np.all(np.isfinite(place)):
         raise ValueError("placement must be a finite x, y")
     layers = visible_layers(artwork, imaging.registration)
-    rows = [
-        row
-        for row in [*_single_rows(artwork, imaging), *_pair_rows(artwork, imaging)]
-        if np.all((row[0] >= box[0]) & (row[0] <= box[1])) and _is_isolated(layers, row, imaging)
-    ]
+    in_region = [*_single_rows(artwork, box, imaging), *_pair_rows(artwork, box, imaging)]
+    rows = [row for row in in_region if _is_isolated(layers, row, imaging)]
     point = np.array([row[0] for row in rows]).reshape(-1, 2)
     normal = np.array([row[1] for row in rows]).reshape(-1, 2)
     pair = np.array([row[2] > 0 for row in rows], dtype=np.bool_)
@@ -148,22 +145,22 @@ def pixel_hint(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike
 _Row = tuple[Float64, Float64, float, bool, int]
 
 
-def _single_rows(artwork: Artwork, imaging: Imaging) -> list[_Row]:
-    """Return rulers across single edges: point, normal, spacing, whether bare, source."""
+def _single_rows(artwork: Artwork, box: Float64, imaging: Imaging) -> list[_Row]:
+    """Return rulers across single edges in a region (2, 2): point, normal, spacing, whether bare, source."""
     edges = artwork.edges
     rows: list[_Row] = []
-    for index in range(len(edges.width)):
+    for index in np.flatnonzero(_touches(artwork, box)).tolist():
         source = int(edges.trace[index]) if edges.trace[index] >= 0 else -1 - index
-        for point in _ruler_centres(edges.start[index], edges.end[index], imaging):
+        for point in _inside(_ruler_centres(edges.start[index], edges.end[index], imaging), box):
             rows.append((point, edges.normal[index], 0.0, bool(edges.bare[index]), source))
     return rows
 
 
-def _pair_rows(artwork: Artwork, imaging: Imaging) -> list[_Row]:
+def _pair_rows(artwork: Artwork, box: Float64, imaging: Imaging) -> list[_Row]:
     """Return rulers across both edges of a trace, where both are visible side by side, and both bare or both masked."""
     edges = artwork.edges
     rows: list[_Row] = []
-    for first in np.flatnonzero(edges.trace >= 0):
+    for first in np.flatnonzero((edges.trace >= 0) & _touches(artwork, box, edges.width)):
         normal, origin = edges.normal[first], edges.start[first]
         axis = np.array([-normal[1], normal[0]])
         opposite = (edges.trace == edges.trace[first]) & (edges.normal @ normal < 0) & (edges.bare == edges.bare[first])
@@ -176,9 +173,21 @@ def _pair_rows(artwork: Artwork, imaging: Imaging) -> list[_Row]:
             width = float(edges.width[first])
             middle = origin - normal * (width / 2)
             if high > low:
-                for point in _ruler_centres(middle + low * axis, middle + high * axis, imaging):
+                for point in _inside(_ruler_centres(middle + low * axis, middle + high * axis, imaging), box):
                     rows.append((point, normal, width, bool(edges.bare[first]), int(edges.trace[first])))
     return rows
+
+
+def _touches(artwork: Artwork, box: Float64, margin: npt.ArrayLike = 0.0) -> npt.NDArray[np.bool_]:
+    """Return which edges may have a point in a region (2, 2) that is larger by a margin on all sides [m]."""
+    ends = np.stack([artwork.edges.start, artwork.edges.end])
+    more = np.expand_dims(np.asarray(margin, np.float64), -1)
+    return np.asarray(np.all((ends.max(axis=0) >= box[0] - more) & (ends.min(axis=0) <= box[1] + more), axis=1))
+
+
+def _inside(points: Float64, box: Float64) -> Float64:
+    """Return the points (n, 2) in a region (2, 2)."""
+    return points[np.all((points >= box[0]) & (points <= box[1]), axis=1)]
 
 
 def _ruler_centres(start: Float64, end: Float64, imaging: Imaging) -> Float64:

@@ -59,7 +59,7 @@ def _machine(top: Section, rate: float | None) -> Machine:
     given_rate = loop.number("rate", "Hz", above=0.0)
     gain = loop.number("gain", "", None, above=0.0)
     loop.finish()
-    transfer, stages = (0.0, {}) if delay is None else _delay(delay)
+    transfer, landing, stages = (0.0, 0.0, {}) if delay is None else _delay(delay)
     tolerance, drift = _tolerance(top.section("tolerance")), top.optional_section("drift")
     machine_drift = ThermalDrift() if drift is None else _drift(drift)
     top.finish()
@@ -72,6 +72,7 @@ def _machine(top: Section, rate: float | None) -> Machine:
             rate=given_rate if rate is None else rate,
             transfer=transfer,
             stages=stages,
+            landing=landing,
             gain=gain,
             drift=machine_drift,
         )
@@ -149,11 +150,12 @@ def _fine(table: Section, unit: str) -> FineStage:
     return FineStage(**values)
 
 
-def _delay(table: Section) -> tuple[float, dict[str, float]]:
+def _delay(table: Section) -> tuple[float, float, dict[str, float]]:
     transfer = table.number("transfer", "s", 0.0, at_least=0.0)
+    landing = table.number("landing", "s", 0.0, at_least=0.0)
     stages = {key: table.number(key, "s", 0.0, at_least=0.0) for key in ("vision", "control", "drive")}
     table.finish()
-    return transfer, {name: time for name, time in stages.items() if time}
+    return transfer, landing, {name: time for name, time in stages.items() if time}
 
 
 def _tolerance(table: Section) -> Tolerance:

@@ -75,6 +75,8 @@ class PlacementResult(NamedTuple):
         frames = [each.frames for each in self.placements if each.released]
         theory = [each.predicted_frames + 1 for each in self.placements if each.released]
         lines = [f"{np.sum(released)} of {len(released)} parts placed"]
+        if self.plan.landing is not None:
+            lines.append(f"coarse registration of the first frame: {1e3 * self.machine.landing:.1f} ms")
         if np.any(released):
             measured = np.sqrt(np.mean(self.error[released] ** 2, axis=0))
             lines[0] += f", in {np.mean(frames):.1f} frames (theory: {np.mean(theory):.1f})"
@@ -95,6 +97,8 @@ class PlacementResult(NamedTuple):
             "target": self.plan.target.tolist(),
             "rate": self.machine.rate,
             "features": len(self.plan.features.length) + len(self.plan.features.fiducials.radius),
+            "search_range": self.plan.features.imaging.shift,
+            "landing": None if self.plan.landing is None else self.machine.landing,
             "delay": {
                 "parts": delay.parts,
                 "total": delay.total,
@@ -213,7 +217,8 @@ class _Cell:
         plant = SimulatedPlant(machine.axes, start=target + start)
         self._camera.follow(plant.pose, true)
         self._sensor.reset()
-        placement = place_part(machine, target, plant, self._sensor, SimulatedClock())
+        landing = 0.0 if self._plan.landing is None else machine.landing
+        placement = place_part(machine, target, plant, self._sensor, SimulatedClock(), landing=landing)
         motion = plant.pose(placement.record.time) - target
         error = motion[-1].copy() if placement.released else np.full(3, np.nan)
         return placement, motion, error

@@ -25,7 +25,9 @@ _DENSE_SMOOTHING = 1.0
 _MAX_FIDUCIALS = 40  # number of rulers of the first pass (cost)
 
 
-def select_features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging, budget: float = 60) -> FeatureSet:
+def select_features_in_view(
+    artwork: Artwork, view: BoardView, imaging: Imaging, budget: float = 60, *, with_hint: bool = True
+) -> FeatureSet:
     """Select rulers and fiducials that lie in the image at every board position within ``imaging.shift``.
 
     In a view with thousands of candidates, rulers are taken from five windows of it only: its corners and its centre.
@@ -42,6 +44,9 @@ def select_features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging,
         Image quality and search range.
     budget
         Number of rulers, default 60; fiducials are selected in addition.
+    with_hint
+        Whether an error names a pixel size at which edges have room, default True. The search takes longer than the
+        selection.
 
     Raises
     ------
@@ -54,10 +59,11 @@ def select_features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging,
         imaging = replace(imaging, smoothing_ratio=_DENSE_SMOOTHING)
         rulers, fiducials = _candidates_in_view(artwork, view, imaging, placement)
     if len(rulers.sigma) + len(fiducials.sigma) < _MIN_FEATURES:
+        hint = pixel_hint(artwork, view.bounds, placement, imaging) if with_hint else "see the pixel size"
         raise ValueError(
             f"{len(rulers.sigma)} edges of the {artwork.side} artwork in view have room for a ruler, and "
             f"{len(fiducials.sigma)} round pads can serve as fiducials, expected 3 or more together; check the "
-            "initial pose, the scale and the blur: " + pixel_hint(artwork, view.bounds, placement, imaging)
+            f"initial pose, the scale and the blur: {hint}"
         )
     return select_feature_set(rulers, imaging, artwork.side, fiducials=fiducials, are_free=True, budget=budget)
 

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.cmos_sensor import CmosSensor
+from gpuvision.camera.orthographic import BoardView
 from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.delay import DelayBudget, gain_limit, non_oscillating_gain
 from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform
@@ -69,6 +70,11 @@ class PlacementCamera:
     def edge_blur_px(self) -> float:
         """Standard deviation of the blur of edges [px]: lens and extent of a pixel."""
         return math.hypot(self.blur_px, 1.0 / math.sqrt(12.0))
+
+    def view(self, pose: Float64) -> BoardView:
+        """Return the view of the board from a pose (3,) of the camera, x, y [m], theta [rad]."""
+        x, y, theta = pose.tolist()
+        return BoardView(scale=self.pixel, shape=self.window, pose=(x, y, theta))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,6 +164,9 @@ class Machine:
         Time of the transfer of a frame [s], default 0.
     stages : mapping of str to float
         Time of each stage of processing [s].
+    landing : float
+        Time of a coarse registration [s], 0 or more, default 0. It finds the pose of the first frame where rulers that
+        cover the landing zone have no room; the head rests during this time.
     gain : float, optional
         Fraction of the error that one frame corrects. Default: the largest one without oscillation.
     drift : ThermalDrift
@@ -176,6 +185,7 @@ class Machine:
     rate: float = 1000.0
     transfer: float = 0.0
     stages: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    landing: float = 0.0
     gain: float | None = None
     drift: ThermalDrift = field(default_factory=ThermalDrift)
 
@@ -184,6 +194,7 @@ class Machine:
         if frames != (PIPETTE, CAMERA, "rigid"):
             raise ValueError(f"pipette_in_camera is {frames}, expected a rigid transform from pipette to camera")
         finite(self.rate, "rate", above=0.0)
+        finite(self.landing, "landing", minimum=0.0)
         timing = self.camera.sensor.timing(self.camera.window, exposure=self.camera.exposure)
         if timing.period > 1.0 / self.rate * (1.0 + 1e-9):
             rows, columns = self.camera.window

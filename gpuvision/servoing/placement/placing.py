@@ -97,7 +97,7 @@ class Placement(NamedTuple):
     start_error : numpy.ndarray
         (3,): first measured error [m], [m], [rad]; NaN if no pose was measured.
     predicted_frames : int
-        Frames from the first measured pose to the release by theory.
+        Frames from the first measured pose to the release by theory, and the frames of the coarse registration.
     """
 
     record: LoopRecord
@@ -117,7 +117,9 @@ class Placement(NamedTuple):
         return tuple(measurement for measurement, _ in self.record.measurements)
 
 
-def place_part(machine: Machine, target: npt.ArrayLike, plant: Plant, sensor: PoseSensor, clock: Clock) -> Placement:
+def place_part(
+    machine: Machine, target: npt.ArrayLike, plant: Plant, sensor: PoseSensor, clock: Clock, *, landing: float = 0.0
+) -> Placement:
     """Steer the nozzle from the landing zone to a target and release the part.
 
     Parameters
@@ -132,6 +134,8 @@ def place_part(machine: Machine, target: npt.ArrayLike, plant: Plant, sensor: Po
         Poses of the nozzle on the board, such as `BoardPoseSensor`.
     clock : Clock
         Wall clock or simulated clock, at the start of a frame.
+    landing : float
+        Time of the coarse registration of the first frame [s], default 0: without one.
 
     Returns
     -------
@@ -143,7 +147,7 @@ def place_part(machine: Machine, target: npt.ArrayLike, plant: Plant, sensor: Po
     goal = np.asarray(target, np.float64)
     observer = LatestPose()
     observer.reset(-math.inf, goal, np.full((3, 3), math.inf))
-    blind = machine.delay.latency + machine.tolerance.max_refused * machine.period
+    blind = landing + machine.delay.latency + machine.tolerance.max_refused * machine.period
     loop = ServoLoop(
         plant,
         sensor,
@@ -156,5 +160,6 @@ def place_part(machine: Machine, target: npt.ArrayLike, plant: Plant, sensor: Po
     rule = ReleaseRule(machine, observer)
     record = loop.run(goal, machine.tolerance.max_time, settling=rule)
     released = record.outcome is Outcome.ARRIVED
+    waited = math.ceil(landing * machine.rate - 1e-9)
     start = np.full(3, math.nan) if rule.start is None else rule.start
-    return Placement(record, released, "" if released else record.outcome.value, start, rule.frames)
+    return Placement(record, released, "" if released else record.outcome.value, start, waited + rule.frames)

@@ -8,7 +8,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -20,14 +20,19 @@ from gpuvision.matching.board.view_features import select_features_in_view
 from gpuvision.matching.features.exposure import sensor_imaging
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.imaging import Imaging
+from gpuvision.matching.pose.registration import CoarseRegistration, prepare_board_registration
+from gpuvision.matching.pose.pose import SolvePose
 from gpuvision.servoing.frames import compose_poses, invert_pose, move_covariance
 from gpuvision.servoing.placement.machine import Machine
+from gpuvision.servoing.placement.refusal import explain_refusal
 from gpuvision.validation import numbers
 
 Float64 = npt.NDArray[np.float64]
 
 # Least height of an edge that counts, as a fraction of the step of copper under the mask (chosen: half of it).
 _THRESHOLD = 0.5
+# Largest distance of an edge from the coarse pose [px]: the default of `CoarseRegistration`.
+_TOLERANCE_PX = 1.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,7 +46,10 @@ class PlacementPlan:
     camera_pose : numpy.ndarray
         (3,): pose of the camera over the board at the release, as `BoardView.pose`.
     features : FeatureSet
-        Rulers and fiducials in view.
+        Rulers and fiducials in view. Their search range is the landing zone, or with ``landing`` the motion between
+        two frames.
+    landing : CoarseRegistration or None
+        Search for the pose of the first frame; None: the features find it.
     threshold, noise : float
         Least height of an edge, and standard deviation of a pixel [grey levels].
     vision : numpy.ndarray
@@ -56,6 +64,7 @@ class PlacementPlan:
     target: Float64
     camera_pose: Float64
     features: FeatureSet
+    landing: CoarseRegistration | None
     threshold: float
     noise: float
     vision: Float64
@@ -93,25 +102,36 @@ def plan_placement(
     Raises
     ------
     ValueError
-        The side is the bottom, or the camera sees too few edges at the target.
+        The side is the bottom, or the camera sees too few edges at the target. The message names the nearest targets
+        and the window that work, where there are any.
+
+    Notes
+    -----
+    Rulers whose search range is the landing zone need no landing stage. Where they have no room, or give a pose that
+    is worse than the tolerance (3 standard deviations of a frame), a coarse registration finds the pose of the first
+    frame and rulers with a search range of `tracking_imaging` follow it.
     """
     if artwork.side != "top":
         raise ValueError("the artwork is that of the bottom side; the camera frame is defined for the top side")
     place = np.array(numbers(target, (3,), "target"))
     calibrated = machine.pipette_in_camera.pose
     camera_pose = compose_poses(place, invert_pose(calibrated))
-    view = BoardView(scale=machine.camera.pixel, shape=machine.camera.window, pose=tuple(camera_pose.tolist()))
-    features = select_features_in_view(artwork, view, placement_imaging(machine, reflectance), budget)
-    noise, etch_bias = _split_covariance(features)
     sensor, board = machine.camera.sensor, reflectance or BoardReflectance()
     white = machine.camera.white_electrons
     step = abs(board.copper_masked - board.laminate_masked) * white * sensor.gain
+    guidance = _Guidance(artwork, machine, board, budget, _THRESHOLD * step)
+    try:
+        features, landing = guidance.at(camera_pose)
+    except ValueError as error:
+        raise ValueError(explain_refusal(str(error), artwork, place, camera_pose, machine, guidance.works)) from error
+    noise, etch_bias = _split_covariance(features)
     bright = max(board.copper_masked, board.laminate_masked) * white
     total, temporal = (float(sensor.noise(bright, machine.camera.exposure, spatial=each)) for each in (True, False))
     return PlacementPlan(
         target=place,
         camera_pose=camera_pose,
         features=features,
+        landing=landing,
         threshold=_THRESHOLD * step,
         noise=total * sensor.gain,
         vision=move_covariance(noise, camera_pose, calibrated),
@@ -135,12 +155,116 @@ def placement_imaging(machine: Machine, reflectance: BoardReflectance | None = N
     )
 
 
+def tracking_imaging(machine: Machine, reflectance: BoardReflectance | None = None) -> Imaging:
+    """Return image quality and search range of the frames after the landing.
+
+    The rulers of a frame are placed at the pose of the last frame. The head moves by the gain times the error at most
+    between them; the error is that of the landing zone, at the camera. The tolerance of the coarse registration is
+    added.
+    """
+    wide, tolerance = placement_imaging(machine, reflectance), machine.tolerance
+    shift = machine.loop_gain * landing_range(machine) + _TOLERANCE_PX * machine.camera.pixel
+    angle = machine.loop_gain * tolerance.landing_angle + _TOLERANCE_PX / (min(machine.camera.window) / 2.0)
+    return replace(wide, shift=min(shift, wide.shift), angle=min(angle, wide.angle))
+
+
+def landing_range(machine: Machine) -> float:
+    """Return the largest offset of the camera along x and along y [m] with the nozzle in the landing zone."""
+    away = float(np.hypot(*machine.pipette_in_camera.pose[:2]))
+    return machine.tolerance.landing_zone + machine.tolerance.landing_angle * away
+
+
+@dataclass(frozen=True)
+class _Guidance:
+    """Selection of the features and of the landing that guide a placement on a board."""
+
+    artwork: Artwork
+    machine: Machine
+    reflectance: BoardReflectance
+    budget: float
+    threshold: float
+
+    def at(self, camera_pose: Float64) -> tuple[FeatureSet, CoarseRegistration | None]:
+        """Return the features at a pose (3,) of the camera at the release, and the search for the first pose."""
+        view, machine = self.machine.camera.view(camera_pose), self.machine
+        try:
+            wide = self._select(view, placement_imaging(machine, self.reflectance))
+        except ValueError:
+            wide = None
+        if wide is not None and _is_precise(wide, camera_pose, machine):
+            return wide, None
+        try:
+            return self._near(view)
+        except ValueError:
+            if wide is None:
+                raise
+            return wide, None
+
+    def _near(self, view: BoardView) -> tuple[FeatureSet, CoarseRegistration]:
+        """Return features that follow the head from frame to frame, and the search for the first pose."""
+        machine = self.machine
+        features = self._select(view, tracking_imaging(machine, self.reflectance))
+        landing = prepare_board_registration(
+            self.artwork,
+            view.matrix,
+            view.shape,
+            shift=landing_range(machine),
+            angle=machine.tolerance.landing_angle,
+            blur_px=machine.camera.edge_blur_px,
+            threshold=self.threshold,
+            tolerance_px=_TOLERANCE_PX,
+        )
+        if len(landing.rulers.point) < landing.limits.min_rulers:
+            raise ValueError(f"{len(landing.rulers.point)} places on edges have room for the coarse registration")
+        return features, landing
+
+    def works(self, camera_pose: Float64, machine: Machine) -> bool:
+        """Return whether features guide a machine at a pose (3,) of its camera."""
+        try:
+            replace(self, machine=machine)._near(machine.camera.view(camera_pose))
+        except ValueError:
+            return False
+        return True
+
+    def _select(self, view: BoardView, imaging: Imaging) -> FeatureSet:
+        features = select_features_in_view(self.artwork, view, imaging, self.budget, with_hint=False)
+        if _largest_leverage(features) > SolvePose.max_leverage:
+            raise ValueError("a direction of the pose depends on one edge only, which no other edge checks")
+        if features.condition > SolvePose.max_condition:
+            raise ValueError("the edges determine a direction of the pose only but for the etch bias, or hardly")
+        return features
+
+
+def _is_precise(features: FeatureSet, camera_pose: Float64, machine: Machine) -> bool:
+    """Return whether three standard deviations of the nozzle by the noise of a frame are within the tolerance."""
+    noise, _ = _split_covariance(features)
+    moved = move_covariance(noise, camera_pose, machine.pipette_in_camera.pose)
+    limit = np.array([machine.tolerance.position] * 2 + [machine.tolerance.angle])
+    return bool(np.all(3.0 * np.sqrt(np.diag(moved)) <= limit))
+
+
 def _split_covariance(features: FeatureSet) -> tuple[Float64, Float64]:
     """Return the covariances (3, 3) of the pose by the noise of the features and by the etch bias.
 
     The pose and the etch bias e are estimated together, with the prior of e: the error of the estimate is
     ``C R' W noise - C P e`` with the information ``R' W R``, the prior P, and ``C = (R' W R + P)^-1``.
     """
+    rows, prior = _weighted_rows(features)
+    information = rows.T @ rows
+    covariance = np.linalg.inv(information + prior)
+    noise, common = (covariance @ each @ covariance for each in (information, prior))
+    return noise[:3, :3], common[:3, :3]
+
+
+def _largest_leverage(features: FeatureSet) -> float:
+    """Return the largest leverage of a row, as `BoardPose.leverage`: 1 where an unknown depends on this row alone."""
+    rows, prior = _weighted_rows(features)
+    covariance = np.linalg.inv(rows.T @ rows + prior)
+    return float(np.max(np.einsum("ij,jk,ik->i", rows, covariance, rows)))
+
+
+def _weighted_rows(features: FeatureSet) -> tuple[Float64, Float64]:
+    """Return the rows (n, 4) of x, y, theta and the etch bias over their sigmas, and the prior (4, 4)."""
     marks = features.fiducials
     x, y = np.concatenate([features.point, marks.point, marks.point]).T - features.placement[:, None]
     along = np.tile([1.0, 0.0], (len(marks.sigma), 1))
@@ -148,9 +272,6 @@ def _split_covariance(features: FeatureSet) -> tuple[Float64, Float64]:
     single = np.concatenate([np.where(features.spacing > 0.0, 0.0, 1.0), np.zeros(2 * len(marks.sigma))])
     sigma = np.concatenate([features.sigma, marks.sigma, marks.sigma])
     lever = normal[:, 1] * x - normal[:, 0] * y
-    rows = np.column_stack([normal, lever, single]) / sigma[:, None]
-    information, prior = rows.T @ rows, np.zeros((4, 4))
+    prior = np.zeros((4, 4))
     prior[3, 3] = 1.0 / max(features.imaging.etch_bias_sigma, 1e-9) ** 2
-    covariance = np.linalg.inv(information + prior)
-    noise, common = (covariance @ each @ covariance for each in (information, prior))
-    return noise[:3, :3], common[:3, :3]
+    return np.column_stack([normal, lever, single]) / sigma[:, None], prior

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device, to_numpy
+from gpuvision.matching.board.edge_measurement import move_view
 from gpuvision.servoing.frames import compose_poses, invert_pose, move_covariance
 from gpuvision.servoing.observer import PoseMeasurement
 from gpuvision.servoing.placement.machine import Machine
@@ -142,8 +144,9 @@ class BoardPoseSensor:
 
     Notes
     -----
-    The rulers of a frame are placed at the pose of the last frame that was measured, at first at the target. The
-    covariance of a measurement is that of the vision; the error of the calibration is common to all frames.
+    The rulers of a frame are placed at the pose of the last frame that was measured, at first at the target. A plan
+    with a ``landing`` registers the first frame instead: frames that arrive within `Machine.landing` after it are not
+    measured, and a refused registration is repeated. The covariance of a measurement is that of the vision; the error of the calibration is common to all frames.
     """
 
     def __init__(
@@ -155,7 +158,8 @@ class BoardPoseSensor:
         *,
         device: Device | None = None,
     ) -> None:
-        self.camera, self._plan = camera, plan
+        self.camera, self._plan, self._device = camera, plan, device
+        self._view, self._landing_time = machine.camera.view(plan.camera_pose), machine.landing
         self._calibrated = machine.pipette_in_camera.pose
         self._bound = plan.features.bind(
             device, machine.camera.window, dtype, copper="bright", threshold=plan.threshold, noise=plan.noise
@@ -165,10 +169,25 @@ class BoardPoseSensor:
     def reset(self) -> None:
         """Place the rulers at the target again."""
         self._predicted = self._plan.camera_pose.copy()
+        self._has_landed, self._ready = self._plan.landing is None, -math.inf
 
     def __call__(self, time: float) -> list[PoseMeasurement]:
         """Return the measurements that arrived since the last call, up to a time [s]."""
-        return [self._measure(frame) for frame in self.camera(time)]
+        frames = (frame for frame in self.camera(time) if frame.arrived >= self._ready - _SAME_TIME)
+        found = [self._measure(frame) if self._has_landed else self._land(frame) for frame in frames]
+        return [each for each in found if each is not None]
+
+    def _land(self, frame: Frame) -> PoseMeasurement | None:
+        """Register a frame coarsely; return a measurement only where the pose is refused."""
+        assert self._plan.landing is not None
+        found = self._plan.landing(frame.image, device=self._device)
+        self._ready = frame.arrived + self._landing_time
+        self._has_landed = found.status == 0
+        if self._has_landed:
+            self._predicted = np.array(move_view(self._view, found.pose).pose)
+            return None
+        nothing = np.full((3, 3), np.nan)
+        return PoseMeasurement(frame.exposed, frame.arrived, nothing[0], nothing, int(found.status))
 
     def _measure(self, frame: Frame) -> PoseMeasurement:
         found = self._bound(frame.image, self._predicted)

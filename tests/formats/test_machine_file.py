@@ -31,7 +31,7 @@ def test_the_machine_of_the_package_is_what_its_file_says() -> None:
     machine = read_machine("look_while_place")
     assert MACHINES == ("look_while_place",)
     assert machine.rate == PRESET["loop"]["rate"]
-    assert machine.camera.window == (256, 256)
+    assert machine.camera.window == (512, 512)
     assert machine.camera.sensor.columns == 1024
     assert machine.pipette_in_camera.pose.tolist() == PRESET["calibration"]["pipette"]
     np.testing.assert_allclose(machine.pipette_in_camera.pose_covariance[0, 0], 1.6e-13)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import tomllib
 from importlib import resources
 from pathlib import Path
@@ -80,6 +81,44 @@ def test_parts_land_where_and_when_the_prediction_says(artwork: Artwork, machine
     assert report["delay"]["frames"] == machine.delay.frames
     assert len(report["placements"]) == 6
     assert "6 of 6 parts placed" in result.summary()
+
+
+def test_narrow_pads_are_landed_by_registration_and_tracked_by_short_rulers(tmp_path: Path, device: Device) -> None:
+    """Edges of 0.34 mm have no room for rulers that cover a landing zone of 0.1 mm, but for the motion of a frame."""
+    pads = [(8.6 + 0.5 * column, 7.5 + row) for column in range(6) for row in range(2)]
+    head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
+    flashes = "".join(f"X{round(1e6 * x)}Y{round(1e6 * y)}D03*\n" for x, y in pads)
+    (tmp_path / "copper.gbr").write_text(f"{head}%ADD10R,0.34X0.34*%\nD10*\n{flashes}M02*\n")
+    border = "X0Y0D02*\nX20000000Y0D01*\nX20000000Y16000000D01*\nX0Y16000000D01*\nX0Y0D01*\n"
+    (tmp_path / "outline.gbr").write_text(f"{head}%ADD10C,0.1*%\nD10*\n{border}M02*\n")
+    machine = read_machine("look_while_place")
+    layers = {name: LAYERS[name] for name in ("copper.gbr", "outline.gbr")}
+    board = read_artwork(tmp_path, layers=layers, clearance=edge_clearance(placement_imaging(machine)))
+    target = (9.85e-3 + 1.0e-3, 8.0e-3 + 0.5e-3, 0.0)
+    result = simulate_placements(board, target, machine, count=3, device=device)
+    assert result.plan.landing is not None
+    # 0.1 mm and the lever of the camera times the gain of 0.2 to 0.26, and a pixel.
+    assert 30e-6 < result.plan.features.imaging.shift < 38e-6
+    assert max(np.abs(motion[0, :2]).max() for motion in result.motion) > 40e-6
+    for placement in result.placements:
+        assert placement.released
+        assert 21 <= placement.predicted_frames + 1 <= placement.frames <= placement.predicted_frames + 3
+        # The head rests while the first frame is registered: 20 ms.
+        assert min(each.arrived for each in placement.measurements) == pytest.approx(20e-3)
+    assert np.all(np.abs(result.sources["vision and servo"][:, :2]) < 2e-6)
+    assert result.report()["landing"] == 20e-3
+
+
+def test_a_refused_target_names_where_the_camera_looks_and_a_target_that_works(
+    artwork: Artwork, machine: Machine
+) -> None:
+    with pytest.raises(ValueError, match=r"2\.56 x 2\.56 mm is centred at") as refused:
+        plan_placement(artwork, (1e-3, 1e-3, 0.0), machine)
+    near = re.search(r"in view is \(([-.\d]+), ([-.\d]+)\) mm", str(refused.value))
+    assert near is not None
+    x, y = (1e-3 * float(each) for each in near.groups())
+    plan = plan_placement(artwork, (x, y, 0.0), machine)
+    assert len(plan.features.length) >= 3
 
 
 def test_the_command_writes_report_and_pictures(

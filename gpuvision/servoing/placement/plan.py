@@ -20,8 +20,8 @@ from gpuvision.matching.board.view_features import select_features_in_view
 from gpuvision.matching.features.exposure import sensor_imaging
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.imaging import Imaging
-from gpuvision.matching.pose.registration import CoarseRegistration, prepare_board_registration
 from gpuvision.matching.pose.pose import SolvePose
+from gpuvision.matching.pose.registration import CoarseRegistration, prepare_board_registration
 from gpuvision.servoing.frames import compose_poses, invert_pose, move_covariance
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.refusal import explain_refusal

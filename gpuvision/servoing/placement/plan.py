@@ -119,7 +119,9 @@ def plan_placement(
     sensor, board = machine.camera.sensor, reflectance or BoardReflectance()
     white = machine.camera.white_electrons
     step = abs(board.copper_masked - board.laminate_masked) * white * sensor.gain
-    guidance = _Guidance(artwork, machine, board, budget, _THRESHOLD * step)
+    guidance = _Guidance(
+        artwork=artwork, machine=machine, reflectance=board, budget=budget, threshold=_THRESHOLD * step
+    )
     try:
         features, landing = guidance.at(camera_pose)
     except ValueError as error:
@@ -174,7 +176,7 @@ def landing_range(machine: Machine) -> float:
     return machine.tolerance.landing_zone + machine.tolerance.landing_angle * away
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Guidance:
     """Selection of the features and of the landing that guide a placement on a board."""
 

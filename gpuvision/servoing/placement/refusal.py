@@ -67,7 +67,7 @@ def _nearest_target(
             return None
         first = np.array([*points[0], camera_pose[2]])
         if works(first, machine):
-            return target + first - camera_pose
+            return np.asarray(target + first - camera_pose)
         points = points[np.linalg.norm(points - points[0], axis=1) > apart]
     return None
 

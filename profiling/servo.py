@@ -5,8 +5,10 @@ the camera as commanded. This process waits for a frame, measures 60 calipers (r
 predicted pose (`FeatureSet.bind`), updates the observer, computes the command, and writes it. The time of a frame runs
 from its publication until its command. A frame is missed if a newer frame was published before it was taken.
 
-``python -m gpuvision.profiling.servo`` runs the loop alone: ``--seconds 60 --rate 1000 --device pocl``. ``gpuvision
-profile servo`` also compares the vision with Numba and NumPy (`gpuvision.profiling.feature_pose`).
+``python -m gpuvision.profiling.servo`` runs the loop alone: ``--seconds 60 --rate 1000 --device pocl``; with
+``--highest`` it searches the highest rate that the loop sustains, with ``--quick`` by runs of half a second.
+``gpuvision profile servo`` does both for a short time, and compares the vision with Numba and NumPy
+(`gpuvision.profiling.feature_pose`).
 """
 
 from __future__ import annotations
@@ -17,11 +19,11 @@ import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +48,32 @@ _PAD, _PITCH = 0.3e-3, 0.55e-3  # m
 _BORDER = 14  # distance of the rulers' centres from the border of the frame [px]: half their length, and motion
 _SLOTS = 4  # frames in shared memory
 _CASE_SECONDS, _CASE_RATE = 3.0, 1000.0
+_TRIAL_SECONDS, _QUICK_SECONDS = 1.0, 0.5  # of a run in the search for the highest rate: in a case, and by --quick
+_SETTLING_FRAMES = 20  # frames after a change of the rate that do not count
+_LEAST_RATE, _MOST_RATE = 31.25, 32000.0  # limits of the search [1/s]
+_BISECTIONS = 5  # the highest rate is found to a factor of 2^(1/32), 2 %
+_ATTEMPTS = 2  # runs at a rate before it counts as not sustained: another process may have interrupted the first one
+_DELIVERED = 0.98  # part of the wanted rate that the camera must publish
 _READY_S = 120.0  # longest start of the other process: it compiles the renderer
+
+
+Limit = Literal["loop", "camera", "search"]
+"""Reason why a rate is the highest one: the loop, the process that renders, or the range of the search."""
+
+
+class HighestRate(NamedTuple):
+    """Highest rate that a loop sustained.
+
+    Attributes
+    ----------
+    rate : float
+        Rate [1/s]; 0 if the least one was not sustained.
+    limit : {"loop", "camera", "search"}
+        Reason why a higher rate was not sustained. With "camera" the loop alone may sustain more.
+    """
+
+    rate: float
+    limit: Limit
 
 
 @dataclass(frozen=True)
@@ -63,12 +90,25 @@ class LoopTimes:
         Frames whose pose was refused.
     error : (3,)
         Distance of the last true pose from the target [m, m, rad].
+    rate : float
+        Rate at which the camera published the frames [1/s].
     """
 
     latencies: NDArray[np.float64]
     missed: int
     refused: int
     error: NDArray[np.float64]
+    rate: float
+
+    def failure(self, rate: float) -> Limit | None:
+        """Return the reason why the loop does not sustain a wanted rate [1/s], or None if it does.
+
+        The loop sustains it if it missed no frame and its 99th percentile is at most the period. Otherwise "loop", or
+        "camera" if the other process did not render as fast.
+        """
+        if self.rate < _DELIVERED * rate:
+            return "camera"
+        return "loop" if self.missed or self.summary["p99_us"] > 1e6 / rate else None
 
     @property
     def summary(self) -> dict[str, float]:
@@ -104,30 +144,31 @@ class _Shared:
     """Memory of both processes: header, commanded velocity, true pose, times, and the ring of frames."""
 
     def __init__(self, size: int, name: str | None = None) -> None:
-        numbers = 8 * (4 + 3 + 3 + _SLOTS)
+        numbers = 8 * (4 + 3 + 3 + _SLOTS + 1)
         self.memory = SharedMemory(name=name, create=name is None, size=numbers + _SLOTS * size * size)
         buffer = self.memory.buf
         self.header: Any = np.ndarray(4, np.int64, buffer)  # number of the newest frame, ready, run, stop
         self.velocity: Any = np.ndarray(3, np.float64, buffer, 32)
         self.pose: Any = np.ndarray(3, np.float64, buffer, 56)
         self.times: Any = np.ndarray(_SLOTS, np.int64, buffer, 80)
+        self.step: Any = np.ndarray(1, np.float64, buffer, numbers - 8)  # time between two frames [s]
         self.frames: Any = np.ndarray((_SLOTS, size, size), np.uint8, buffer, numbers)
 
     def close(self) -> None:
         """Release the memory; views of it must be gone."""
-        self.header = self.velocity = self.pose = self.times = self.frames = None
+        self.header = self.velocity = self.pose = self.times = self.step = self.frames = None
         self.memory.close()
 
 
-def _render(name: str, size: int, rate: float, label: str) -> None:
-    """Render frames at a rate and move the camera as commanded, until told to stop; runs in another process."""
+def _render(name: str, size: int, label: str) -> None:
+    """Render frames at the wanted rate and move the camera as commanded, until the stop; runs in another process."""
     shared, device = _Shared(size, name), Device.named(label)
     box = (tuple(TARGET[:2] - 2e-3), tuple(TARGET[:2] + 2e-3))
     values = ReflectanceMap.of(board(), pixel=PIXEL, region=box)
     operation = RenderBoard(board=values, shape=(size, size), sensor=read_cmos_sensor("pb1024"))
     queue = device.new_queue(inline=device.has_inline_queues)
     bound = operation.bind(device, (1, 1, 3), np.float64, queue=queue)
-    pose, step = TARGET + _START, 1.0 / rate
+    pose = TARGET + _START
     outputs: Any = bound.outputs
     poses, numbers, image = (host_view(each) for each in (*bound.inputs, outputs.image))
     shared.header[0], shared.header[1] = -1, 1
@@ -135,7 +176,7 @@ def _render(name: str, size: int, rate: float, label: str) -> None:
         time.sleep(1e-3)
     due, number = time.perf_counter_ns(), 0
     while not shared.header[3]:
-        poses[0, 0], numbers[0] = pose, number
+        poses[0, 0], numbers[0], step = pose, number, float(shared.step[0])
         bound.run()
         while time.perf_counter_ns() < due:
             os.sched_yield()
@@ -151,10 +192,10 @@ def _render(name: str, size: int, rate: float, label: str) -> None:
 
 
 @contextlib.contextmanager
-def _camera(size: int, rate: float, device: Device) -> Iterator[_Shared]:
+def _camera(size: int, device: Device) -> Iterator[_Shared]:
     """Start the process that renders, and end it."""
     shared = _Shared(size)
-    arguments = (shared.memory.name, size, rate, device.label)
+    arguments = (shared.memory.name, size, device.label)
     process = multiprocessing.get_context("spawn").Process(target=_render, args=arguments, daemon=True)
     process.start()
     try:
@@ -172,61 +213,158 @@ def _camera(size: int, rate: float, device: Device) -> Iterator[_Shared]:
         memory.unlink()
 
 
-def run_loop(device: Device, size: int, *, rate: float, seconds: float) -> LoopTimes:
-    """Run the loop at a frame rate [1/s] for some seconds and return its times."""
-    features = features_of(board(), size)
-    bound = features.bind(
-        device, (size, size), np.uint8, copper="bright", threshold=20.0, noise=2.0, etch_bias_sigma=0.0
-    )
-    # A random walk with the largest step of a frame, 3 um and 0.3 mrad: missed frames do not spoil the prediction.
-    model = MotionModel(lag=(0.0, 0.0, 0.0), position_noise=(9e-12 * rate, 9e-12 * rate, 9e-8 * rate))
-    observer, still = PoseObserver(model), np.zeros(3)
-    latencies, refused, taken, missed = np.empty(round(rate * seconds)), 0, -1, 0
-    with _camera(size, rate, device) as camera:
+class _Loop:
+    """Loop over the frames of a camera, at one rate after another."""
+
+    def __init__(self, device: Device, size: int, camera: _Shared) -> None:
+        self.camera, self.taken, self.pose = camera, -1, TARGET + _START
+        self.bound = features_of(board(), size).bind(
+            device, (size, size), np.uint8, copper="bright", threshold=20.0, noise=2.0, etch_bias_sigma=0.0
+        )
+
+    def run(self, rate: float, seconds: float, *, settling: int = 0) -> LoopTimes:
+        """Run at a rate [1/s] for some seconds and return the times, without those of the first settling frames."""
+        camera, still = self.camera, np.zeros(3)
+        # A random walk with the largest step of a frame, 3 um and 0.3 mrad: missed frames do not spoil the prediction.
+        model = MotionModel(lag=(0.0, 0.0, 0.0), position_noise=(9e-12 * rate, 9e-12 * rate, 9e-8 * rate))
+        observer = PoseObserver(model)
         now = 1e-9 * time.perf_counter_ns()  # time of the last command [s]
-        observer.reset(now, TARGET + _START, np.diag((1e-10, 1e-10, 1e-6)))
-        camera.header[2] = 1
+        observer.reset(now, self.pose, np.diag((1e-10, 1e-10, 1e-6)))
+        camera.step[0], camera.header[2] = 1.0 / rate, 1
+        latencies, published = np.empty(round(rate * seconds) + settling), np.empty(2, np.int64)
+        refused = missed = begun = 0
         for number in range(len(latencies)):
-            while camera.header[0] == taken:
+            while camera.header[0] == self.taken:
                 os.sched_yield()
             newest = int(camera.header[0])
-            missed += newest - taken - 1
-            taken, slot = newest, newest % _SLOTS
-            published = int(camera.times[slot])
-            exposed = 1e-9 * published
-            found = bound(camera.frames[slot], observer.estimate(max(exposed, now)).pose)
+            skipped, self.taken, slot = newest - self.taken - 1, newest, newest % _SLOTS
+            if number == settling:
+                published[0], begun = camera.times[slot], newest
+            missed += skipped if number >= settling else 0
+            published[1] = camera.times[slot]
+            exposed = 1e-9 * int(published[1])
+            found = self.bound(camera.frames[slot], observer.estimate(max(exposed, now)).pose)
             now = 1e-9 * time.perf_counter_ns()
             status = int(to_numpy(found.status))
             refused += status != 0
             measured = (np.array(found.pose, np.float64), np.array(found.covariance, np.float64))
             observer.add(PoseMeasurement(exposed, now, *measured, status))
-            velocity = _GAIN * rate * (TARGET - observer.estimate(now).pose)
+            self.pose = observer.estimate(now).pose
+            velocity = _GAIN * rate * (TARGET - self.pose)
             observer.command(now, still)
             camera.velocity[:] = velocity if status == 0 else still
-            latencies[number] = 1e-3 * (time.perf_counter_ns() - published)
-        error = camera.pose - TARGET
-    return LoopTimes(latencies, missed, refused, error)
+            latencies[number] = 1e-3 * (time.perf_counter_ns() - int(published[1]))
+        delivered = (newest - begun) / max(1e-9 * int(published[1] - published[0]), 1e-9)
+        return LoopTimes(latencies[settling:], missed, refused, camera.pose - TARGET, delivered)
+
+    def highest_rate(self, start: float, seconds: float) -> HighestRate:
+        """Search the highest sustained rate by runs of some seconds, from a rate on [1/s]."""
+
+        def failure(rate: float) -> Limit | None:
+            runs = (self.run(rate, seconds, settling=_SETTLING_FRAMES).failure(rate) for _ in range(_ATTEMPTS))
+            reasons: list[Limit] = []
+            for reason in runs:
+                if reason is None:
+                    return None
+                reasons.append(reason)
+            return reasons[-1]
+
+        return search_highest(failure, start)
+
+
+def search_highest(failure: Callable[[float], Limit | None], start: float) -> HighestRate:
+    """Search the highest sustained rate by doubling or halving, then by bisection of the logarithm.
+
+    Parameters
+    ----------
+    failure : function
+        Returns the reason why a rate [1/s] is not sustained, or None.
+    start : float
+        First rate [1/s].
+    """
+    low, high, limit = 0.0, 0.0, failure(start)
+    if limit is None:
+        low, high, limit = start, 2.0 * start, "search"
+        while high <= _MOST_RATE and (reason := failure(high)) is None:
+            low, high = high, 2.0 * high
+        if high > _MOST_RATE:
+            return HighestRate(low, "search")
+        limit = reason or limit
+    else:
+        low, high = 0.5 * start, start
+        while low >= _LEAST_RATE and (reason := failure(low)) is not None:
+            low, high, limit = 0.5 * low, low, reason
+        if low < _LEAST_RATE:
+            return HighestRate(0.0, limit)
+    for _ in range(_BISECTIONS):
+        middle = (low * high) ** 0.5
+        reason = failure(middle)
+        if reason is None:
+            low = middle
+        else:
+            high, limit = middle, reason
+    return HighestRate(low, limit)
+
+
+@contextlib.contextmanager
+def _loop(device: Device, size: int) -> Iterator[_Loop]:
+    with _camera(size, device) as camera:
+        yield _Loop(device, size, camera)
+
+
+def run_loop(device: Device, size: int, *, rate: float, seconds: float) -> LoopTimes:
+    """Run the loop at a frame rate [1/s] for some seconds and return its times."""
+    with _loop(device, size) as loop:
+        return loop.run(rate, seconds)
+
+
+def highest_rate(device: Device, size: int, *, seconds: float, start: float = _CASE_RATE) -> HighestRate:
+    """Search the highest rate at which the loop misses no frame and its 99th percentile is within the period.
+
+    Parameters
+    ----------
+    device : Device
+        Device of both processes.
+    size : int
+        Rows and columns of a frame [px].
+    seconds : float
+        Time of each of about 8 runs [s].
+    start : float
+        First rate [1/s].
+    """
+    with _loop(device, size) as loop:
+        return loop.highest_rate(start, seconds)
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield the vision alone with its peers; with the metadata of a short loop at 1 kHz for each size."""
+    """Yield the vision alone with its peers; the metadata is of a loop at 1 kHz, and of its highest rate."""
     for case in feature_pose.cases(device):
-        loop = run_loop(device, int(case.name), rate=_CASE_RATE, seconds=_CASE_SECONDS)
-        times = {f"loop_{name}": value for name, value in loop.summary.items()}
-        yield Case(case.operation, case.name, case.ours, case.peers, case.error, metadata={**case.metadata, **times})
+        with _loop(device, int(case.name)) as loop:
+            times = {f"loop_{name}": value for name, value in loop.run(_CASE_RATE, _CASE_SECONDS).summary.items()}
+            highest = loop.highest_rate(_CASE_RATE, _TRIAL_SECONDS)
+        rates = {"loop_highest_hz": highest.rate, "loop_highest_limit": highest.limit}
+        metadata = {**case.metadata, **times, **rates}
+        yield Case(case.operation, case.name, case.ours, case.peers, case.error, metadata=metadata)
 
 
 def main() -> None:
     """Run the loop alone and print its times."""
     parser = argparse.ArgumentParser(description="Servo loop in wall-clock time, with the camera in another process")
     parser.add_argument("--device", default=None, help="label of the device; default: the best one")
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--rate", type=float, default=1000.0, help="frames per second")
+    parser.add_argument("--seconds", type=float, default=None, help="time of a run; default: 60, with --highest 5")
+    parser.add_argument("--rate", type=float, default=_CASE_RATE, help="frames per second; of --highest the first")
     parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES), help="rows and columns [px]")
+    parser.add_argument("--highest", action="store_true", help="search the highest rate that the loop sustains")
+    parser.add_argument("--quick", action="store_true", help="runs of half a second")
     options = parser.parse_args()
     device = Device.best() if options.device is None else Device.named(options.device)
+    seconds = options.seconds or (_QUICK_SECONDS if options.quick else 5.0 if options.highest else 60.0)
     for size in options.sizes:
-        loop = run_loop(device, size, rate=options.rate, seconds=options.seconds)
+        if options.highest:
+            highest = highest_rate(device, size, seconds=seconds, start=options.rate)
+            print(size, f"highest rate {highest.rate:.0f} Hz, limited by the {highest.limit}")
+            continue
+        loop = run_loop(device, size, rate=options.rate, seconds=seconds)
         error = ", ".join(f"{each:+.2e}" for each in loop.error)
         print(size, {name: round(value, 1) for name, value in loop.summary.items()}, f"error {error}")
 

@@ -13,7 +13,7 @@ from gpuvision.profiling import feature_pose, servo
 
 
 def test_summary_has_percentiles_and_counts() -> None:
-    times = servo.LoopTimes(np.arange(101.0), 3, 2, np.zeros(3))
+    times = servo.LoopTimes(np.arange(101.0), 3, 2, np.zeros(3), 1000.0)
     assert times.summary == {"p50_us": 50.0, "p99_us": 99.0, "max_us": 100.0, "frames": 101, "missed": 3, "refused": 2}
 
 
@@ -23,6 +23,53 @@ def test_regions_have_enough_rulers() -> None:
         features = servo.features_of(artwork, size)
         assert len(features.length) == (48 if size == 128 else servo.RULERS)
         assert max(features.region_px) <= size
+
+
+@pytest.mark.parametrize(
+    ("slowest", "missed", "rate", "reason"),
+    [
+        (900.0, 0, 1000.0, None),
+        (900.0, 0, 985.0, None),
+        (900.0, 1, 1000.0, "loop"),
+        (1100.0, 0, 1000.0, "loop"),
+        (1100.0, 3, 900.0, "camera"),
+    ],
+)
+def test_loop_sustains_a_rate(slowest: float, missed: int, rate: float, reason: str | None) -> None:
+    times = servo.LoopTimes(np.full(100, slowest), missed, 0, np.zeros(3), rate)
+    assert times.failure(1000.0) == reason
+
+
+@pytest.mark.parametrize("highest", [40.0, 333.0, 1000.0, 1011.0, 7777.0, 31000.0])
+def test_search_finds_the_highest_rate(highest: float) -> None:
+    tried: list[float] = []
+
+    def failure(rate: float) -> servo.Limit | None:
+        tried.append(rate)
+        return None if rate <= highest else "loop"
+
+    found = servo.search_highest(failure, 1000.0)
+    assert found.limit == "loop"
+    assert highest / 2 ** (1 / 32) - 1e-6 <= found.rate <= highest
+    assert len(tried) <= 12
+
+
+def test_search_ends_at_its_range() -> None:
+    assert servo.search_highest(lambda rate: None, 1000.0) == (32000.0, "search")
+    assert servo.search_highest(lambda rate: "loop", 1000.0) == (0.0, "loop")
+    reason = servo.search_highest(lambda rate: None if rate < 1500.0 else "camera", 1000.0)
+    assert reason.limit == "camera"
+
+
+@pytest.mark.slow
+def test_camera_goes_on_at_another_rate(device: Device) -> None:
+    with servo._loop(device, 128) as loop:
+        for rate in (100.0, 50.0):
+            times = loop.run(rate, 0.5, settling=10)
+            assert len(times.latencies) == round(0.5 * rate)
+            assert times.rate == pytest.approx(rate, rel=0.02)
+        assert (np.abs(times.error) < (5e-7, 5e-7, 1e-3)).all()
+        assert loop.highest_rate(50.0, 0.1).rate > 0.0
 
 
 @pytest.mark.slow

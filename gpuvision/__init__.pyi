@@ -331,16 +331,16 @@ from .ranging.sheet import (
     SheetPoints as SheetPoints,
 )
 from .ranging.sheet_calibration import (
-    LaserLine as LaserLine,
-)
-from .ranging.sheet_calibration import (
-    SheetFit as SheetFit,
-)
-from .ranging.sheet_calibration import (
     fit_sheet as fit_sheet,
 )
 from .ranging.sheet_from_points import (
     sheet_from_points as sheet_from_points,
+)
+from .ranging.sheet_readings import (
+    LaserLine as LaserLine,
+)
+from .ranging.sheet_result import (
+    SheetFit as SheetFit,
 )
 from .ranging.transport_calibration import (
     TransportFit as TransportFit,

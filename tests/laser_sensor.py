@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from gpuvision.camera.views.planar_calibration import fit_camera
 from gpuvision.camera.views.pose_response import pose_responses
 from gpuvision.ranging.sensor_geometry import SensorGeometry
-from gpuvision.ranging.sheet_calibration import LaserLine, fit_sheet
+from gpuvision.ranging.sheet_calibration import fit_sheet
+from gpuvision.ranging.sheet_readings import LaserLine
 from gpuvision.ranging.transport_calibration import fit_transport
 from target_images import chessboard, dots
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import tomli_w
 
 from gpuvision.ranging.sensor_geometry import SensorGeometry
-from gpuvision.ranging.sheet_calibration import Along
+from gpuvision.ranging.sheet_readings import Along
 
 # Components of unit vectors and of distances [m] below this size are rounding errors.
 _ROUNDING = 1e-15

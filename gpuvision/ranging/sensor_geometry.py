@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.views.pose_response import ray_derivatives
-from gpuvision.ranging.sheet_calibration import Along, SheetFit
+from gpuvision.ranging.sheet_readings import Along
+from gpuvision.ranging.sheet_result import SheetFit
 from gpuvision.ranging.transport_calibration import TransportFit
 from gpuvision.ranging.triangulation import Triangulation
 

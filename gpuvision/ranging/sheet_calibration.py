@@ -25,7 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,201 +33,26 @@ from scipy.linalg import block_diag
 from scipy.special import fdtrc
 
 from gpuvision.camera.camera import Camera
-from gpuvision.camera.views.pose_response import PoseResponse, ray_derivatives
 from gpuvision.normal_distribution import MAD_TO_SIGMA
+from gpuvision.ranging.sheet_readings import (
+    DEFAULT_LIMITS,
+    Along,
+    LaserLine,
+    SheetFrame,
+    SheetLimits,
+    SheetReadings,
+    robust_plane,
+    triangulate,
+    turn_to_image,
+)
+from gpuvision.ranging.sheet_result import SHEET_PARAMETERS, BendTest, SheetFit
 
-Along = Literal["columns", "rows"]
 Float64 = npt.NDArray[np.float64]
 
-SHEET_PARAMETERS = ("offset", "slope_g", "slope_h", "gg", "gh", "hh")
-"""Names of the parameters of a sheet [m, -, -, 1/m, 1/m, 1/m]; a plane has the first three."""
-
-# Standard deviation of a normal distribution over its median absolute deviation.
 # Tuning constant of Tukey's loss: 95 % efficiency for normal noise.
 _TUKEY = 4.685
 # Degrees of freedom that the line of a view contributes to the tests: offset, direction and curvature.
 _NUMBERS_PER_VIEW = 3
-
-
-@dataclass(frozen=True, kw_only=True)
-class SheetLimits:
-    """Thresholds of `fit_sheet`.
-
-    Attributes
-    ----------
-    significance : float
-        p-value of the F test below which the sheet is bent; as for the lens models.
-    min_readings : int
-        Fewest readings of a view that are used: they must show a line. The readings of shorter lines count as outliers.
-    trials : int
-        Number of random triples of readings that the robust start tries. Derived: with 30 % outliers the chance that
-        every triple has an outlier is 0.66^200 < 1e-36.
-    max_iterations : int
-        Largest number of steps of the robust fit and of the final fit.
-    noise_floor_px : float
-        Least noise of a reading [px] that is assumed: real lines are not read better.
-    max_scatter_px : float
-        Robust standard deviation of the readings about the sheet [px] above which they show no sheet. Chosen: real
-        lines are read within a pixel; a laser image in a wrong pose is off by many.
-    min_spread : float
-        Ratio of the second to the first principal extent of the points below which all lines coincide: a plane needs
-        targets at different distances.
-    """
-
-    significance: float = 0.001
-    min_readings: int = 16
-    trials: int = 200
-    max_iterations: int = 30
-    noise_floor_px: float = 1e-4
-    max_scatter_px: float = 2.0
-    min_spread: float = 0.02
-
-
-DEFAULT_LIMITS = SheetLimits()
-
-
-class LaserLine(NamedTuple):
-    """Readings of the laser line on one target.
-
-    Attributes
-    ----------
-    points : numpy.ndarray
-        (n, 2): measured (column, row) of the line [px].
-    target : PoseResponse
-        Pose of the target (its plane is Z = 0), the covariance of the pose, and its derivative by the camera. Lines
-        with the same object share its error.
-    height : numpy.ndarray or float
-        (n,) or one number: height of the lit surface over the target's plane, towards the camera [m]. Default 0; a
-        stepped block on the plane has other heights.
-    """
-
-    points: Float64
-    target: PoseResponse
-    height: Float64 | float = 0.0
-
-
-class BendTest(NamedTuple):
-    """Test of the bend of a sheet against a plane.
-
-    Attributes
-    ----------
-    bend : (float, float, float)
-        (gg, gh, hh) of the fit with a bend [1/m].
-    sigma : (float, float, float)
-        Standard deviations, with the error of the camera [1/m].
-    f_value, p_value : float
-        F statistic of "no bend", and the probability of at least this value for a plane.
-    significant : bool
-        Whether the sheet keeps the bend.
-    """
-
-    bend: tuple[float, float, float]
-    sigma: tuple[float, float, float]
-    f_value: float
-    p_value: float
-    significant: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class SheetFit:
-    """Sheet of light in the camera's frame.
-
-    Attributes
-    ----------
-    origin, g_axis, h_axis : numpy.ndarray
-        (3,): point G = H = 0 [m], and unit vectors along G and H. G follows the samples of the image, H leads towards
-        the camera.
-    bend : (float, float, float) or None
-        (gg, gh, hh) [1/m]; None for a plane.
-    names : tuple of str
-        Fitted parameters, the first ones of `SHEET_PARAMETERS`.
-    noise_covariance : numpy.ndarray
-        (p, p): covariance of the parameters for a known camera.
-    by_camera : numpy.ndarray
-        (p, m): derivative of the parameters by the camera's parameters.
-    sigma_px : float
-        Noise of a reading across the line [px].
-    view_ratio : float
-        Reduced chi-square of the lines of the views about the sheet; `noise_covariance` includes it if it is above 1.
-    bend_test : BendTest or None
-        Test of the bend; None with too few views.
-    residuals : tuple of numpy.ndarray
-        Per view (n,): distance of each reading from the sheet's line [px]; NaN for outliers.
-    coordinates : tuple of numpy.ndarray
-        Per view (n, 2): G and H of each reading [m].
-    """
-
-    origin: Float64
-    g_axis: Float64
-    h_axis: Float64
-    bend: tuple[float, float, float] | None
-    names: tuple[str, ...]
-    noise_covariance: Float64
-    by_camera: Float64
-    sigma_px: float
-    view_ratio: float
-    bend_test: BendTest | None
-    residuals: tuple[Float64, ...]
-    coordinates: tuple[Float64, ...]
-
-    @property
-    def normal(self) -> Float64:
-        """Direction of d: ``g_axis x h_axis``."""
-        return np.cross(self.g_axis, self.h_axis)
-
-    @property
-    def rms_px(self) -> float:
-        """Root mean square residual of the readings that are no outliers [px]."""
-        return float(np.sqrt(np.nanmean(np.concatenate(self.residuals) ** 2)))
-
-    @property
-    def outliers(self) -> int:
-        """Number of readings that the fit rejected."""
-        return int(np.count_nonzero(np.isnan(np.concatenate(self.residuals))))
-
-    def covariance(self, camera: npt.ArrayLike) -> Float64:
-        """Return the covariance (p, p) of the parameters for a camera with a covariance (m, m)."""
-        total: Float64 = self.noise_covariance + self.by_camera @ np.asarray(camera) @ self.by_camera.T
-        return total
-
-
-class _Frame(NamedTuple):
-    """Frame of the sheet: origin and axes g, h (rows of ``axes``: g, h, normal)."""
-
-    origin: Float64
-    axes: Float64
-
-    def moved(self, change: Float64) -> _Frame:
-        """Return the frame whose plane is d = offset + slope_g G + slope_h H of this frame."""
-        offset, slope_g, slope_h = change[:3]
-        g, h, n = self.axes
-        normal = n - slope_g * g - slope_h * h
-        normal /= np.linalg.norm(normal)
-        along = g - (g @ normal) * normal
-        along /= np.linalg.norm(along)
-        return _Frame(self.origin + offset * n, np.stack([along, np.cross(normal, along), normal]))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Readings:
-    """Readings of all views, and derivatives of their points.
-
-    ``ray`` are unit viewing directions, ``slope`` the change of a ray by a pixel across the line, and ``by_camera`` the
-    change of a ray by the camera's parameters. ``view`` is the number of the line. ``targets`` are the poses without
-    repetition, and ``pose`` is the number of the pose of each line: lines on one pose share its error.
-    """
-
-    lines: tuple[LaserLine, ...]
-    view: npt.NDArray[np.intp]
-    targets: tuple[PoseResponse, ...]
-    pose: tuple[int, ...]
-    ray: Float64
-    slope: Float64
-    by_camera: Float64
-    point: Float64
-    normal: Float64
-    along: Float64
-    weight: Float64
 
 
 def fit_sheet(
@@ -266,8 +91,8 @@ def fit_sheet(
         The readings do not determine a plane; the message names the missing data.
     """
     covariance = np.zeros((len(names), len(names))) if camera_covariance is None else np.asarray(camera_covariance)
-    readings = _triangulated(camera, lines, along, tuple(names), limits)
-    frame = _oriented(_robust_plane(readings, limits), readings)
+    readings = triangulate(camera, lines, along, tuple(names), limits)
+    frame = turn_to_image(robust_plane(readings, limits), readings)
     frame, readings, sigma = _robust_fit(frame, readings, limits)
     plane = _Solution.of(frame, readings, sigma, 3, limits)
     bent = None
@@ -276,108 +101,6 @@ def fit_sheet(
     test = None if bent is None else _test_bend(bent, covariance, limits)
     chosen = bent if bent is not None and test is not None and test.significant else plane
     return _result(chosen, test, sigma, [len(each.points) for each in lines])
-
-
-def _triangulated(
-    camera: Camera, lines: Sequence[LaserLine], along: Along, names: tuple[str, ...], limits: SheetLimits
-) -> _Readings:
-    """Intersect the viewing rays of all readings with their target's plane."""
-    used = [each for each in lines if len(each.points) >= limits.min_readings]
-    if len(used) < 2 and not any(np.ptp(each.height) > 0.0 for each in used):
-        raise ValueError(
-            f"the laser line was read on {len(used)} targets, expected two at least, at different distances"
-        )
-    pixels = np.concatenate([each.points for each in lines])
-    view = np.repeat(np.arange(len(lines)), [len(each.points) for each in lines])
-    across = np.array([0.0, 0.5]) if along == "columns" else np.array([0.5, 0.0])
-    ray = camera.rays(pixels)
-    normal = np.stack([each.target.pose.rotation[:, 2] for each in lines])[view]
-    place = np.stack([each.target.pose.translation for each in lines])[view]
-    height = np.concatenate([np.broadcast_to(each.height, len(each.points)) for each in lines])
-    reach = np.sum(normal * place, axis=1)
-    distance = (reach - np.sign(reach) * height) / np.sum(normal * ray, axis=1)
-    slope = camera.rays(pixels + across) - camera.rays(pixels - across)
-    by_camera = ray_derivatives(camera, names, pixels)
-    # Past the fold of the lens a pixel has no ray; next to the fold its derivatives are missing.
-    known = np.isfinite(distance) & (distance > 0.0)
-    known &= np.isfinite(slope).all(axis=1) & np.isfinite(by_camera).all(axis=(1, 2))
-    known &= np.array([len(each.points) >= limits.min_readings for each in lines])[view]
-    targets = {id(each.target): each.target for each in lines}
-    return _Readings(
-        lines=tuple(lines),
-        view=view,
-        targets=tuple(targets.values()),
-        pose=tuple(list(targets).index(id(each.target)) for each in lines),
-        ray=ray,
-        slope=slope,
-        by_camera=by_camera,
-        point=ray * distance[:, None],
-        normal=normal,
-        along=pixels[:, 0 if along == "columns" else 1],
-        weight=known.astype(np.float64),
-    )
-
-
-def _robust_plane(readings: _Readings, limits: SheetLimits) -> _Frame:
-    """Return a plane by least median of squares over random triples of points.
-
-    References
-    ----------
-    P. J. Rousseeuw, Least median of squares regression, J. American Statistical Association 79 (1984) 871.
-    """
-    points = readings.point[readings.weight > 0.0]
-    random = np.random.default_rng(0)
-    triples = points[np.stack([random.permutation(len(points))[:3] for _ in range(limits.trials)])]
-    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
-    some = points[:: max(len(points) // 1000, 1)]
-    distances = np.abs(some @ normals.T - np.sum(normals * triples[:, 0], axis=1))
-    best = int(np.argmin(np.median(distances, axis=0)))
-    inside = some[distances[:, best] <= 3.0 * np.median(distances[:, best]) + np.finfo(float).tiny]
-    middle = inside.mean(axis=0)
-    _, extents, axes = np.linalg.svd(inside - middle, full_matrices=False)
-    if extents[1] < limits.min_spread * extents[0]:
-        raise ValueError(
-            "all laser lines lie on one line in space, so that the sheet is not determined; move or tilt the target "
-            "between the images"
-        )
-    return _Frame(middle, axes)
-
-
-def _oriented(frame: _Frame, readings: _Readings) -> _Frame:
-    """Turn g along the samples of the image and h towards the camera; the normal is g x h."""
-    inside = readings.weight > 0.0
-    axes = sheet_axes(frame.origin, frame.axes, readings.point[inside], readings.along[inside])
-    return _Frame(frame.origin, axes)
-
-
-def sheet_axes(origin: Float64, axes: Float64, points: Float64, sample: Float64) -> Float64:
-    """Return the axes g, h and g x h of a plane: g along the samples of the image, h towards the camera.
-
-    Parameters
-    ----------
-    origin : numpy.ndarray
-        (3,): point of the plane in the camera's frame [m].
-    axes : numpy.ndarray
-        (3, 3): two unit vectors in the plane and the normal.
-    points : numpy.ndarray
-        (n, 3): points near the plane [m].
-    sample : numpy.ndarray
-        (n,): place of each point along the laser line in the image [px].
-
-    Returns
-    -------
-    numpy.ndarray
-        (3, 3): the axes as rows.
-    """
-    flat = (points - origin) @ axes[:2].T
-    # G is the direction in the sheet in which the sample number grows fastest.
-    growth = np.linalg.lstsq(flat - flat.mean(axis=0), sample - sample.mean(), rcond=None)[0]
-    g = growth @ axes[:2]
-    g /= np.linalg.norm(g)
-    h = np.cross(axes[2], g)
-    h = h if h @ origin < 0.0 else -h
-    return np.stack([g, h, np.cross(g, h)])
 
 
 class _System(NamedTuple):
@@ -396,7 +119,7 @@ class _System(NamedTuple):
     by_camera: Float64
 
 
-def _system(frame: _Frame, bend: Float64, readings: _Readings, count: int) -> _System:
+def _system(frame: SheetFrame, bend: Float64, readings: SheetReadings, count: int) -> _System:
     offset = readings.point - frame.origin
     g, h, d = (offset @ frame.axes.T).T
     gg, gh, hh = bend
@@ -424,7 +147,9 @@ def _system(frame: _Frame, bend: Float64, readings: _Readings, count: int) -> _S
     )
 
 
-def _robust_fit(frame: _Frame, readings: _Readings, limits: SheetLimits) -> tuple[_Frame, _Readings, float]:
+def _robust_fit(
+    frame: SheetFrame, readings: SheetReadings, limits: SheetLimits
+) -> tuple[SheetFrame, SheetReadings, float]:
     """Fit the bent sheet with Tukey's loss; return frame, readings with weights 0 or 1, and the noise [px]."""
     count = len(SHEET_PARAMETERS) if _freedom(readings) > 0 else 3
     bend, weight, sigma = np.zeros(3), readings.weight, math.inf
@@ -453,7 +178,7 @@ def _robust_fit(frame: _Frame, readings: _Readings, limits: SheetLimits) -> tupl
     return frame, readings, _noise_within_views(pixels, readings, limits)
 
 
-def _noise_within_views(pixels: Float64, readings: _Readings, limits: SheetLimits) -> float:
+def _noise_within_views(pixels: Float64, readings: SheetReadings, limits: SheetLimits) -> float:
     """Return the noise of a reading [px], from residuals about a parabola in each view."""
     total, freedom = 0.0, 0
     for number in range(len(readings.lines)):
@@ -476,16 +201,16 @@ def _parabola(along: Float64) -> Float64:
 class _Solution:
     """Generalised least squares fit of a plane (three parameters) or a bent sheet (six)."""
 
-    frame: _Frame
+    frame: SheetFrame
     bend: Float64
     system: _System
-    readings: _Readings
+    readings: SheetReadings
     noise_covariance: Float64
     by_camera: Float64
     view_ratio: float
 
     @classmethod
-    def of(cls, frame: _Frame, readings: _Readings, sigma: float, count: int, limits: SheetLimits) -> _Solution:
+    def of(cls, frame: SheetFrame, readings: SheetReadings, sigma: float, count: int, limits: SheetLimits) -> _Solution:
         """Iterate to the frame in which offset and slopes vanish."""
         bend = np.zeros(3)
         for _ in range(limits.max_iterations):
@@ -509,7 +234,7 @@ class _Solution:
         )
 
 
-def _normal_equations(system: _System, readings: _Readings, sigma: float) -> tuple[Float64, Float64, Float64]:
+def _normal_equations(system: _System, readings: SheetReadings, sigma: float) -> tuple[Float64, Float64, Float64]:
     """Return the normal matrix (p, p), the right-hand side (p,), and the right-hand sides (p, m) by the camera."""
     count, others = system.design.shape[1], system.by_camera.shape[1]
     total = np.zeros((count, count + 1 + others))
@@ -529,7 +254,7 @@ def _normal_equations(system: _System, readings: _Readings, sigma: float) -> tup
     return total[:, :count], total[:, count], total[:, count + 1 :]
 
 
-def _view_ratio(system: _System, readings: _Readings, sigma: float, count: int) -> float:
+def _view_ratio(system: _System, readings: SheetReadings, sigma: float, count: int) -> float:
     """Return the reduced chi-square of offset, direction and curvature of every view's line about the sheet."""
     # Numbers, their covariance by the readings, and their derivatives by the pose, of all lines on each pose.
     measured: list[list[Float64]] = [[] for _ in readings.targets]
@@ -565,7 +290,7 @@ def _test_bend(bent: _Solution, camera: Float64, limits: SheetLimits) -> BendTes
     return BendTest(_triple(bent.bend), _triple(sigmas), f_value, p_value, p_value < limits.significance)
 
 
-def _freedom(readings: _Readings) -> int:
+def _freedom(readings: SheetReadings) -> int:
     """Return the degrees of freedom of a bent sheet: numbers that the lines of all views give, less its parameters."""
     counts = np.bincount(readings.view[readings.weight > 0.0], minlength=len(readings.lines))
     return int(_NUMBERS_PER_VIEW * np.count_nonzero(counts > _NUMBERS_PER_VIEW)) - len(SHEET_PARAMETERS)

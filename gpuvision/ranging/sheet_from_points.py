@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.views.pose_response import fit_pose
-from gpuvision.ranging.sheet_calibration import SHEET_PARAMETERS, Along, SheetFit, sheet_axes
+from gpuvision.ranging.sheet_readings import Along, sheet_axes
+from gpuvision.ranging.sheet_result import SHEET_PARAMETERS, SheetFit
 
 Float64 = npt.NDArray[np.float64]
 

@@ -24,8 +24,10 @@ from gpuvision.formats.known_points_file import read_known_points
 from gpuvision.host import Device
 from gpuvision.host.recordings import Channel, image_files
 from gpuvision.ranging.sensor_geometry import SensorGeometry
-from gpuvision.ranging.sheet_calibration import DEFAULT_LIMITS, Along, LaserLine, SheetFit, fit_sheet
+from gpuvision.ranging.sheet_calibration import fit_sheet
 from gpuvision.ranging.sheet_from_points import sheet_from_points
+from gpuvision.ranging.sheet_readings import DEFAULT_LIMITS, Along, LaserLine
+from gpuvision.ranging.sheet_result import SheetFit
 from gpuvision.ranging.transport_calibration import TransportFit, fit_transport
 from gpuvision.validation import finite
 from gpuvision.workflows.calibrating import detect_targets

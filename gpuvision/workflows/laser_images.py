@@ -19,7 +19,7 @@ from gpuvision.host.recordings import Channel, image_files, read_frame
 from gpuvision.normal_distribution import MAD_TO_SIGMA
 from gpuvision.ranging.background import line_threshold, noise_threshold
 from gpuvision.ranging.line import LineReadout
-from gpuvision.ranging.sheet_calibration import Along
+from gpuvision.ranging.sheet_readings import Along
 
 SUFFIX = "_laser"
 """End of the name of a laser image: ``pose1_laser.png`` shows the target of ``pose1.png`` with the laser on."""

@@ -20,7 +20,8 @@ from gpuvision.host.outputs import Outputs
 from gpuvision.host.recordings import Channel
 from gpuvision.plots.sensor_calibration import SensorPicture, draw_sensor_calibration
 from gpuvision.ranging.sensor_geometry import SensorGeometry
-from gpuvision.ranging.sheet_calibration import Along, SheetFit
+from gpuvision.ranging.sheet_readings import Along
+from gpuvision.ranging.sheet_result import SheetFit
 from gpuvision.ranging.transport_calibration import TransportFit
 from gpuvision.workflows.laser_images import LineImage
 from gpuvision.workflows.sensor_camera import KnownCamera, known_grid

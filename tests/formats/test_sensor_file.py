@@ -12,7 +12,7 @@ from gpuvision.formats.sensor_file import sensor_text
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.sensor_geometry import SensorGeometry
-from gpuvision.ranging.sheet_calibration import SheetFit
+from gpuvision.ranging.sheet_result import SheetFit
 from gpuvision.ranging.transport_calibration import TransportFit
 from gpuvision.sensor.sensor import Sensor
 from laser_sensor import SIZE, LaserSensor, sensor

@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.views.camera_fit import Pose
 from gpuvision.camera.views.pose_response import PoseResponse, change_camera
-from gpuvision.ranging.sheet_calibration import LaserLine, SheetFit, fit_sheet
+from gpuvision.ranging.sheet_calibration import fit_sheet
+from gpuvision.ranging.sheet_readings import LaserLine
+from gpuvision.ranging.sheet_result import SheetFit
 from laser_sensor import LaserSensor, on_stage, poses, readings, sensor
 
 TRUTH = sensor(20.0)

@@ -42,25 +42,26 @@ import math
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host.recordings import CHANNELS, Channel
 from gpuvision.ranging.focus_stack import FocusStack
-from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
+from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.polygon_scan import PolygonScan
-from gpuvision.ranging.psd import PsdNoise, PsdReadout
+from gpuvision.ranging.psd import PsdReadout
 from gpuvision.ranging.range_image import Limits, StraightTransport
 from gpuvision.ranging.rotating_sigma import RotatingSheetSigma
 from gpuvision.ranging.sheet import SampleAxes
-from gpuvision.ranging.triangulation import Along, Triangulation
+from gpuvision.ranging.triangulation import Along
 from gpuvision.schema import DescriptionError, Section, read_toml
 from gpuvision.sensor.focus import FOCUS_PLACE, read_focus
 from gpuvision.sensor.light_source import Light, read_light
 from gpuvision.sensor.optics import read_optics
 from gpuvision.sensor.polygon import read_polygon
+from gpuvision.sensor.readouts import read_axes, read_line_readout, read_psd_readout
 from gpuvision.sensor.sheet import read_triangulation
 from gpuvision.sensor.transports import Encoder, Transport, read_transport
 
@@ -247,7 +248,7 @@ class Sensor:
         is_rotating = (
             moving.choice("kind", ("straight", "rotating") if kind == "camera" else ("straight",)) == "rotating"
         )
-        axes = SampleAxes() if is_rotating else _axes(top.optional_section("axes"))
+        axes = SampleAxes() if is_rotating else read_axes(top.optional_section("axes"))
         optics = read_optics(top, kind, frame, along, axes)
         transport, encoder, rotating_sigma = read_transport(
             moving, optics, along, is_rotating=is_rotating, encoder_file=encoder_file
@@ -267,7 +268,9 @@ class Sensor:
         top.finish()
         return cls(
             name=name,
-            readout=_line(readout, along, sheet, axes) if kind == "camera" else _psd(readout, sheet, axes, light),
+            readout=read_line_readout(readout, along, sheet, axes)
+            if kind == "camera"
+            else read_psd_readout(readout, sheet, axes, light),
             transport=transport,
             output=output,
             recording=recording,
@@ -356,15 +359,6 @@ def _frame(top: Section) -> tuple[int, int] | None:
     return rows, columns
 
 
-def _axes(table: Section | None) -> SampleAxes:
-    if table is None:
-        return SampleAxes()
-    names = ("position_origin", "position_pitch", "sample_origin", "sample_pitch")
-    values = {name: table.number(name, "sensor unit", getattr(SampleAxes(), name)) for name in names}
-    table.finish()
-    return SampleAxes(**values)
-
-
 def _region(
     kind: str, top: Section, frame: tuple[int, int] | None, along: Along, axes: SampleAxes, readout: Section
 ) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -380,67 +374,6 @@ def _region(
     u = sorted(axes.position_origin + axes.position_pitch * each for each in positions)
     v = sorted(axes.sample_origin + axes.sample_pitch * each for each in (0.0, samples - 1.0))
     return (u[0], u[1]), (v[0], v[1])
-
-
-def _line(table: Section, along: Along, sheet: Triangulation | None, axes: SampleAxes) -> LineReadout:
-    default = LineReadout()
-    threshold = default.threshold
-    if table.word("threshold", ("auto",)) is None:
-        threshold = table.number("threshold", "grey levels", default.threshold, at_least=0.0)
-    readout = LineReadout(
-        along=along,
-        method=table.choice("method", cast(tuple[Method, ...], METHODS), default.method),
-        threshold=threshold,
-        window=table.integer("window", default.window, at_least=1, at_most=WIDEST_WINDOW),
-        # "nearest" needs the reading before: a recording is read in batches, of which all frames run at once.
-        peak_selection=table.choice("peak_selection", ("strongest", "first", "last"), default.peak_selection),
-        minimum_peak=table.number("minimum_peak", "grey levels", None, at_least=0.0),
-        minimum_width=table.integer("minimum_width", default.minimum_width, at_least=1),
-        maximum_width=table.integer("maximum_width", None, at_least=1),
-        saturation=table.number("saturation", "grey levels", None, above=0.0),
-        ambiguity=table.number("ambiguity", "share of the peak", None, above=0.0, at_most=1.0),
-        fir_length=cast(Literal[4, 8], table.integer("fir_length", default.fir_length, at_least=4, at_most=8)),
-        read_noise=table.number("read_noise", "grey levels", default.read_noise, at_least=0.0),
-        gain=table.number("gain", "grey levels per electron", default.gain, at_least=0.0),
-        speckle=table.number("speckle", "pixel", default.speckle, at_least=0.0),
-        triangulation=sheet,
-        axes=axes,
-    )
-    table.finish()
-    return readout
-
-
-def _psd(table: Section, sheet: Triangulation | None, axes: SampleAxes, light: Light | None) -> PsdReadout:
-    left, right = table.numbers("dark", "A", (2,), (0.0, 0.0))
-    readout = PsdReadout(
-        strip_length=table.number("strip_length", "m", above=0.0),
-        ampere=table.number("ampere", "A per unit of the recording", 1.0, above=0.0),
-        dark=(left, right),
-        right_gain=table.number("right_gain", "", 1.0, above=0.0),
-        interelectrode_resistance=table.number("interelectrode_resistance", "Ohm", None, above=0.0),
-        load_resistance=table.number("load_resistance", "Ohm", 0.0, at_least=0.0),
-        minimum_total=table.number("minimum_total", "A", 0.0, at_least=0.0),
-        saturation=table.number("saturation", "A", None, above=0.0),
-        linearity=table.rows("linearity", "m", default=None),
-        margin=table.number("margin", "m", None, at_least=0.0),
-        noise=_noise(table.optional_section("noise"), 0.0 if light is None else light.responsivity * light.ambient),
-        triangulation=sheet,
-        axes=axes,
-    )
-    table.finish()
-    return readout
-
-
-def _noise(table: Section | None, ambient: float) -> PsdNoise | None:
-    """Read the noise of a PSD; without a background it is the photocurrent of the light's ambient light [A]."""
-    if table is None:
-        return None
-    units = {"independent": "A", "opposed": "A", "spot": "m", "bandwidth": "Hz", "dark_current": "A"}
-    values = {name: table.number(name, unit, 0.0, at_least=0.0) for name, unit in units.items()}
-    background = table.number("background", "A", ambient if values["bandwidth"] > 0.0 else 0.0, at_least=0.0)
-    noise = PsdNoise(**values, background=background)
-    table.finish()
-    return noise
 
 
 def _light(top: Section, transport: Transport) -> Light | None:

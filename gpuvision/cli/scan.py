@@ -23,7 +23,9 @@ from gpuvision.cli.arguments import (
 )
 
 if TYPE_CHECKING:
+    from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
+    from gpuvision.workflows.scan_result import Scan
 
 
 class Precision(StrEnum):
@@ -155,8 +157,6 @@ def scan(
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
-    from gpuvision.workflows.scan_errors import budget_line
-    from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES, surface_files
     from gpuvision.workflows.scanning import scan as run
 
     described = Sensor.load(sensor, encoder=encoder)
@@ -174,14 +174,9 @@ def scan(
         )
         _write_preview(recording, described, out, inputs, device, overwrite)
         return
-    outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
     chosen_formats = [each.value for each in formats or ()]
-    outputs.claim_folder(out, (*SCAN_FILES, *SIGMA_FILES, *surface_files(chosen_formats).values()))
-    outputs.claim(as_json)
-    if trace is not None:
-        if trace.absolute() in (out.absolute(), *out.absolute().parents):
-            raise ValueError(f"--trace is {trace}, the folder of --out or one above it; give a file")
-        outputs.claim(trace, job="trace")
+    outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
+    _claim(outputs, out, chosen_formats, as_json, trace)
     chosen = None if device is None else Device.named(device)
     with progress_bar(f"scanning {recording.name}") as progress:
         done = run(
@@ -200,13 +195,32 @@ def scan(
     possible = [each for each in chosen_formats if each not in problems]
     done.write(out, formats=possible, ply_points=ply.value, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
+    _show(done, out, to_stderr=prints_report(as_json))
+    if problems:
+        raise ValueError(f"{'; '.join(problems.values())}; all other files are written")
+
+
+def _claim(outputs: Outputs, out: Path, formats: Sequence[str], as_json: Path | None, trace: Path | None) -> None:
+    """Claim all files of a scan before it runs."""
+    from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES, surface_files
+
+    outputs.claim_folder(out, (*SCAN_FILES, *SIGMA_FILES, *surface_files(formats).values()))
+    outputs.claim(as_json)
+    if trace is not None:
+        if trace.absolute() in (out.absolute(), *out.absolute().parents):
+            raise ValueError(f"--trace is {trace}, the folder of --out or one above it; give a file")
+        outputs.claim(trace, job="trace")
+
+
+def _show(done: Scan, out: Path, *, to_stderr: bool) -> None:
+    """Print the advice to standard error, then summary and error budget."""
+    from gpuvision.workflows.scan_errors import budget_line
+
     for advice in done.advice():
         echo(f"warning: {advice}", err=True)
     lines = (done.summary(), budget_line(done.error_budget()))
     look = f"look at {out / 'picture.png'} and {out / 'report.json'}"
-    echo("\n".join([*filter(None, lines), look]), err=prints_report(as_json))
-    if problems:
-        raise ValueError(f"{'; '.join(problems.values())}; all other files are written")
+    echo("\n".join([*filter(None, lines), look]), err=to_stderr)
 
 
 def _write_preview(

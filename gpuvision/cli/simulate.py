@@ -163,10 +163,7 @@ def simulate(
     reject_unused("without --second", rule=rule if second is None else None)
     reject_unused("with --no-noise", seed=None if noise else seed)
     names = _names(paths)
-    if not {"diffuse-diffuse", "multi-bounce"} & set(names):
-        reject_unused("without diffuse-diffuse or multi-bounce in --paths", tolerance=tolerance or None)
-    if "multi-bounce" not in names:
-        reject_unused("without multi-bounce in --paths", patch_size=patch_size)
+    _check_unused_paths(names, tolerance, patch_size)
     described = Sensor.load(sensor)
     second_sensor = None if second is None else Sensor.load(second)
     read = [each for each in (part, sensor, second, materials, mask) if each is not None]
@@ -214,6 +211,14 @@ def _names(paths: str) -> tuple[str, ...]:
     if paths.strip() == "all":
         return PATHS
     return tuple(each.strip() for each in paths.split(",") if each.strip())
+
+
+def _check_unused_paths(names: tuple[str, ...], tolerance: float, patch_size: float | None) -> None:
+    """Refuse options of light paths that are left out."""
+    if not {"diffuse-diffuse", "multi-bounce"} & set(names):
+        reject_unused("without diffuse-diffuse or multi-bounce in --paths", tolerance=tolerance or None)
+    if "multi-bounce" not in names:
+        reject_unused("without multi-bounce in --paths", patch_size=patch_size)
 
 
 def _load_part(

@@ -125,10 +125,10 @@ class PidController:
 
     Notes
     -----
-    The command is ``proportional (error + derivative error') + integral part + feed_forward target'``. The derivative
-    of the error is the target's velocity less the observer's, and needs no filter. A command beyond the limit is cut,
-    and the integral part of this axis stands still while the error would drive the command further beyond the limit
-    (conditional integration) [1]_.
+    The command is ``proportional (part + integral of part / integral) + feed_forward target'`` with ``part = error +
+    derivative error'``: the form of `simc_gains`. The derivative of the error is the target's velocity less the
+    observer's, and needs no filter. A command beyond the limit is cut, and the integral part of this axis stands still
+    while ``part`` would drive the command further beyond the limit (conditional integration) [1]_.
 
     References
     ----------
@@ -166,18 +166,15 @@ class PidController:
             (3,): velocity of the target. Default: it rests.
         """
         gains = self.gains
-        wanted = (
-            gains.proportional * (error + gains.derivative * velocity)
-            if gains.derivative
-            else (gains.proportional * error)
-        )
+        part = error + gains.derivative * velocity if gains.derivative else error
+        wanted = gains.proportional * part
         if target_velocity is not None:
             wanted = wanted + self.feed_forward * target_velocity
         if math.isinf(gains.integral):
             return np.clip(wanted, -self.limit, self.limit)
-        grown = self._integral + gains.proportional / gains.integral * period * error
+        grown = self._integral + gains.proportional / gains.integral * period * part
         total = wanted + grown
-        pushes = (np.abs(total) > self.limit) & (np.sign(total) == np.sign(error))
+        pushes = (np.abs(total) > self.limit) & (np.sign(total) == np.sign(part))
         self._integral = np.where(pushes, self._integral, grown)
         return np.clip(wanted + self._integral, -self.limit, self.limit)
 

@@ -55,7 +55,7 @@ class LoopLimits:
         counts to the travel. Default 0.
     encoder_error : tuple of float
         Largest difference of encoder and integrated command [m], [m], [rad], above the lag times the speed of the
-        axes. Default: not checked.
+        axes. Zero of the encoders is the first reading with which the next one agrees. Default: not checked.
     readings : int
         Number of readings in a row after which an encoder or a stop ends the loop; shorter faults are ignored.
         Default 5 (chosen).
@@ -181,6 +181,7 @@ class FaultCounter:
         self._limits = limits
         self._gated = self._stopped = self._differing = self._missed = 0
         self._offset: Float64 | None = None
+        self._last_difference: Float64 | None = None
         self.glitches = 0
         """Number of readings whose encoders contradicted the commands."""
 
@@ -193,11 +194,15 @@ class FaultCounter:
 
     def reading(self, position: Float64, at_limit: npt.NDArray[np.int8], commanded: Float64, error: Float64) -> None:
         """Compare a reading with the integrated command (3,) and with the error (3,) that is to be corrected."""
-        if self._offset is None:
-            self._offset = position - commanded
-        outside = np.abs(position - commanded - self._offset) > np.array(self._limits.encoder_error)
-        self._differing = self._differing + 1 if np.any(outside) else 0
-        self.glitches += int(np.any(outside))
+        difference = position - commanded
+        zero = self._last_difference if self._offset is None else self._offset
+        self._last_difference = difference
+        if zero is not None:
+            outside = bool(np.any(np.abs(difference - zero) > np.array(self._limits.encoder_error)))
+            self._differing = self._differing + 1 if outside else 0
+            self.glitches += int(outside)
+            if not outside:
+                self._offset = zero
         self._stopped = self._stopped + 1 if np.any(at_limit * error > 0.0) else 0
 
     def tick(self, late: bool) -> None:

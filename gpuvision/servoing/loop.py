@@ -26,6 +26,9 @@ from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
 
+# Differences of two equal times by rounding [s].
+_SAME_TIME = 1e-9
+
 
 class PlantReading(NamedTuple):
     """State that the encoders of a plant report.
@@ -96,14 +99,20 @@ class WallClock:
     spin : float
         Time before the end in which the clock does not sleep [s]: the operating system may wake a sleeper late. Default
         0.2 ms.
+
+    Attributes
+    ----------
+    start : float
+        Time 0 of the clock, in seconds of `time.perf_counter`. Give it to `streamed_pose`: the measurements then have
+        the times of this clock.
     """
 
     def __init__(self, spin: float = 2e-4) -> None:
-        self._start, self._spin = time.perf_counter(), finite(spin, "spin", minimum=0.0)
+        self.start, self._spin = time.perf_counter(), finite(spin, "spin", minimum=0.0)
 
     def now(self) -> float:
         """Return the time [s]."""
-        return time.perf_counter() - self._start
+        return time.perf_counter() - self.start
 
     def wait_until(self, until: float) -> float:
         """Wait until a time [s] and return the time; return at once if it is past."""
@@ -167,6 +176,9 @@ class LoopRecord(NamedTuple):
 
 class ServoLoop:
     """Loop that steers a plant to a target by measured poses.
+
+    A run resets the controller. A measurement that was exposed after the begin of its frame is refused: its times are
+    not those of the loop's clock.
 
     Parameters
     ----------
@@ -241,6 +253,7 @@ class _Run:
         self.limits = loop.limits or LoopLimits()
         self.guard = TravelGuard(self.limits.margin_sigmas, self.limits.lag)
         self.faults = FaultCounter(self.limits)
+        loop.controller.reset()
         self.start = loop.clock.now()
         self.count = max(math.ceil(duration / loop.period - 1e-9), 1)
         self.columns = np.zeros((6, self.count, 3))  # target, pose, velocity, sigma, command, encoder
@@ -254,7 +267,9 @@ class _Run:
         try:
             outcome, row = self._frames()
         finally:
-            self.loop.plant.command(self.loop.clock.now(), np.zeros(3))
+            stopped = self.loop.clock.now()
+            self.loop.plant.command(stopped, np.zeros(3))
+            self.loop.observer.command(stopped, np.zeros(3))
         target, pose, velocity, sigma, command, encoder = self.columns[:, :row]
         return LoopRecord(
             outcome,
@@ -292,7 +307,8 @@ class _Run:
         """Do one frame; return the reason to end the loop, or None."""
         loop = self.loop
         for measurement in loop.sensor(now):
-            verdict = loop.observer.add(measurement)
+            is_future = measurement.exposed > now + _SAME_TIME
+            verdict = Verdict.REFUSED if is_future else loop.observer.add(measurement)
             self.measurements.append((measurement, verdict))
             self.faults.verdict(verdict)
             if verdict is Verdict.ACCEPTED:

@@ -42,7 +42,7 @@ class Margins(NamedTuple):
     gain : float
         Factor of the gain that makes the loop unstable.
     phase : float
-        Additional loss of phase that makes the loop unstable [rad].
+        Additional loss of phase that makes the loop unstable [rad]; below 0 for an unstable loop.
     delay : float
         Additional delay that makes the loop unstable [s], by the phase margin.
     modulus : float
@@ -58,35 +58,47 @@ class Margins(NamedTuple):
     crossover: float
 
 
-def open_loop(gains: PidGains, delay: float, period: float, z: npt.ArrayLike) -> npt.NDArray[np.complex128]:
+def open_loop(
+    gains: PidGains, delay: float, period: float, z: npt.ArrayLike, *, lag: float = 0.0
+) -> npt.NDArray[np.complex128]:
     """Return the open loop of controller, integrating plant with hold, and delay, at points of the z plane.
 
     Parameters
     ----------
     gains : PidGains
-        Gains of the controller; the derivative is the difference of two frames.
+        Gains of the controller in series form; the derivative is the difference of two frames.
     delay : float
         Delay from the middle of the exposure to the command [s].
     period : float
         Frame time [s].
     z : array_like
         (...,) complex numbers, not 1.
+    lag : float
+        Time constant with which the plant follows the commanded velocity [s]. Default 0.
     """
     z = np.asarray(z, np.complex128)
     whole, part = delay_taps(delay / finite(period, "period", above=0.0))
     controller = 1.0 + gains.derivative / period * (1.0 - 1.0 / z)
     if math.isfinite(gains.integral):
-        controller = controller + period / gains.integral / (1.0 - 1.0 / z)
-    taps = z**-whole * (1.0 - part + part / z)
-    return np.asarray(gains.proportional * period * controller * taps / (z - 1.0))
+        controller = controller * (1.0 + period / gains.integral / (1.0 - 1.0 / z))
+    if finite(lag, "lag", minimum=0.0) == 0.0:
+        taps = z**-whole * (1.0 - part + part / z)
+        return np.asarray(gains.proportional * period * controller * taps / (z - 1.0))
+    plant = MotionModel(lag=(lag,) * 3)
+    last, first = _response(plant, (1.0 - part) * period), _response(plant, part * period)
+    older = last[0] @ first[1]  # effect of the command before the newest one that acts in a frame
+    position, velocity = (last[1][k] + older[k] / z for k in range(2))
+    whole_frame = last[0] @ first[0]
+    position = (position + whole_frame[0, 1] * velocity / (z - whole_frame[1, 1])) / (z - 1.0)
+    return np.asarray(gains.proportional * controller * z**-whole * position)
 
 
-def margins(gains: PidGains, delay: float, period: float) -> Margins:
+def margins(gains: PidGains, delay: float, period: float, *, lag: float = 0.0) -> Margins:
     """Return the stability margins of a loop with a delayed pose and no predictor.
 
     Parameters
     ----------
-    gains, delay, period
+    gains, delay, period, lag
         As for `open_loop`.
 
     Raises
@@ -97,13 +109,15 @@ def margins(gains: PidGains, delay: float, period: float) -> Margins:
     angles = np.append(np.geomspace(2e-6 * math.pi, math.pi, _FREQUENCIES)[:-1], math.pi)
 
     def at(angle: float) -> complex:
-        return complex(open_loop(gains, delay, period, np.exp(1j * angle)))
+        return complex(open_loop(gains, delay, period, np.exp(1j * angle), lag=lag))
 
-    response = open_loop(gains, delay, period, np.exp(1j * angles))
+    response = open_loop(gains, delay, period, np.exp(1j * angles), lag=lag)
     crossing = _first_root(lambda angle: math.log(abs(at(angle))), angles, np.log(np.abs(response)))
     if crossing is None:
         raise ValueError("the gain of the loop is above 1 at all frequencies; give smaller gains")
     phase = float(np.angle(-at(crossing)))
+    continuous = float(np.interp(crossing, angles[:-1], np.unwrap(np.angle(-response[:-1]))))
+    phase += 2.0 * math.pi * round((continuous - phase) / (2.0 * math.pi))
     # The response crosses the negative real axis where its imaginary part is 0; at half the frame rate it is real.
     real = [float(response[-1].real)]
     for k in np.flatnonzero(np.diff(np.sign(response.imag[:-1]))):

@@ -77,7 +77,8 @@ class Verdict(enum.Enum):
     ACCEPTED = "accepted"
     """The measurement corrected the state."""
     REFUSED = "refused"
-    """Its status is not 0, its pose or covariance is not finite, or it was exposed after it arrived."""
+    """Its status is not 0, its pose or covariance is not finite, its covariance is not positive definite,
+    or it was exposed after it arrived. A `ServoLoop` also refuses an exposure after the begin of the frame."""
     DUPLICATE = "duplicate"
     """A measurement of the same exposure was accepted before."""
     TOO_OLD = "too old"
@@ -176,6 +177,9 @@ def _axis_transition(step: float, lag: float | None) -> tuple[float, float, floa
 _GATE = 16.266
 # Two exposures nearer than this are the same frame [s] (chosen): below the shortest frame time by far.
 _SAME_TIME = 1e-9
+# Smallest diagonal of the Cholesky factor of a correlation matrix that is not singular (chosen): the root of the
+# rounding errors is 1e-8.
+_SINGULAR = 1e-6
 # Transitions that are kept for time steps that occur again; a loop with jitter makes new ones all the time.
 _MAX_TRANSITIONS = 4096
 
@@ -342,7 +346,15 @@ def _is_valid(measurement: PoseMeasurement) -> bool:
     values = (measurement.exposed, measurement.arrived, *measurement.pose.tolist(), *measurement.covariance.flat)
     if measurement.status != 0 or not all(map(math.isfinite, values)) or measurement.exposed > measurement.arrived:
         return False
-    return bool(np.all(np.diagonal(measurement.covariance) > 0.0))
+    variances = np.diagonal(measurement.covariance)
+    if not np.all(variances > 0.0):
+        return False
+    sigma = np.sqrt(variances)
+    try:
+        root = np.linalg.cholesky(measurement.covariance / np.outer(sigma, sigma))
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.diagonal(root).min() > _SINGULAR)
 
 
 def _innovation(state: Float64, covariance: Float64, pose: Float64, noise: Float64) -> tuple[float, Float64, Float64]:

@@ -52,8 +52,9 @@ class SimulatedPlant:
         Raises
         ------
         ValueError
-            The time is before the last command.
+            The time is before the last command, or a velocity is not finite.
         """
+        velocity = numbers(velocity, (3,), "velocity")
         states = self._states(time)
         moved = [each.command(state, float(v)) for each, state, v in zip(self._steppers, states, velocity, strict=True)]
         self._segments.append((_ticks(time), moved))

@@ -261,3 +261,26 @@ def test_guard_bounds_the_motion_after_the_exposure() -> None:
     second = guard.limit(2e-3, np.array([0.6, -5.0, -1.0]), target, 1e-3)
     assert second == pytest.approx([0.403, 0.0, -6e-3], abs=1e-12)
     assert guard.limit(3e-3, np.array([-0.1, 0.1, 0.0]), target, 1e-3) == pytest.approx([-0.1, 0.1, 0.0])
+
+
+def test_glitch_of_the_first_reading_is_ignored() -> None:
+    """A wrong first reading does not become the zero of the encoders."""
+    record, plant = run(wrong=lambda time: 1e-3 if time == 0.0 else 0.0)
+    assert record.outcome is Outcome.TIME_OVER
+    assert record.glitches == 1
+    check_travel(record, plant)
+
+
+def test_times_ahead_of_the_loop_are_refused() -> None:
+    """A sensor that answers with times of another clock."""
+    plant, observer = SimulatedPlant(), PoseObserver(MODEL)
+    observer.reset(-DELAY, np.zeros(3), COVARIANCE)
+    controller = PidController(PidGains(proportional=50.0))
+
+    def sensor(time: float) -> list[PoseMeasurement]:
+        return [PoseMeasurement(time + 5e4, time + 5e4 + DELAY, np.zeros(3), COVARIANCE, 0)]
+
+    record = ServoLoop(plant, sensor, observer, controller, SimulatedClock(), period=PERIOD).run(TARGET, 1.0)
+    assert record.outcome is Outcome.LOST
+    assert {verdict for _, verdict in record.measurements} == {Verdict.REFUSED}
+    assert np.all(plant.pose(1.0) == 0.0)

@@ -151,3 +151,18 @@ def test_loop_needs_a_frame_time() -> None:
     with pytest.raises(ValueError, match="period is 0"):
         ServoLoop(None, None, None, None, None, period=0.0)  # type: ignore[arg-type]
     assert math.isinf(LoopLimits().encoder_error[0])
+
+
+def test_runs_of_a_loop_do_not_depend_on_earlier_runs() -> None:
+    """The second run from the target starts without integral part, and the observer knows that the head was stopped."""
+    plant, observer = SimulatedPlant(), predictors(2.0)[0]
+    observer.reset(-1.0, np.zeros(3), 1e-12 * np.eye(3))
+    sensor = SimulatedPoseSensor(plant.pose, period=PERIOD, delay=2e-3, is_noisy=False)
+    controller = PidController(PidGains(proportional=10.0, integral=0.1))
+    loop = ServoLoop(plant, sensor, observer, controller, SimulatedClock(), period=PERIOD, limits=None)
+    first = loop.run(STEP, 0.02)
+    later = loop.clock.now() + 0.05
+    assert first.command[-1, 0] > 1e-3
+    assert observer.estimate(later).pose == pytest.approx(plant.pose(later), abs=1e-6)
+    second = loop.run(plant.pose(later), 2e-3)
+    assert second.command == pytest.approx(np.zeros((2, 3)), abs=1e-4)

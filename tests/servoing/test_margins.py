@@ -15,6 +15,7 @@ from gpuvision.servoing.margins import (
     margins,
     observer_matrix,
     observer_tolerance,
+    open_loop,
     predictor_polynomial,
     predictor_tolerance,
 )
@@ -216,3 +217,52 @@ def test_observer_that_trusts_the_measurements_alone_is_the_predictor() -> None:
     assert (found.shorter, found.longer) == pytest.approx((predictor.shorter, predictor.longer), abs=1e-4)
     assert found.plant_gain == pytest.approx(predictor.plant_gain, abs=1e-4)
     assert found.longer < observer_tolerance(0.8, 4.0).longer < observer_tolerance(0.8, 4.0, noise_ratio=0.3).longer
+
+
+@pytest.mark.parametrize(("delay", "gain"), [(10.0, 1.5), (10.0, 0.5), (20.0, 1.9), (3.0, 0.6)])
+def test_margins_of_an_unstable_loop_are_below_those_of_a_stable_one(delay: float, gain: float) -> None:
+    """The phase at the crossover is more than one turn behind for the long delays."""
+    assert gain > gain_limit(delay)
+    found = margins(PidGains(proportional=gain / PERIOD), delay * PERIOD, PERIOD)
+    assert found.phase == pytest.approx(math.pi / 2.0 - (2.0 * delay + 1.0) * math.asin(gain / 2.0), rel=1e-6)
+    assert found.phase < 0.0
+    assert found.delay < 0.0
+    assert found.gain < 1.0
+
+
+def test_pid_cancels_the_lag() -> None:
+    """With the zero of a series PID at the lag, a fast-sampled loop is that of an integrator and a delay."""
+    delay, lag, period = 2e-3, 10e-3, 2e-5
+    found = margins(simc_gains(delay, lag=lag), delay, period, lag=lag)
+    alone = margins(simc_gains(delay), delay, period)
+    assert found.gain == pytest.approx(alone.gain, rel=0.02)
+    assert found.phase == pytest.approx(alone.phase, rel=0.02)
+    # Closed form of the continuous loop: a zero at the integral time, two integrators and the delay.
+    gains = simc_gains(delay)
+    angle = 2.0 * math.pi * alone.crossover
+    expected = math.atan(gains.integral * angle) - delay * angle
+    assert alone.phase == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("delay", [2.0, 2.3])
+def test_open_loop_with_a_lag_is_the_simulated_plant(delay: float) -> None:
+    """Response of a plant to a commanded sine, by its gain and phase at the frames."""
+    lag, angle, frames = 2.5 * PERIOD, 0.37, 400
+    plant = SimulatedPlant((Axis(lag=lag), Axis(), Axis()), history=1000)
+    for k in range(frames):
+        plant.command(k * PERIOD, np.array([math.cos(angle * k), 0.0, 0.0]))
+    k = np.arange(100, frames)
+    seen = plant.pose((k - delay) * PERIOD)[:, 0]
+    basis = np.column_stack([np.cos(angle * k), -np.sin(angle * k), np.ones(len(k))])
+    real, imaginary, _ = np.linalg.lstsq(basis, seen, rcond=None)[0]
+    found = open_loop(PidGains(proportional=1.0), delay * PERIOD, PERIOD, np.exp(1j * angle), lag=lag)
+    assert complex(real, imaginary) == pytest.approx(complex(found), rel=1e-5)
+    small = open_loop(PidGains(proportional=1.0), delay * PERIOD, PERIOD, np.exp(1j * angle), lag=1e-9)
+    none = open_loop(PidGains(proportional=1.0), delay * PERIOD, PERIOD, np.exp(1j * angle))
+    assert complex(small) == pytest.approx(complex(none), rel=1e-5)
+
+
+def test_controller_is_in_series_form() -> None:
+    """A constant error 1 that grows by 1 /s: 1 (1 + 1), and its integral over 0.1 s with the time constant 1 s."""
+    controller = PidController(PidGains(proportional=1.0, integral=1.0, derivative=1.0))
+    assert controller(np.ones(3), np.ones(3), 0.1) == pytest.approx(2.2)

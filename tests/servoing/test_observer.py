@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.linalg import expm
 
-from gpuvision.servoing.observer import LatestPose, MotionModel, PoseMeasurement, PoseObserver, Verdict
+from gpuvision.servoing.observer import LatestPose, MotionModel, Observer, PoseMeasurement, PoseObserver, Verdict
 
 NOISE = np.array([[4.0, 1.0, 0.5], [1.0, 3.0, -0.2], [0.5, -0.2, 2.0]]) * 1e-12
 MODEL = MotionModel(lag=(2e-3, 0.0, 5e-3), acceleration_noise=(1e-3, 0.0, 1e-2), position_noise=(0.0, 1e-9, 1e-12))
@@ -188,3 +188,15 @@ def test_latest_pose_keeps_the_newest_exposure() -> None:
     assert latest.add(measured(2e-3, [0.0, 0.0, 0.0])) is Verdict.DUPLICATE
     assert latest.add(measured(3e-3, [np.nan, 0.0, 0.0])) is Verdict.REFUSED
     assert latest.estimate(9e-3).pose.tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize("other", [1.0, -1.0, 2.0])
+@pytest.mark.parametrize("observer", [PoseObserver(MotionModel()), LatestPose()])
+def test_covariance_must_be_positive_definite(observer: Observer, other: float) -> None:
+    """Correlations 1 of all axes are singular, -1 and 2 are indefinite."""
+    observer.reset(-1.0, np.zeros(3), np.zeros((3, 3)))
+    covariance = 1e-12 * (np.eye(3) + other * (np.ones((3, 3)) - np.eye(3)))
+    assert observer.add(PoseMeasurement(0.0, 0.1, np.zeros(3), covariance, 0)) is Verdict.REFUSED
+    units = np.diag([1e-7, 1.0, 1e-3]) * 1e-5
+    valid = units @ (np.eye(3) + 0.9 * (np.ones((3, 3)) - np.eye(3))) @ units
+    assert observer.add(PoseMeasurement(0.0, 0.1, np.zeros(3), valid, 0)) is Verdict.ACCEPTED

@@ -138,3 +138,11 @@ def test_history_is_bounded() -> None:
 def test_axis_refuses(given: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"needs a lag|must be above 0|damping is"):
         Axis(**given)
+
+
+@pytest.mark.parametrize("axis", [Axis(), Axis(upper=1.0, lag=1e-3)])
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_velocity_must_be_finite(axis: Axis, wrong: float) -> None:
+    plant = SimulatedPlant((axis,) * 3)
+    with pytest.raises(ValueError, match="velocity"):
+        plant.command(0.0, np.array([0.0, wrong, 0.0]))

@@ -15,6 +15,10 @@ from gpuvision.matching.features.feature_set import FeatureSet, choose_features
 from gpuvision.matching.features.imaging import Imaging
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.ranging.line import LineReadout
+from gpuvision.servoing.controllers import PidController, PidGains
+from gpuvision.servoing.loop import ServoLoop, WallClock
+from gpuvision.servoing.observer import MotionModel, PoseMeasurement, PoseObserver, Verdict
+from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.servoing.streamed_pose import streamed_pose
 from gpuvision.status import Status
 from round_boards import NOISE, PIXEL, SHAPE, TRACES, moved_picture, round_artwork, round_board, round_picture
@@ -78,6 +82,30 @@ def test_poses_of_a_stream_are_those_of_single_calls(
     assert [pose.status for pose in measured] == [0] * (FRAMES - 1) + [Status.NO_DATA]
     error = np.stack([pose.pose for pose in measured[:-1]]) - true
     assert (np.abs(error) < 6 * np.sqrt([np.diag(pose.covariance) for pose in measured[:-1]])).all()
+
+
+def test_loop_with_a_wall_clock_takes_the_poses_of_a_stream(
+    features: FeatureSet, frames: tuple[np.ndarray, np.ndarray], device: Device
+) -> None:
+    bound = features.bind(device, SHAPE, np.uint8, copper="bright", threshold=12.0, noise=NOISE)
+    images, clock, observer = frames[0][:-1], WallClock(), PoseObserver(MotionModel(lag=(0.0,) * 3), gate=1e300)
+    observer.reset(clock.now(), NEAR, np.eye(3))
+    found: list[PoseMeasurement] = []
+    with Pipeline(images, Step(bound.operation, fixed=(NEAR, CORNER)), device=device) as stream:
+        batches = iter(stream)
+
+        def sensor(time: float) -> list[PoseMeasurement]:
+            """Return the poses of the earlier calls that were not returned yet, and take the next one."""
+            arrived = found[-1:]
+            found.extend(streamed_pose(batch, clock.start) for batch in (next(batches, None),) if batch is not None)
+            return arrived
+
+        controller = PidController(PidGains(proportional=1.0))
+        loop = ServoLoop(SimulatedPlant(), sensor, observer, controller, clock, period=0.02, limits=None)
+        record = loop.run(NEAR, 1.0, settling=lambda *_: len(found) == len(images))
+    verdicts = [verdict for _, verdict in record.measurements]
+    assert verdicts == [Verdict.ACCEPTED] * (len(images) - 1)
+    assert all(0.0 < each.exposed < each.arrived < record.time[-1] for each, _ in record.measurements)
 
 
 @pytest.mark.parametrize("kind", ["rulers", "blobs"])

@@ -124,12 +124,27 @@ def _covariance(table: Section) -> tuple[tuple[str, ...], npt.NDArray[np.float64
     table.finish()
     if len(matrix) != len(names):
         raise table.error(f"matrix has {len(matrix)} rows for {len(names)} names")
-    sigmas = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
-    correlation = matrix / np.outer(sigmas, sigmas)
-    values = np.linalg.eigvalsh(correlation)
-    if not np.allclose(correlation, correlation.T, rtol=0.0, atol=_ROUNDING) or values[0] < -_ROUNDING * values[-1]:
-        raise table.error("matrix is no covariance, expected a symmetric matrix without negative eigenvalues")
+    if not _is_covariance(matrix):
+        raise table.error(
+            "matrix is no covariance, expected a symmetric matrix with variances above 0 and no negative eigenvalue"
+        )
     return names, matrix
+
+
+def _is_covariance(matrix: npt.NDArray[np.float64]) -> bool:
+    """Return whether a square matrix is symmetric, with variances above 0 and no negative eigenvalue."""
+    variances = np.diag(matrix)
+    if not (variances > 0.0).all():
+        return False
+    sigmas = np.sqrt(variances)
+    with np.errstate(over="ignore"):
+        correlation = matrix / sigmas / sigmas[:, None]
+    if not (np.abs(correlation) <= 1.0 + _ROUNDING).all():
+        return False
+    values = np.linalg.eigvalsh(correlation)
+    return bool(
+        np.allclose(correlation, correlation.T, rtol=0.0, atol=_ROUNDING) and values[0] >= -_ROUNDING * values[-1]
+    )
 
 
 def read_calibrated_size(path: str | Path) -> tuple[int, int] | None:

@@ -348,6 +348,8 @@ def test_camera_file_without_covariance_counts_as_exact(images: Path, tmp_path: 
         (CAMERA + '[covariance]\nnames = "f,cx"\nmatrix = [[1.0, 0.0]]\n', "matrix has 1 rows for 2 names"),
         (CAMERA + '[covariance]\nnames = "f,cx"\nmatrix = [[1.0, 2.0], [2.0, 1.0]]\n', "matrix is no covariance"),
         (CAMERA + '[covariance]\nnames = "f,cx"\nmatrix = [[1.0, 0.5], [0.0, 1.0]]\n', "matrix is no covariance"),
+        (CAMERA + '[covariance]\nnames = "f,cx"\nmatrix = [[0.0, 1e20], [1e20, 0.0]]\n', "matrix is no covariance"),
+        (CAMERA + '[covariance]\nnames = "f,cx"\nmatrix = [[1e-310, 1e20], [1e20, 1.0]]\n', "matrix is no covariance"),
     ],
 )
 def test_camera_file_that_does_not_fit_is_refused(images: Path, tmp_path: Path, text: str, said: str) -> None:

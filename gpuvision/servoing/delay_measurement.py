@@ -28,8 +28,10 @@ from gpuvision.validation import finite, integer
 
 Float64 = npt.NDArray[np.float64]
 
-# Nodes and weights of the Gauss-Hermite quadrature over the jitter.
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
+# Nodes [sigma] and weights of the trapezoids over the jitter (chosen). The command has a corner at each frame: Gaussian
+# quadrature with few nodes gives the likelihood a ripple as large as its curvature.
+_NODES = np.linspace(-4.0, 4.0, 21)
+_WEIGHTS = np.exp(-0.5 * _NODES**2)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 # Fewer samples than this do not fix five parameters (chosen).
 _MIN_SAMPLES = 20
@@ -144,8 +146,13 @@ def measure_delay(
 
     Notes
     -----
-    A lag of the plant counts to the delay. The standard deviations are those of the inverse Fisher information, from
-    differences of the likelihood. The likelihood of a sample is normal with the exact mean and variance of the jitter.
+    A lag of the plant counts to the delay. The likelihood of a sample is normal with the mean and variance of the
+    jitter. The position is not normal where the command changes its velocity, so that the standard deviations are those
+    of the sandwich estimator of [1]_, from differences of the likelihood.
+
+    References
+    ----------
+    .. [1] H. White, *Maximum Likelihood Estimation of Misspecified Models*, Econometrica 50, 1982.
     """
     times, known, seen = _samples(time, command, measured)
     step = float(np.median(np.diff(times)))
@@ -247,9 +254,13 @@ class _Likelihood:
         """Return the negative log-likelihood without its constant."""
         if not 0.0 <= parameters[0] <= self._limit or not np.all(np.abs(parameters[1:]) < 30.0):
             return math.inf
+        return float(np.sum(self._costs(parameters)))
+
+    def _costs(self, parameters: Float64) -> Float64:
+        """Return the negative log-likelihoods (n,) of the samples."""
         scale = self._weighted(parameters, 1.0)[0]
         _, _, residual, variance = self._weighted(parameters, scale)
-        return 0.5 * float(np.sum(residual**2 / variance + np.log(variance)))
+        return 0.5 * (residual**2 / variance + np.log(variance))
 
     def maximise(self, delay: float, jitter: float) -> Float64:
         """Return the parameters of the largest likelihood, from a first delay and jitter [s]."""
@@ -260,15 +271,19 @@ class _Likelihood:
         return np.asarray(minimize(self.cost, first, method="Nelder-Mead", options=options).x, np.float64)
 
     def covariance(self, best: Float64) -> Float64:
-        """Return the inverse (3, 3) of the Hessian of the cost, by central differences."""
-        steps = np.diag([1e-3, 2e-2, 1e-2])  # [frames], and factors of jitter and noise
+        """Return the covariance (3, 3): inverse Hessian, squared gradients of the samples, inverse Hessian."""
+        # [frames], and factors of jitter and noise
+        steps = np.diag([max(1e-3, 0.3 * math.exp(best[1])), 2e-2, 1e-2])
         middle = np.maximum(best, [2.0 * steps[0, 0], -25.0, -25.0])
         hessian = np.zeros((3, 3))
         for i in range(3):
             for j in range(3):
                 corners = [a * b * self.cost(middle + a * steps[i] + b * steps[j]) for a in (-1, 1) for b in (-1, 1)]
                 hessian[i, j] = sum(corners) / (4.0 * steps[i, i] * steps[j, j])
-        return np.asarray(np.abs(np.linalg.pinv(hessian)), np.float64)
+        changes = np.array([self._costs(middle + each) - self._costs(middle - each) for each in steps])
+        gradients = changes / (2.0 * np.diag(steps)[:, None])
+        inverse = np.linalg.pinv(hessian)
+        return np.asarray(inverse @ (gradients @ gradients.T) @ inverse, np.float64)
 
     def single_delays(self, best: Float64) -> Float64:
         """Return the delays [s] of the samples in which the jitter exceeds the noise."""

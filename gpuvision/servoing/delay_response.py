@@ -28,6 +28,8 @@ _SCANS, _BISECTIONS = 24, 22
 # Trapezoids over a normal distribution of the delay, and their range [sigma] (chosen): the limits of 81 and of 401
 # differ by less than 0.2 %, and the tail beyond 4 sigma has a probability of 6e-5.
 _NODES, _RANGE = 81, 4.0
+# Longest step response that is searched for the settling [frames] (chosen): an hour at 1 kHz, 30 MB an array.
+_MAX_FRAMES = 3_600_000
 
 
 def root_locus(delay: float, gains: npt.ArrayLike) -> npt.NDArray[np.complex128]:
@@ -89,7 +91,7 @@ def settling_frames(delay: float, gain: float, tolerance: float) -> int:
     Raises
     ------
     ValueError
-        The loop is not stable, or the tolerance is out of range.
+        The loop is not stable, the tolerance is out of range, or the search takes more than 3.6 million frames.
     """
     tolerance = finite(tolerance, "tolerance", above=0.0, maximum=1.0)
     slowest = float(np.abs(root_locus(delay, gain)).max()) if gain > 0.0 else 1.0
@@ -98,11 +100,15 @@ def settling_frames(delay: float, gain: float, tolerance: float) -> int:
     # A double root decays as k r^k: twice the frames of r^k and some for the delay cover it; then double until it fits.
     count = math.ceil(2.0 * math.log(tolerance) / math.log(slowest)) if slowest > 0.0 else 0
     count += 4 * (math.ceil(delay) + 2)
-    while True:
+    while count <= _MAX_FRAMES:
         outside = np.flatnonzero(np.abs(step_response(delay, gain, count)) > tolerance)
         if outside.size == 0 or outside[-1] < count // 2:
             return int(outside[-1]) + 1 if outside.size else 0
         count *= 2
+    raise ValueError(
+        f"the loop with delay {delay:g} frames and gain {gain:g} does not settle within {_MAX_FRAMES // 2} frames; "
+        "raise the gain"
+    )
 
 
 class JitterMoments(NamedTuple):

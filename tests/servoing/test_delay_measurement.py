@@ -54,6 +54,30 @@ def test_uncertainty_covers_the_error() -> None:
     assert 0.3 < np.mean(jitter**2) < 2.2
 
 
+def _check_sigma_of_a_whole_delay(runs: int) -> None:
+    """Errors at a delay of whole frames, at which each corner of the command meets a sample."""
+    errors = []
+    for seed in range(runs):
+        rng = np.random.default_rng(5100 + seed)  # the jitter is independent of the command
+        time = PERIOD * np.arange(600)
+        command = np.concatenate([[0.0], np.cumsum(excitation(599, SPEED / 2.0, seed=100 + seed)) * PERIOD])
+        late = 2e-3 + 0.15e-3 * rng.standard_normal(600)
+        measured = np.interp(time - late, time, command) + 1e-7 * rng.standard_normal(600)
+        found = measure_delay(time, command, measured, longest=0.02)
+        errors.append((found.mean - 2e-3) / found.mean_sigma)
+    # The mean of squares of a unit normal has a standard deviation of the root of 2 / runs.
+    assert np.mean(np.square(errors)) == pytest.approx(1.0, abs=2.5 * np.sqrt(2.0 / runs))
+
+
+def test_uncertainty_covers_the_error_of_a_whole_delay() -> None:
+    _check_sigma_of_a_whole_delay(10)
+
+
+@pytest.mark.slow
+def test_uncertainty_covers_the_error_of_a_whole_delay_in_100_recordings() -> None:
+    _check_sigma_of_a_whole_delay(100)
+
+
 def test_missing_frames_and_a_chirp() -> None:
     time = PERIOD * np.arange(500)
     command = chirp(500, PERIOD, 1e-3, 2.0, 60.0)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -51,6 +54,17 @@ def test_settling_of_an_unstable_loop_is_an_error() -> None:
         settling_frames(2, 0.62, 0.01)
     with pytest.raises(ValueError, match="not stable"):
         settling_frames(2, 0.0, 0.01)
+
+
+def test_settling_of_a_slow_loop_is_an_error_without_much_memory() -> None:
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="gain 1e-08 does not settle within 1800000 frames; raise the gain"):
+        settling_frames(2.0, 1e-8, 0.01)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 1e6
+    # A first-order loop: (1 - gain)^n = 0.01.
+    assert settling_frames(0.0, 1e-4, 0.01) == math.ceil(math.log(0.01) / math.log1p(-1e-4))
 
 
 def test_root_locus_is_sorted_and_leaves_the_circle_at_the_limit() -> None:

@@ -139,6 +139,11 @@ def fit_nozzle_axis(
         The angles do not determine all parameters.
     ValueError
         A shape or a harmonic is wrong, or the marker turns against the sense of the angles.
+
+    Notes
+    -----
+    Without the harmonic -1 the sense is found from the residuals: at two angles, or at angles half a turn apart, both
+    senses fit, and a wrong sense is not seen.
     """
     phi, points = np.asarray(angles, np.float64), np.asarray(seen, np.float64)
     if phi.ndim != 1 or points.shape != (len(phi), 2):
@@ -159,7 +164,13 @@ def fit_nozzle_axis(
     fit = fit_linear(_design(phi, orders), points, covariance, names, "turn the nozzle to other angles")
     motion = fit.values[4:].reshape(-1, 2)
     marker = fit.values[2:4]
-    if -1 in orders and np.hypot(*motion[orders.index(-1)]) > np.hypot(*marker):
+    if -1 in orders:
+        is_reversed = np.hypot(*motion[orders.index(-1)]) > np.hypot(*marker)
+    else:
+        mirrored = fit_linear(_design(-phi, orders), points, covariance, names, "turn the nozzle to other angles")
+        gain = fit.residual_scale**2 - mirrored.residual_scale**2
+        is_reversed = fit.degrees_of_freedom * gain > 9.0  # 3 standard deviations; not with angles that fit both senses
+    if is_reversed:
         raise ValueError("the marker turns against the sense of the angles: give them counter-clockwise as seen")
     return NozzleAxis(
         centre=fit.values[:2],

@@ -132,6 +132,10 @@ def test_wrong_input_is_refused() -> None:
     points = _seen(ANGLES, None)
     with pytest.raises(ValueError, match="turns against the sense"):
         fit_nozzle_axis(-ANGLES, points, NOISE)
+    exact = CENTRE + MARKER * np.exp(1j * ANGLES)
+    for harmonics in ((), (2,)):
+        with pytest.raises(ValueError, match="turns against the sense"):
+            fit_nozzle_axis(-ANGLES, np.stack([exact.real, exact.imag], axis=-1), NOISE, harmonics=harmonics)
     with pytest.raises(ValueError, match=r"expected \(n,\) and \(n, 2\)"):
         fit_nozzle_axis(ANGLES[:-1], points, NOISE)
     with pytest.raises(ValueError, match="not finite"):
@@ -142,3 +146,10 @@ def test_wrong_input_is_refused() -> None:
         fit_nozzle_axis(ANGLES, points, -NOISE)
     with pytest.raises(ValueError, match="covariance has shape"):
         fit_nozzle_axis(ANGLES, points, np.eye(3))
+
+
+def test_angles_half_a_turn_apart_do_not_tell_the_sense() -> None:
+    angles = np.repeat([0.4, 0.4 + math.pi], 6)
+    points = _seen(angles, np.random.default_rng(2))[0]
+    centres = [fit_nozzle_axis(each, points, NOISE, harmonics=()).centre for each in (angles, -angles)]
+    np.testing.assert_allclose(centres[0], centres[1], rtol=1e-9)

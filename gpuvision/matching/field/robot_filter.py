@@ -25,7 +25,6 @@ import numpy.typing as npt
 from gpuvision.matching.field.distance_map import Field
 from gpuvision.matching.field.field_pose import PoseCandidate
 from gpuvision.matching.field.odometry import PoseEstimate, correct, predict, squared_mahalanobis_distance
-from gpuvision.matching.pose.motion import rotation
 from gpuvision.status import Status
 from gpuvision.validation import finite
 
@@ -116,8 +115,8 @@ class _Motion(NamedTuple):
     def since(self, time: float) -> _Motion:
         """Return the second part of the motion: after the first one it gives the pose of the whole motion."""
         first, share = self.until(time).motion, (self.end - time) / (self.end - self.start)
-        back = np.eye(3)
-        back[:2, :2] = rotation(-float(first[2]))
+        c, s = math.cos(first[2]), math.sin(first[2])
+        back = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         return _Motion(time, self.end, back @ (self.motion - first), share * back @ self.covariance @ back.T)
 
 

@@ -85,6 +85,7 @@ def delay(
 
     Give --rate and the parts of the delay, or --recording, or both: then the report states the difference.
     """
+    from gpuvision.formats.cmos_sensor_file import CMOS_SENSORS
     from gpuvision.formats.loop_recording import read_loop_recording
     from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.analysing_delay import DELAY_FILES, MEASURED_PICTURE, analyse_delay
@@ -97,7 +98,8 @@ def delay(
             raise ValueError("give --rate and the parts of the delay, or --recording")
     else:
         budget = _budget(rate, exposure, readout, sensor, roi, transfer, stage or ())
-    inputs = () if recording is None else (recording,)
+    sensor_file = None if sensor in CMOS_SENSORS else sensor
+    inputs = tuple(Path(each) for each in (recording, sensor_file) if each is not None)
     outputs = Outputs("delay", inputs=inputs, overwrite=overwrite)
     outputs.claim_folder(out, DELAY_FILES if recording is None else (*DELAY_FILES, MEASURED_PICTURE))
     outputs.claim(as_json)

@@ -65,7 +65,7 @@ def place(
     machine. The report compares the error at the release and the number of frames with their predictions.
     """
     from gpuvision.formats.json import json_tree
-    from gpuvision.formats.machine_file import read_machine
+    from gpuvision.formats.machine_file import named_files, read_machine
     from gpuvision.host import Device
     from gpuvision.host.files import write_text_atomic
     from gpuvision.host.outputs import Outputs
@@ -77,7 +77,7 @@ def place(
     from gpuvision.workflows.placing import simulate_placements
 
     target = quantities(at, "--at", "m,m,rad")
-    outputs = Outputs("place", inputs=[gerbers, machine], overwrite=overwrite)
+    outputs = Outputs("place", inputs=[gerbers, machine, *named_files(machine)], overwrite=overwrite)
     outputs.claim(as_json)
     outputs.claim_folder(out, _FILES)
     described = read_machine(machine, rate=rate)

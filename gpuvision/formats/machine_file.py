@@ -51,6 +51,24 @@ def read_machine(path: str | Path, *, rate: float | None = None) -> Machine:
     return _machine(read_toml(Path(path)), rate)
 
 
+def named_files(path: str | Path) -> tuple[Path, ...]:
+    """Return the files that a machine file names: its camera preset, where it is not one of the package.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    DescriptionError
+        The file is not valid TOML, or the key of the sensor is missing or has a wrong value.
+    """
+    if str(path) in MACHINES:
+        return ()
+    camera = read_toml(Path(path)).section("camera")
+    if camera.word("sensor", CMOS_SENSORS) is None:
+        camera.file("sensor")
+    return camera.files
+
+
 def _machine(top: Section, rate: float | None) -> Machine:
     top.text("name", "")
     camera, calibration = _camera(top.section("camera")), _calibration(top.section("calibration"))

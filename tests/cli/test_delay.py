@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -101,3 +102,18 @@ def test_foreign_files_are_kept(tmp_path: Path, quick_picture: None) -> None:
     run("--rate", 1000, "--out", tmp_path, "--overwrite")
     assert (tmp_path / "report.json").read_text() != "mine"
     run("--rate", 500, "--out", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "kept"), [(("--out", "out", "--json", "cam.toml"), "cam.toml"), (("--out", "in"), "in/report.json")]
+)
+def test_sensor_file_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, outputs: tuple[str, ...], kept: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = (resources.files("gpuvision") / "presets" / "cameras" / "pb1024.toml").read_text(encoding="utf-8")
+    Path(kept).parent.mkdir(exist_ok=True)
+    Path(kept).write_text(text)
+    with pytest.raises(FileExistsError, match=f"it is the input {kept}"):
+        run("--rate", 100, "--exposure", "200us", "--sensor", kept, *outputs, "--overwrite")
+    assert Path(kept).read_text() == text

@@ -79,7 +79,7 @@ def predicted_frames(machine: Machine, error: npt.ArrayLike, fraction: float = R
 
 def _share(machine: Machine, error: Float64) -> float:
     """Return an error (3,) as a fraction of the tolerance: the larger one of distance and angle."""
-    x, y, theta = error.tolist()
+    x, y, theta = (float(each) for each in error)
     return max(math.hypot(x, y) / machine.tolerance.position, abs(theta) / machine.tolerance.angle)
 
 

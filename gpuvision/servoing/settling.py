@@ -201,12 +201,19 @@ class VibrationSettling:
         Number of the last errors to which the vibration is fitted, 4 or more. Default 24.
     lead : float
         Time from the decision to the contact of the part with the board [s]. Default 0.
+    is_filtered : bool
+        Whether the errors are estimates of a filter, such as `PoseObserver`, whose noise is correlated from one frame
+        to the next. False for independent measurements, such as those of `LatestPose` with a new pose in each frame.
+        Default True.
 
     Notes
     -----
     Offset and amplitude are a linear least-squares fit. The error at the contact is taken as offset plus envelope,
     whatever the phase, with the standard deviation of the fit: the head stays within the tolerance from then on. Call
     it once for each frame; it implements `gpuvision.servoing.loop.SettlingRule`.
+
+    The correlation of filtered errors is not known to the rule. It then takes the largest standard deviation that any
+    correlation gives: the sum of those of the errors, each by the absolute value of its weight in the fit.
     """
 
     def __init__(
@@ -218,6 +225,7 @@ class VibrationSettling:
         miss_probability: float = 0.0027,
         window: int = 24,
         lead: float = 0.0,
+        is_filtered: bool = True,
     ) -> None:
         self._tolerance = [finite(each, "tolerance", above=0.0) for each in numbers(tolerance, (3,), "tolerance")]
         self._frequency = [finite(each, "frequency", minimum=0.0) for each in numbers(frequency, (3,), "frequency")]
@@ -225,7 +233,7 @@ class VibrationSettling:
             finite(each, "damping", minimum=0.0, maximum=_MAX_DAMPING) for each in numbers(damping, (3,), "damping")
         ]
         self._miss = finite(miss_probability, "miss_probability", above=0.0, maximum=1.0)
-        self._lead = finite(lead, "lead", minimum=0.0)
+        self._lead, self._is_filtered = finite(lead, "lead", minimum=0.0), is_filtered
         self._samples: deque[tuple[float, Float64, Float64]] = deque(maxlen=integer(window, "window", minimum=4))
 
     def __call__(self, time: float, error: Float64, covariance: Float64) -> bool:
@@ -250,12 +258,15 @@ class VibrationSettling:
         if np.linalg.cond(information) > 1e12:  # the window is a small part of a period
             return 1.0
         covariance = np.linalg.inv(information)
+        weights = covariance @ weighted.T
         fit = covariance @ (weighted.T @ errors)
-        worst, variance = abs(float(fit[0])), float(covariance[0, 0])
+        sigmas = np.abs(weights) @ np.sqrt(variances) if self._is_filtered else np.sqrt(np.diagonal(covariance))
+        worst, spread = abs(float(fit[0])), [float(sigmas[0])]
         if len(fit) == 3:
             ratio = self._damping[axis] / math.sqrt(1.0 - self._damping[axis] ** 2)
             decay = math.exp(-ratio * 2.0 * math.pi * self._frequency[axis] * self._lead)
             worst += decay * math.hypot(fit[1], fit[2])
-            variance += decay**2 * 0.5 * float(covariance[1, 1] + covariance[2, 2])
-        sigma, tolerance = math.sqrt(2.0 * variance), self._tolerance[axis]
+            spread.append(decay * math.hypot(sigmas[1], sigmas[2]) / math.sqrt(2.0))
+        sigma = math.sqrt(2.0) * (sum(spread) if self._is_filtered else math.hypot(*spread))
+        tolerance = self._tolerance[axis]
         return 0.5 * (math.erfc((tolerance - worst) / sigma) + math.erfc((tolerance + worst) / sigma))

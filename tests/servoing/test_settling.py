@@ -12,7 +12,7 @@ from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.controllers import PidController, PidGains
 from gpuvision.servoing.guard import Outcome
 from gpuvision.servoing.loop import LoopRecord, ServoLoop, SimulatedClock
-from gpuvision.servoing.observer import MotionModel, PoseObserver
+from gpuvision.servoing.observer import MotionModel, PoseMeasurement, PoseObserver
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.servoing.settling import VibrationSettling, fit_vibration, vibration_of_loop
 from gpuvision.servoing.simulated_sensor import SimulatedPoseSensor
@@ -33,7 +33,11 @@ def swings(count: int, rng: np.random.Generator) -> np.ndarray:
 
 def wait_by_rule(errors: np.ndarray, tolerance: float, rng: np.random.Generator) -> int:
     rule = VibrationSettling(
-        (tolerance, 1e-3, 1e-3), frequency=(FREQUENCY, 0.0, 0.0), damping=(DAMPING,) * 3, miss_probability=0.02
+        (tolerance, 1e-3, 1e-3),
+        frequency=(FREQUENCY, 0.0, 0.0),
+        damping=(DAMPING,) * 3,
+        miss_probability=0.02,
+        is_filtered=False,
     )
     covariance = SIGMA**2 * np.eye(3)
     for frame, error in enumerate(errors):
@@ -99,7 +103,7 @@ def test_vibration_of_a_simulated_axis_is_identified() -> None:
 
 def test_rule_without_vibration_is_the_normal_distribution() -> None:
     """Four errors of 1 um, mean 2 um: a tolerance of 3 um is two standard deviations of the mean away."""
-    rule = VibrationSettling((3e-6, 1.0, 1.0))
+    rule = VibrationSettling((3e-6, 1.0, 1.0), is_filtered=False)
     for k in range(4):
         assert rule.miss_probability() == 1.0
         rule(k * PERIOD, np.array([2e-6, 0.0, 0.0]), SIGMA**2 * np.eye(3))
@@ -186,3 +190,22 @@ def test_rule_from_a_loop_settles_as_soon_as_the_swing_allows() -> None:
 def test_vibration_of_a_loop_needs_poses() -> None:
     with pytest.raises(ValueError, match="expected 8 or more; run the loop for longer"):
         vibration_of_loop(swinging_loop()[0], 0.244)
+
+
+def test_rule_on_the_estimates_of_an_observer_keeps_its_probability() -> None:
+    """A resting head just beyond the tolerance, and one at the target: the estimates share most of their noise."""
+    rng, sigma, tolerance = np.random.default_rng(8), 10e-6, 12e-6
+
+    def allows(true: float) -> bool:
+        observer = PoseObserver(MotionModel(lag=(0.0,) * 3), gate=1e9)
+        observer.reset(0.0, np.zeros(3), 1e-8 * np.eye(3))
+        rule = VibrationSettling((tolerance, 1.0, 1.0), window=20)
+        for k in range(1, 29):
+            pose = np.array([true + sigma * rng.standard_normal(), 0.0, 0.0])
+            observer.add(PoseMeasurement(k * PERIOD, k * PERIOD, pose, sigma**2 * np.eye(3), 0))
+            state = observer.estimate(k * PERIOD)
+            is_allowed = k > 8 and rule(k * PERIOD, -state.pose, state.covariance)
+        return is_allowed
+
+    assert sum(allows(1.05 * tolerance) for _ in range(40)) == 0
+    assert sum(allows(0.0) for _ in range(8)) >= 6

@@ -46,7 +46,7 @@ class FineStage:
     lag : float
         Time constant of its velocity [s], above 0.
     stroke : float
-        Largest displacement to both sides [m] or [rad], above 0.
+        Largest displacement from the middle, in each direction [m] or [rad], above 0.
     recentring : float
         Velocity of the long stroke per displacement of the fine stage [1/s], 0 or more. Default 20.
     """

@@ -47,13 +47,14 @@ class MotionUncertainty:
     Parameters
     ----------
     speed, turn_rate : float
-        Of the unknown motion without odometry [m/s], [rad/s] (chosen: a walking pace and a quarter turn a second).
+        Speed and turn rate of a robot without odometry [m/s], [rad/s] (chosen: a walking pace and a quarter turn a
+        second).
     share : float
-        Of odometry, relative to the distance and to the turn (chosen: wheels on a carpet).
+        Error of odometry, relative to the distance and to the turn (chosen: wheels on a carpet).
     least, least_turn : float
-        Least ones of odometry for a frame [m], [rad] (chosen).
+        Smallest error of odometry in a frame [m], [rad] (chosen).
     initial, initial_turn : float
-        Of a given first pose [m], [rad] (chosen: placed by hand).
+        Error of a given first pose [m], [rad] (chosen: placed by hand).
     """
 
     speed: float = 1.0

@@ -19,6 +19,9 @@ from gpuvision.validation import finite, integer
 
 Float64 = npt.NDArray[np.float64]
 
+# Smallest gain (chosen): the error then falls by a factor of e in 10 000 frames.
+_MIN_GAIN = 1e-4
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlacementCamera:
@@ -168,7 +171,7 @@ class Machine:
         Time of a coarse registration [s], 0 or more, default 0. It finds the pose of the first frame where rulers that
         cover the landing zone have no room; the head rests during this time.
     gain : float, optional
-        Fraction of the error that one frame corrects. Default: the largest one without oscillation.
+        Fraction of the error that one frame corrects, 1e-4 or more. Default: the largest one without oscillation.
     drift : ThermalDrift
         Default: none.
 
@@ -209,6 +212,8 @@ class Machine:
                 f"gain is {self.gain}, expected above 0 and below {most:.4g}, the limit of stability for a delay of "
                 f"{self.response_frames:.2f} frames"
             )
+        if self.gain is not None and self.gain < _MIN_GAIN:
+            raise ValueError(f"gain is {self.gain}, expected {_MIN_GAIN} or more: the loop would hardly move")
 
     @property
     def period(self) -> float:

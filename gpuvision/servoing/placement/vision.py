@@ -94,7 +94,8 @@ class SimulatedCamera:
             seed=seed,
         )
         self._bound = render.bind(Device.best() if device is None else device, (1, _SUBPOSES, 3), np.dtype(np.float64))
-        self._period, self._latency, self._exposure = machine.period, machine.delay.latency, camera.exposure
+        delay = machine.delay
+        self._period, self._latency, self._exposure = machine.period, delay.latency, delay.exposure
         self._nozzle, self._camera_in_pipette = nozzle, invert_pose(pipette_in_camera)
         self.dtype = render.dtype
         """Dtype of the frames."""

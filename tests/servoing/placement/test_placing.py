@@ -110,6 +110,8 @@ def test_machines_that_cannot_work_are_refused() -> None:
     camera = MACHINE.camera
     with pytest.raises(ValueError, match=r"gain is 1.5, expected above 0 and below .* limit of stability"):
         dataclasses.replace(MACHINE, gain=1.5)
+    with pytest.raises(ValueError, match=r"gain is 1e-09, expected 0\.0001 or more"):
+        dataclasses.replace(MACHINE, gain=1e-9)
     with pytest.raises(ValueError, match="more than 1/rate"):
         dataclasses.replace(MACHINE, rate=20_000.0)
     with pytest.raises(ValueError, match="expected a rigid transform from pipette to camera"):

@@ -45,7 +45,8 @@ class DepositSums(NamedTuple):
         Fraction of the cells with a height; always known.
     status : uint8
         `Status` flags. NO_DATA: too few cells of the core or of the margin have a height. LOW_SIGNAL: the volume is not
-        significant; the offset is NaN.
+        significant; the offset is NaN. An aperture without cells has the volume 0 and is LOW_SIGNAL; `owner_map`
+        is given apertures with core cells only.
     """
 
     area: FloatArray

@@ -217,8 +217,9 @@ kernel AS_IT_IS void deposits(global const INPUT *restrict z, global const INPUT
     const real unit = surface.length / total;
     const real own_x = board_xx * board_xx * xx + 2 * board_xx * board_xy * xy + board_xy * board_xy * yy;
     const real own_y = board_yx * board_yx * xx + 2 * board_yx * board_yy * xy + board_yy * board_yy * yy;
-    const real variance_x = correlated * (own_x * unit * unit + surface_variance(gradient_x, &surface));
-    const real variance_y = correlated * (own_y * unit * unit + surface_variance(gradient_y, &surface));
+    // Rounding of the differences above may give less than 0 for one valid cell.
+    const real variance_x = correlated * (max(own_x, (real)0) * unit * unit + surface_variance(gradient_x, &surface));
+    const real variance_y = correlated * (max(own_y, (real)0) * unit * unit + surface_variance(gradient_y, &surface));
     offset[2 * item] = has_offset ? (board_xx * middle_x + board_xy * middle_y) * surface.length : REAL_NAN;
     offset[2 * item + 1] = has_offset ? (board_yx * middle_x + board_yy * middle_y) * surface.length : REAL_NAN;
     offset_sigma[2 * item] = has_offset ? sqrt(variance_x) : REAL_NAN;

@@ -175,18 +175,26 @@ kernel void feature_pose(global const WIDE *restrict expected,
     pose_rows all = {nx, ny, px, py, ex, ey, certainty, etch_factor, padded, etch_certainty};
     const pose_frame frame = centre_rows(&all, sum, sum_x, sum_y);
     const laned_pose about = {0, 0, 0, 0, 0, 0, 0};
-    const solved_pose fit = pose_solved(about, all, subsets, trials, steps, min_scale, rank_tolerance, room);
+    solved_pose fit = pose_solved(about, all, subsets, trials, steps, min_scale, rank_tolerance, room);
     const pose_outputs outputs = {motion, 0,         0,    motion_covariance, residuals, weights, scale, residual_scale,
                                   condition, rank, inliers, status,           etch,      inlier_fraction, leverage};
     const pose_limits limits = {min_inlier_fraction, max_leverage, max_shift, max_turn};
     const real at_x = expected[0] - view->placement_x, at_y = expected[1] - view->placement_y;
     const int all_finite = !(not_finite(at_x) | not_finite(at_y) | not_finite((real)expected[2]));
+#ifdef GIVEN_SCALE
+    const real factor = 1;
+#else
+    const real factor = fit.covariance_factor;
+    if (factor < 1) fit.covariance_factor = 1;
+#endif
     store_pose(fit, all, frame, all_finite, 0, count, limits, at_x, at_y, outputs);
 #ifdef GIVEN_SCALE
     const real smallest = 1;
 #else
-    // The residuals of few edges may be small by chance: the covariance is not scaled down by them.
-    const real smallest = fmin(*residual_scale, (real)1);
+    // The residuals of few edges may be small by chance: the covariance is not scaled down by them. fmin: 1 for NaN,
+    // no degrees of freedom.
+    const real smallest = factor < 1 ? 1 : fmin(*residual_scale, (real)1);
 #endif
     store_camera(motion, at_x, at_y, expected, smallest, pose, covariance, motion_covariance);
+    for (int i = 0; i < 9 && factor < 1; i++) motion_covariance[i] *= factor;
 }

@@ -391,28 +391,42 @@ static inline real least_inlier_fraction(pose_matrix inlier_matrix, pose_matrix 
 // Solution in the frame of the rows (their centre is 0, their size 1).
 typedef struct {
     laned_pose pose;
-    real covariance[FREEDOMS][FREEDOMS]; // of the step d in T exp(d), about the centre of the rows
+    real covariance[FREEDOMS][FREEDOMS]; // of the step d in T exp(d), about the centre of the rows, over the factor
+    real covariance_factor;              // 1, or the variance of the residuals where it is too small to be multiplied
     real scale, residual_scale, condition;
     real inlier_fraction, leverage; // least inlier fraction of the information; largest leverage of an inlier
     int present, inliers, rank;
 } solved_pose;
 
+// Least variance of the residuals that is multiplied into the covariance: above the smallest normal number by the square
+// of a sigma of 1e-9 of the size of the rows.
+#ifdef REAL_IS_DOUBLE
+#define LEAST_VARIANCE ((real)1e-280)
+#else
+#define LEAST_VARIANCE ((real)1e-20f)
+#endif
+
 // Compute the covariance and the largest leverage from the normal equations of the inliers, each with weight 1.
 //
 // Covariance of an M-estimator (Huber, 1981): variance * A^-1, A = sum of h h^T / sigma^2 over the inliers. With a
 // given scale, variance = scale^2 / EFFICIENCY. Otherwise it is estimated from the residuals z in units of the scale:
-// variance = scale^2 (sum psi(z)^2 / (n - FREEDOMS)) / (mean psi'(z))^2. The leverage of a row is h^T A^-1 h / sigma^2.
+// variance = scale^2 (sum psi(z)^2 / (n - FREEDOMS)) / (mean psi'(z))^2; without degrees of freedom residual_scale is NaN
+// and the sigmas are trusted, variance = 1. The leverage of a row is h^T A^-1 h / sigma^2.
 static inline void pose_covariance(private solved_pose *fit, pose_rows all, private const pose_sums *sums) {
     reals factor[TRIANGLE];
     for (int i = 0; i < TRIANGLE; i++) factor[i] = sums->matrix[i];
     factored(factor);
     const real free = (real)(fit->inliers - FREEDOMS), mean = sums->slopes / fit->inliers;
-    fit->residual_scale = fit->scale * sqrt(sums->squares / free) / mean;
+    fit->residual_scale = free > 0 ? fit->scale * sqrt(sums->squares / free) / mean : REAL_NAN;
 #ifdef GIVEN_SCALE
-    const real variance = fit->scale * fit->scale / (real)(EFFICIENCY);
+    const real whole = fit->scale * fit->scale / (real)(EFFICIENCY);
 #else
-    const real variance = fit->residual_scale * fit->residual_scale;
+    const real whole = free > 0 ? fit->residual_scale * fit->residual_scale : 1;
 #endif
+    // Exact rows have a variance of 0 or nearly so, from which no leverage follows.
+    const int is_usual = whole >= LEAST_VARIANCE && whole < (real)INFINITY;
+    const real variance = is_usual ? whole : 1;
+    fit->covariance_factor = is_usual ? 1 : whole;
     for (int i = 0; i < FREEDOMS; i++) {
         reals unit[FREEDOMS], column[FREEDOMS];
         for (int k = 0; k < FREEDOMS; k++) unit[k] = (reals)(real)(i == k);

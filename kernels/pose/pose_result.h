@@ -82,7 +82,8 @@ static inline void store_pose(solved_pose fit, pose_rows all, pose_frame frame, 
     // other rows check each row.
     const real leverage = fit.inlier_fraction > 0.75f ? limits.leverage : limits.leverage / 2;
     const int refused = fit.rank < POSE_PARAMETERS || fit.inliers < POSE_PARAMETERS ||
-                        !(fit.inlier_fraction >= limits.inlier_fraction) || !(fit.leverage < leverage);
+                        !(fit.inlier_fraction >= limits.inlier_fraction) || !(fit.leverage < leverage) ||
+                        !(fit.covariance_factor < (real)INFINITY);
     const real axx = 1 + FIRST(fit.pose.dxx), axy = FIRST(fit.pose.dxy), ayx = FIRST(fit.pose.dyx),
                ayy = 1 + FIRST(fit.pose.dyy), length = sqrt(axx * axx + ayx * ayx), c = axx / length, s = ayx / length;
     const real move_x = FIRST(fit.pose.x) * frame.size, move_y = FIRST(fit.pose.y) * frame.size;
@@ -123,7 +124,8 @@ static inline void store_pose(solved_pose fit, pose_rows all, pose_frame frame, 
             real total = 0;
             for (int k = 0; k < POSE_PARAMETERS; k++)
                 for (int l = 0; l < POSE_PARAMETERS; l++) total += lever[i][k] * fit.covariance[k][l] * lever[j][l];
-            to.covariance[(item * POSE_PARAMETERS + i) * POSE_PARAMETERS + j] = bad ? REAL_NAN : total;
+            to.covariance[(item * POSE_PARAMETERS + i) * POSE_PARAMETERS + j] =
+                bad ? REAL_NAN : total * fit.covariance_factor;
         }
     for (int i = 0; i < count; i += LANES) {
         const laned_row at = row_of(all, i);

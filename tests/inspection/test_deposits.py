@@ -130,6 +130,23 @@ def test_an_aperture_without_cells_and_cells_without_noise(rng: np.random.Genera
     check(DepositSums(*(each[:7] for each in found)), wanted, 2e-4)
 
 
+def test_one_valid_cell_has_the_offset_of_its_place(device: Device) -> None:
+    """Its place has no error but that of the surface, here 0; a difference of squares may round below 0."""
+    of = scene(np.random.default_rng(3), (24, 72), np.float32)
+    core, sigmas = of.owner == 1, []
+    for row, column in np.argwhere(core):
+        z = np.full_like(of.z, math.nan)
+        z[row, column] = of.z[12, 12] + 300e-6 if math.isfinite(of.z[12, 12]) else 1.3e-3
+        table = of.table.copy()
+        table[:, -(TERMS**2) :] = 0.0
+        single = of._replace(z=z, owner=np.where(core, 1, 0).astype(np.int32), table=table)
+        found = run(operation(single, least_valid=1e-3), single, device)
+        assert Status(int(found.status[0])) == Status.OK
+        sigmas.append(found.offset_sigma[0])
+    assert np.isfinite(sigmas).all()
+    np.testing.assert_allclose(sigmas, 0.0, atol=0.01 * CELL)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [

@@ -31,6 +31,7 @@ from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.board.edge_measurement import BoardMeasurer
 from gpuvision.matching.board.located_board import LocatedBoard
 from gpuvision.matching.board.measurement_result import MeasurementLimits
+from gpuvision.matching.pose.pose import BoardPose
 from gpuvision.workflows.locating_board import _reason_of_ambiguity, locate_board
 from gpuvision.workflows.locating_robot import floor_points
 
@@ -115,6 +116,20 @@ def test_a_camera_is_located_where_it_is(artwork: Artwork, turned: float, device
     assert np.all(located.sigmas[:2] < 0.05 * PIXEL)
     assert located.rulers.used.sum() >= 0.9 * located.rulers.in_image.sum()
     assert located.noise == pytest.approx(NOISE, rel=0.1)
+
+
+def test_edges_that_agree_exactly_are_refused(artwork: Artwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A covariance of 0 from residuals of 0 is no covariance."""
+    fit = BoardMeasurer._fit
+
+    def exact(*of: Any) -> BoardPose:
+        found = fit(*of)
+        return found._replace(residual_scale=np.zeros(()), covariance=np.zeros_like(found.covariance))
+
+    monkeypatch.setattr(BoardMeasurer, "_fit", exact)
+    pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 2e-3)
+    located = locate_board(camera_image(artwork, pose), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0))
+    assert "all edges agree exactly" in located.reason
 
 
 @pytest.mark.parametrize(

@@ -214,10 +214,14 @@ class BoardMeasurer:
             found = count_true(rulers.found, fiducials.found, fiducials.found)
             return refuse_measurement(rulers, fiducials, _reason_of(fit, found, self.limits))
         residual_scale = float(to_numpy(fit.residual_scale))
+        if residual_scale == 0.0:
+            reason = (
+                "all edges agree exactly, so that the covariance of the pose is unknown; is the image without noise?"
+            )
+            return refuse_measurement(rulers, fiducials, reason)
         solution = PoseSolution(
             pose=_about_origin(np.asarray(to_numpy(fit.pose), np.float64), self.features.placement),
-            # The residuals of few edges may be small by chance: the covariance is not scaled down by them.
-            covariance=np.asarray(to_numpy(fit.covariance), np.float64) / min(residual_scale, 1.0) ** 2,
+            covariance=_covariance_of(fit),
             etch_bias=float(to_numpy(fit.etch_bias)) if has_etch_bias else math.nan,
             residual_scale=residual_scale,
             condition=float(to_numpy(fit.condition)),
@@ -267,12 +271,10 @@ class BoardMeasurer:
         if not np.all(np.isfinite(solution.covariance)):
             return solution
         fit = self._fit(solution.rulers, solution.fiducials, scale, None, "similarity")
-        if int(to_numpy(fit.status)):
+        if int(to_numpy(fit.status)) or float(to_numpy(fit.residual_scale)) == 0.0:
             return solution
         limits = self.limits
-        covariance = (
-            np.asarray(to_numpy(fit.covariance), np.float64) / min(float(to_numpy(fit.residual_scale)), 1.0) ** 2
-        )
+        covariance = _covariance_of(fit)
         error = ScaleError(float(to_numpy(fit.deformation)[..., 0]), math.sqrt(covariance[3, 3]))
         solution = solution._replace(scale_error=error)
         if not abs(error.value) > limits.scale_significance * error.sigma:
@@ -346,6 +348,13 @@ def _reason_of(fit: BoardPose, found: int, limits: MeasurementLimits) -> str:
     if math.isfinite(leverage) and leverage > 0.0:
         return "a part of the pose depends on a single edge that no other edge checks; use more features"
     return "the edges found do not determine x, y and theta (all parallel, or all through one point)"
+
+
+def _covariance_of(fit: BoardPose) -> Float64:
+    """Return the covariance of a pose, not scaled down by the residuals: those of few edges may be small by chance."""
+    # fmin: the residual scale is NaN without degrees of freedom, where the covariance is that of the sigmas.
+    factor = np.fmin(float(to_numpy(fit.residual_scale)), 1.0)
+    return np.asarray(np.asarray(to_numpy(fit.covariance), np.float64) / factor**2)
 
 
 def _about_origin(pose: Float64, point: Float64) -> Float64:

@@ -60,7 +60,8 @@ class FeaturePose(NamedTuple):
         precision.
         Where the status is not OK, all fields are NaN unless their description says otherwise.
     covariance : float64, (3, 3)
-        Covariance of the pose. float32 on devices without double precision.
+        Covariance of the pose: not below that of the sigmas of the features, however well these agree. float32 on
+        devices without double precision.
     status : uint8
         `Status` flags, as in `BoardPose`: NO_DATA, AMBIGUOUS, OUT_OF_RANGE, NOT_FINITE.
     residuals, weights : float32, (rows,)

@@ -59,7 +59,9 @@ class BoardPose(NamedTuple):
     placement : float, (..., 2)
         Measured position of the placement point [m].
     covariance : float, (..., f, f)
-        Covariance of the placement point's x, y [m], of theta [rad], and of the free deformation parameters.
+        Covariance of the placement point's x, y [m], of theta [rad], and of the free deformation parameters. Without a
+        given ``scale`` it is that of the sigmas times ``residual_scale`` squared: 0 for exact rows, and that of the
+        sigmas alone where ``residual_scale`` is NaN.
     residuals : float, (..., rows)
         Residuals along the normal in the artwork's frame [m]; NaN for missing rows.
     weights : float, (..., rows)
@@ -69,7 +71,7 @@ class BoardPose(NamedTuple):
         residuals.
     residual_scale : float, (...,)
         Root of the reduced chi square of the inliers: standard deviation of their residuals in sigmas, about 1 where
-        the sigmas are right.
+        the sigmas are right. NaN with as many inliers as unknowns or fewer.
     condition : float, (...,)
         Largest over smallest standard deviation, of shifts, and of turns times the mean distance of the features from
         their centre. Valid also where it is the reason of a refusal.

@@ -11,7 +11,7 @@ import pytest
 
 from boards import BOARD_MIDDLE
 from gpuvision.camera.orthographic import BoardView
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.board.edge_measurement import move_view
 from gpuvision.matching.features.blob import FindBlobs
@@ -20,6 +20,7 @@ from gpuvision.matching.features.fiducials import SPOKES, Fiducials, fiducial_sm
 from gpuvision.matching.features.imaging import Imaging
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.pose.bound_features import BoundFeatures
+from gpuvision.matching.pose.feature_pose import CameraFeatures, EstimateFeaturePose
 from gpuvision.matching.pose.pose import SolvePose, line_rows
 from gpuvision.reference import robust
 from gpuvision.status import Status
@@ -281,6 +282,44 @@ def test_one_kind_of_features_is_enough(
     found = bind(some, device)(image, NEAR)
     assert found.status == 0
     assert_near(found.pose, true, 5 * np.sqrt(np.diag(found.covariance)))
+
+
+@pytest.mark.parametrize("count", [3, 8])
+def test_exact_edges_have_the_covariance_of_their_sigmas(count: int, device: Device) -> None:
+    """A square without noise: the rulers at its sides agree exactly, and three rulers have no residuals."""
+    image, half, pixel = np.full((128, 128), 50, np.uint8), 32, 1e-5
+    image[32:96, 32:96] = 200
+    rulers = []
+    for number in range(count):
+        angle, along = 0.5 * math.pi * (number % 4), -15.0 + 10.0 * (number // 4)
+        c, s = round(math.cos(angle)), round(math.sin(angle))
+        along -= 3.0 * (number % 4 == 2)
+        rulers.append((pixel * (half * c - along * s), pixel * (half * s + along * c), c, s, -1.0, 0.0, 0.0, 0.0))
+    features = CameraFeatures(
+        rulers=tuple(rulers), matched=(), drilled=(), placement=(0, 0), pixel_size=pixel, frame_shape=image.shape
+    )
+    operation = EstimateFeaturePose(
+        features=features,
+        ruler=RulerEdges(threshold=20, length=32, per_ruler=True, smoothing_px=1.0, noise=1.0),
+        matched=FindBlobs(threshold=20),
+        drilled=FindBlobs(threshold=20),
+        solver=SolvePose(scale=None, min_scale=1.0, max_leverage=1.0),
+    )
+    bound = BoundFeatures(operation, device, image.shape, np.uint8)
+    found = bound(image, np.zeros(3))
+    assert found.status == 0
+    np.testing.assert_allclose(found.pose, 0.0, atol=1e-9)
+    x, y, nx, ny = np.transpose(rulers)[:4]
+    sigma = to_numpy(bound.stages["edges"].outputs.sigma).astype(np.float64) * pixel
+    rows = np.stack([nx, ny, ny * x - nx * y], axis=1) / sigma[:, None]
+    expected = np.linalg.inv(rows.T @ rows)
+    unit = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found.covariance / unit, expected / unit, atol=1e-4)
+    if count == 3:
+        assert np.isnan(found.residual_scale)
+    else:
+        assert found.residual_scale == 0.0
+        np.testing.assert_array_equal(found.motion_covariance, 0.0)
 
 
 def test_wrong_frames_and_options_are_refused(features: FeatureSet, device: Device) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -137,6 +138,46 @@ def test_covariance_is_what_is_measured(
     squares = np.einsum("bi,bij,bj->b", found, np.linalg.inv(covariance), found)
     assert squares.max() < 49.0
     np.testing.assert_allclose(np.mean(result.residual_scale[good]), 1.0, atol=0.1)
+
+
+def information(rows: np.ndarray) -> np.ndarray:
+    """Return the information of the rigid motion about PLACE of each set of rows, at no motion."""
+    nx, ny, px, py, _, _, sigma = np.moveaxis(rows.astype(np.float64), -1, 0)
+    terms = np.stack([nx, ny, ny * (px - PLACE[0]) - nx * (py - PLACE[1])], axis=-1) / sigma[..., None]
+    return terms.swapaxes(-1, -2) @ terms
+
+
+@VARIANTS
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_exact_rows_are_not_refused(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
+    _, rows = scene(rng, 4, 16)
+    rows[..., 4:6] = 0.0
+    result = SolvePose(scale=None, min_scale=1.0, placement=PLACE, variant=variant)(rows.astype(dtype), device=device)
+    assert not result.status.any()
+    np.testing.assert_array_equal(result.residual_scale, 0.0)
+    np.testing.assert_array_equal(result.covariance, 0.0)
+    np.testing.assert_allclose(result.leverage, [carried(each, 0, "rigid")[1] for each in rows], rtol=1e-3)
+
+
+@VARIANTS
+@pytest.mark.parametrize("is_exact", [False, True])
+def test_as_many_rows_as_unknowns_have_the_covariance_of_their_sigmas(
+    device: Device, variant: Any, is_exact: bool, rng: np.random.Generator
+) -> None:
+    _, rows = scene(rng, 6, 3, turn=0.0)
+    rows[..., 4:6] = 0.0 if is_exact else 1e-9 * rng.standard_normal((6, 3, 2))
+    operation = SolvePose(scale=None, min_scale=1.0, placement=PLACE, variant=variant, max_leverage=1.0)
+    result = operation(rows, device=device)
+    good = result.status == Status.OK
+    assert good.any()
+    assert np.isnan(result.residual_scale).all()
+    expected = np.linalg.inv(information(rows))
+    unit = np.sqrt(np.einsum("bi,bj->bij", *2 * [np.diagonal(expected, axis1=1, axis2=2)]))
+    np.testing.assert_allclose((result.covariance / unit)[good], (expected / unit)[good], atol=1e-3)
+    # Nothing checks such a pose.
+    checked = replace(operation, max_leverage=0.95)(rows, device=device)
+    assert (checked.status == Status.AMBIGUOUS).all()
+    np.testing.assert_allclose(checked.leverage[good], 1.0, atol=1e-6)
 
 
 def test_single_follows_double(device: Device, rng: np.random.Generator) -> None:

@@ -53,6 +53,9 @@ class LoopLimits:
     lag : tuple of float
         Time constants with which the axes follow the commanded velocity [s]: the motion that remains after an exposure
         counts to the travel. Default 0.
+    watchdog : float
+        Time without a command after which the plant stops by itself [s]; see `Plant`. Default: never, and the last
+        command lasts until a late frame.
     encoder_error : tuple of float
         Largest difference of encoder and integrated command [m], [m], [rad], above the lag times the speed of the
         axes. Zero of the encoders is the first reading with which the next one agrees. Default: not checked.
@@ -68,6 +71,7 @@ class LoopLimits:
     gated: int = 10
     margin_sigmas: float = 3.0
     lag: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    watchdog: float = math.inf
     encoder_error: tuple[float, float, float] = (math.inf, math.inf, math.inf)
     readings: int = 5
     missed: int = 10
@@ -76,6 +80,8 @@ class LoopLimits:
         finite(self.hold_after, "hold_after", above=0.0)
         finite(self.abort_after, "abort_after", minimum=self.hold_after)
         finite(self.margin_sigmas, "margin_sigmas", minimum=0.0)
+        if not self.watchdog > 0.0:
+            raise ValueError(f"watchdog is {self.watchdog}, expected a time > 0, or infinity for none")
         for each in numbers(self.lag, (3,), "lag"):
             finite(each, "lag", minimum=0.0)
         for name in ("gated", "readings", "missed"):
@@ -99,6 +105,9 @@ class TravelGuard:
     However long the camera is blind, each axis moves at most as far as the last trusted pose was away from the target.
     Bounded is the integral of the commands since the exposure plus lag times the velocity at the exposure: the place
     where an axis with this lag comes to rest, and by which its motion is bounded. A resonance adds its swing.
+
+    The bound holds for frames in time. Before a late frame the last command lasts for longer: n periods move an axis by
+    up to n times the bound, unless a watchdog of one period stops the plant (`LoopLimits.watchdog`).
     """
 
     def __init__(self, margin_sigmas: float, lag: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
@@ -151,6 +160,12 @@ class TravelGuard:
         start, commanded, speed = self._commands[-1] if self._commands else (time, np.zeros(3), np.zeros(3))
         self._commands.append((time, cut, self._speed(commanded, speed, time - start)))
         return cut
+
+    def stop(self, time: float) -> None:
+        """Take note that the plant stopped by itself at a time [s]."""
+        if self._commands:
+            start, commanded, speed = self._commands[-1]
+            self._commands.append((time, np.zeros(3), self._speed(commanded, speed, time - start)))
 
     def _speed(self, commanded: Float64, speed: Float64, step: float) -> Float64:
         """Return the velocity (3,) of the axes some time after a command."""

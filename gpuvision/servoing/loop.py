@@ -52,7 +52,11 @@ class Plant(Protocol):
     """Axes of a machine that move the head: a motion controller or its simulation."""
 
     def command(self, time: float, velocity: Float64) -> None:
-        """Move with a velocity (3,) [m/s], [m/s], [rad/s] from a time on, until the next command."""
+        """Move with a velocity (3,) [m/s], [m/s], [rad/s] from a time on, until the next command.
+
+        A plant with a watchdog stops by itself a fixed time after its last command: a computer that hangs does not move
+        the head on. Give this time as `LoopLimits.watchdog`, one frame or a little more.
+        """
 
     def read(self, time: float) -> PlantReading:
         """Return the reading of the encoders at a time, not before the last command."""
@@ -269,6 +273,7 @@ class _Run:
         finally:
             stopped = self.loop.clock.now()
             self.loop.plant.command(stopped, np.zeros(3))
+            self._watch(stopped)
             self.loop.observer.command(stopped, np.zeros(3))
         target, pose, velocity, sigma, command, encoder = self.columns[:, :row]
         return LoopRecord(
@@ -295,7 +300,7 @@ class _Run:
             late = max(int((now - due) / loop.period), 0)
             self.missed += late
             self.faults.tick(late > 0)
-            outcome = self._frame(row, now)
+            outcome = self._frame(row, now, loop.period * (1 + late))
             self.computing[row] = loop.clock.now() - now
             frame, row = frame + 1 + late, row + 1
             if outcome is not None:
@@ -303,9 +308,10 @@ class _Run:
         loop.clock.wait_until(self.start + self.count * loop.period)  # the last command lasts for a frame
         return Outcome.TIME_OVER, row
 
-    def _frame(self, row: int, now: float) -> Outcome | None:
-        """Do one frame; return the reason to end the loop, or None."""
+    def _frame(self, row: int, now: float, elapsed: float) -> Outcome | None:
+        """Do one frame, a time after the last one; return the reason to end the loop, or None."""
         loop = self.loop
+        self._watch(now)
         for measurement in loop.sensor(now):
             is_future = measurement.exposed > now + _SAME_TIME
             verdict = Verdict.REFUSED if is_future else loop.observer.add(measurement)
@@ -324,18 +330,26 @@ class _Run:
         if outcome is None and self.settling is not None and self.settling(now, error, state.covariance):
             outcome = Outcome.ARRIVED
         if outcome is None:
-            self._command(row, now, target, error, speed - state.velocity, speed)
+            velocity = loop.controller(error, speed - state.velocity, elapsed, speed)
+            self._command(row, now, velocity, target + loop.period * speed)
         return outcome
 
-    def _command(
-        self, row: int, now: float, target: Float64, error: Float64, error_velocity: Float64, speed: Float64
-    ) -> None:
+    def _watch(self, now: float) -> None:
+        """Tell observer and guard that the watchdog of the plant stopped the head, if it did."""
+        stopped = self.last[0] + self.limits.watchdog
+        if now > stopped + _SAME_TIME:
+            self.loop.observer.command(stopped, np.zeros(3))
+            self.guard.stop(stopped)
+            self.commanded += self.last[1] * self.limits.watchdog
+            self.last = stopped, np.zeros(3)
+
+    def _command(self, row: int, now: float, velocity: Float64, target: Float64) -> None:
+        """Command a velocity, within the guards for a target at the next frame."""
         loop = self.loop
-        velocity = loop.controller(error, error_velocity, loop.period, speed)
         if loop.limits is not None:
             if now - self.guard.exposed > self.limits.hold_after:
                 velocity = np.zeros(3)
-            velocity = self.guard.limit(now, velocity, target + loop.period * speed, loop.period)
+            velocity = self.guard.limit(now, velocity, target, loop.period)
         loop.plant.command(now, velocity)
         loop.observer.command(now, velocity)
         self.last = now, velocity

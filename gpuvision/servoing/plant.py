@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 
@@ -26,6 +27,8 @@ class SimulatedPlant:
         (3,): x [m], y [m], theta [rad] at time 0, at rest. Default: zeros.
     history : int
         Number of past commands for which `pose` still answers, 2 or more. Default 4096.
+    watchdog : float
+        Time after a command at which the axes are commanded to stand still [s]. Default: never.
 
     Notes
     -----
@@ -34,11 +37,18 @@ class SimulatedPlant:
     """
 
     def __init__(
-        self, axes: Sequence[Axis] = (Axis(), Axis(), Axis()), *, start: npt.ArrayLike = (0, 0, 0), history: int = 4096
+        self,
+        axes: Sequence[Axis] = (Axis(), Axis(), Axis()),
+        *,
+        start: npt.ArrayLike = (0, 0, 0),
+        history: int = 4096,
+        watchdog: float = math.inf,
     ) -> None:
         if len(axes) != 3:
             raise ValueError(f"a plant has 3 axes (x, y, theta), got {len(axes)}")
-        self.axes = tuple(axes)
+        if not watchdog > 0.0:
+            raise ValueError(f"watchdog is {watchdog}, expected a time > 0, or infinity for none")
+        self.axes, self._watchdog = tuple(axes), math.inf if math.isinf(watchdog) else _ticks(watchdog)
         self._steppers = [AxisStepper(each) for each in axes]
         position = numbers(start, (3,), "start")
         states = [each.start(where) for each, where in zip(axes, position, strict=True)]
@@ -96,7 +106,7 @@ class SimulatedPlant:
         if found is None:
             raise ValueError(f"the time {time:.6f} s is before the history of the plant; enlarge history")
         start, states = found
-        moved = [each.advance(state, ticks - start) for each, state in zip(self._steppers, states, strict=True)]
+        moved = self._advance(states, ticks - start)
         return [
             float(state[Q] if axis.resonance else state[P] + state[S])
             for axis, state in zip(self.axes, moved, strict=True)
@@ -107,7 +117,17 @@ class SimulatedPlant:
         ticks = _ticks(time) - start
         if ticks < 0:
             raise ValueError(f"the time {time:.6f} s is before the last command at {start * TICK:.6f} s")
-        return [each.advance(state, ticks) for each, state in zip(self._steppers, states, strict=True)]
+        return self._advance(states, ticks)
+
+    def _advance(self, states: list[Float64], ticks: int) -> list[Float64]:
+        """Return the states some ticks after a command."""
+        steppers = self._steppers
+        if ticks > self._watchdog:
+            before = int(self._watchdog)
+            moved = [each.advance(state, before) for each, state in zip(steppers, states, strict=True)]
+            states = [each.command(state, 0.0) for each, state in zip(steppers, moved, strict=True)]
+            ticks -= before
+        return [each.advance(state, ticks) for each, state in zip(steppers, states, strict=True)]
 
 
 def _ticks(time: float) -> int:

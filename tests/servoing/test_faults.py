@@ -284,3 +284,69 @@ def test_times_ahead_of_the_loop_are_refused() -> None:
     assert record.outcome is Outcome.LOST
     assert {verdict for _, verdict in record.measurements} == {Verdict.REFUSED}
     assert np.all(plant.pose(1.0) == 0.0)
+
+
+@pytest.mark.parametrize("lag", [0.0, 1e-3])
+def test_watchdog_bounds_the_motion_before_a_late_frame(lag: float) -> None:
+    """A frame that is 50 ms late, while the head moves fast: it stops, and the loop goes on to the target."""
+
+    class Stalled(SimulatedClock):
+        calls = 0
+
+        def wait_until(self, time: float) -> float:
+            self.calls += 1
+            return super().wait_until(time + 0.05 if self.calls == 7 else time)
+
+    def stalled(watchdog: float) -> tuple[LoopRecord, SimulatedPlant]:
+        plant = SimulatedPlant((Axis(lag=lag),) * 3, watchdog=watchdog)
+        observer = PoseObserver(MotionModel(lag=(lag,) * 3, position_noise=(1e-11,) * 3))
+        observer.reset(-DELAY, np.zeros(3), COVARIANCE)
+        sensor = SimulatedPoseSensor(plant.pose, period=PERIOD, delay=DELAY, covariance=COVARIANCE)
+        controller = PidController(PidGains(proportional=300.0))
+        limits = LoopLimits(lag=(lag,) * 3, watchdog=watchdog, encoder_error=(1e-3,) * 3)
+        loop = ServoLoop(plant, sensor, observer, controller, Stalled(), period=PERIOD, limits=limits)
+        return loop.run(TARGET, 0.15), plant
+
+    record, plant = stalled(PERIOD)
+    assert record.missed == 50
+    assert record.outcome is Outcome.TIME_OVER
+    assert record.glitches == 0
+    check_travel(record, plant)
+    times = np.arange(0.0, 0.15, 2e-4)
+    assert np.all(np.abs(plant.pose(times)) <= np.abs(TARGET) + SLACK)
+    assert record.pose[-1] == pytest.approx(TARGET, abs=5e-6)
+    assert {verdict for _, verdict in record.measurements} == {Verdict.ACCEPTED}
+    free, plant = stalled(np.inf)
+    assert free.missed == 50
+    assert np.abs(plant.pose(times)).max() > 2.0 * np.abs(TARGET).max()
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan])
+def test_watchdog_is_checked(wrong: float) -> None:
+    with pytest.raises(ValueError, match="watchdog is"):
+        LoopLimits(watchdog=wrong)
+    with pytest.raises(ValueError, match="watchdog is"):
+        SimulatedPlant(watchdog=wrong)
+
+
+def test_controller_is_given_the_time_since_its_last_call() -> None:
+    """One frame is late by two frames: the integral part grows by three frames."""
+
+    class Late(SimulatedClock):
+        def wait_until(self, time: float) -> float:
+            return super().wait_until(time + 2.0 * PERIOD if abs(time - 3.0 * PERIOD) < 1e-9 else time)
+
+    periods: list[float] = []
+
+    class Recorder(PidController):
+        def __call__(
+            self, error: np.ndarray, velocity: np.ndarray, period: float, target_velocity: np.ndarray | None = None
+        ) -> np.ndarray:
+            periods.append(period)
+            return super().__call__(error, velocity, period, target_velocity)
+
+    plant, observer = SimulatedPlant(), PoseObserver(MODEL)
+    observer.reset(-DELAY, np.zeros(3), COVARIANCE)
+    controller = Recorder(PidGains(proportional=50.0))
+    ServoLoop(plant, lambda _: [], observer, controller, Late(), period=PERIOD).run(TARGET, 8.0 * PERIOD)
+    assert periods == pytest.approx([PERIOD] * 3 + [3.0 * PERIOD] + [PERIOD] * 2)

@@ -100,7 +100,10 @@ def place(
     write_report(as_json, report, outputs)
     with outputs.folder(out) as inside:
         write_text_atomic(inside / "report.json", json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n")
-        draw_features(inside / "features.png", artwork, result.plan.features, result.plan.features.region)
+        view, region = described.camera.view(result.plan.camera_pose), result.plan.features.region
+        draw_features(
+            inside / "features.png", artwork, result.plan.features, region, view=view, target=result.plan.target[:2]
+        )
         draw_placements(
             inside / "placements.png",
             period=described.period,
@@ -108,6 +111,6 @@ def place(
             error=result.error,
             sigmas=result.simulated_sigmas,
             delay=described.delay.parts,
-            tolerance=described.tolerance.position,
+            tolerance=(described.tolerance.position, described.tolerance.angle),
         )
     echo(f"{result.summary()}\nlook at {out / 'placements.png'} and {out / 'report.json'}", err=prints_report(as_json))

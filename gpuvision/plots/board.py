@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle, Polygon
 from matplotlib.path import Path as Outline
 
 from gpuvision.camera.orthographic import BoardView
@@ -31,7 +31,14 @@ _MM = 1e3
 
 
 def draw_features(
-    path: str | Path, artwork: Artwork, features: FeatureSet, region: npt.ArrayLike, *, overwrite: bool = False
+    path: str | Path,
+    artwork: Artwork,
+    features: FeatureSet,
+    region: npt.ArrayLike,
+    *,
+    view: BoardView | None = None,
+    target: npt.ArrayLike | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Draw a region of the artwork with the selected features as PNG.
 
@@ -45,17 +52,24 @@ def draw_features(
         Selected features.
     region
         (2, 2) least and greatest x, y [m].
+    view : BoardView, optional
+        Image on the board; its border is drawn, and the cross is named image centre. Default: the border of the region.
+    target : array_like, optional
+        (2,) point of the board that the nozzle shall reach [m], marked by a diagonal cross. Default: none.
     overwrite : bool
         Whether an existing file may be replaced. Default False.
     """
     box = np.asarray(region, np.float64)
+    corners = box[[0, 1, 1, 0], [0, 0, 1, 1]] if view is None else _image_corners(view)
+    shown = corners if target is None else np.vstack([corners, np.asarray(target, np.float64)])
+    box = np.stack([np.minimum(box[0], shown.min(axis=0)), np.maximum(box[1], shown.max(axis=0))])
     window = np.stack([np.minimum(box[0], features.region[0]), np.maximum(box[1], features.region[1])])
     border = 0.04 * (window[1] - window[0]).max()
     window = window + border * np.array([[-1.0], [1.0]])
     wide, high = window[1] - window[0]
     figure, axes = _page((9.0, min(max(9.0 * high / wide, 3.0), 12.0) + 0.9))
     draw_artwork(axes, artwork, window)
-    axes.add_patch(Rectangle(_MM * box[0], *(_MM * (box[1] - box[0])), fill=False, edgecolor="white", linestyle="--"))
+    axes.add_patch(Polygon(_MM * corners, fill=False, edgecolor="white", linestyle="--"))
     ends = features.normal * features.length[:, None] / 2
     lines = _MM * np.stack([features.point - ends, features.point + ends], axis=1)
     pair = features.spacing > 0
@@ -69,9 +83,19 @@ def draw_features(
         axes.invert_xaxis()
     axes.set_title(features.summary(), fontsize=8, loc="left")
     handles = [Line2D([], [], color=_USED, label="across an edge"), Line2D([], [], color="#ff66ff", label="a trace")]
-    handles.append(Line2D([], [], color="grey", marker="+", linestyle="", label="placement point"))
-    figure.legend(handles=handles, loc="outside lower left", ncols=3, fontsize=8, frameon=False)
+    centre = "placement point" if view is None else "image centre"
+    handles.append(Line2D([], [], color="grey", marker="+", linestyle="", label=centre))
+    if target is not None:
+        axes.plot(*(_MM * np.asarray(target, np.float64)), marker="x", color=_MISSING, markersize=12, markeredgewidth=2)
+        handles.append(Line2D([], [], color=_MISSING, marker="x", linestyle="", label="target"))
+    figure.legend(handles=handles, loc="outside lower left", ncols=4, fontsize=8, frameon=False)
     _write(figure, path, overwrite)
+
+
+def _image_corners(view: BoardView) -> Float64:
+    """Return the corners (4, 2) of the undistorted image on the board [m], in order."""
+    rows, columns = view.shape
+    return view.to_plane([[0, 0], [columns - 1, 0], [columns - 1, rows - 1], [0, rows - 1]])
 
 
 def draw_artwork(axes: Any, artwork: Artwork, window: Float64) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from gpuvision.host.files import atomic_write
 
@@ -27,9 +29,9 @@ def draw_placements(
     error: Float64,
     sigmas: Float64,
     delay: Mapping[str, float],
-    tolerance: float,
+    tolerance: tuple[float, float],
 ) -> None:
-    """Draw error over time, histogram of the final error with its prediction, and delay budget as PNG.
+    """Draw error over time, histograms of the final error with its prediction, and delay budget as PNG.
 
     Parameters
     ----------
@@ -45,40 +47,61 @@ def draw_placements(
         (3,): predicted standard deviations of the error.
     delay : mapping of str to float
         Parts of the delay by name [s].
-    tolerance : float
-        Tolerance of the position [m].
+    tolerance : (float, float)
+        Tolerances of position [m] and angle [rad].
     """
-    figure = Figure(figsize=(15.0, 4.6), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(15.0, 9.2), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(1, 3)
-    _draw_motion(panels[0], period, motion, tolerance)
-    _draw_errors(panels[1], error, sigmas)
-    _draw_delay(panels[2], delay)
+    panels = figure.subplot_mosaic([["motion x, y", "error x, y", "delay"], ["motion theta", "error theta", "delay"]])
+    for quantity, limit in zip((_POSITION, _ANGLE), tolerance, strict=True):
+        coordinates = ", ".join(quantity.names)
+        _draw_motion(panels[f"motion {coordinates}"], period, motion, limit, quantity)
+        _draw_errors(panels[f"error {coordinates}"], error, sigmas, quantity)
+    _draw_delay(panels["delay"], delay)
     with atomic_write(path) as file:
         figure.savefig(file, format="png")
 
 
-def _draw_motion(axes: Axes, period: float, motion: Sequence[Float64], tolerance: float) -> None:
+class _Quantity(NamedTuple):
+    """Position or angle: names of its coordinates, their columns, and its unit."""
+
+    names: tuple[str, ...]
+    columns: slice
+    factor: float
+    unit: str
+    title: str
+
+
+_POSITION = _Quantity(("x", "y"), slice(0, 2), 1e6, "µm", "distance from the target")
+_ANGLE = _Quantity(("theta",), slice(2, 3), 1e3, "mrad", "angle from the target")
+
+
+def _draw_motion(axes: Axes, period: float, motion: Sequence[Float64], tolerance: float, quantity: _Quantity) -> None:
     for each in motion:
-        distance = np.hypot(each[:, 0], each[:, 1])
-        axes.semilogy(1e3 * period * np.arange(len(each)), 1e6 * distance, color="C0", alpha=0.5, linewidth=0.8)
-    axes.axhline(1e6 * tolerance, color="0.4", linestyle="--", linewidth=0.8, label="tolerance")
-    axes.set(xlabel="time [ms]", ylabel="distance from the target [µm]", title="error over time")
+        distance = np.linalg.norm(each[:, quantity.columns], axis=1)
+        axes.semilogy(
+            1e3 * period * np.arange(len(each)), quantity.factor * distance, color="C0", alpha=0.5, linewidth=0.8
+        )
+    axes.axhline(quantity.factor * tolerance, color="0.4", linestyle="--", linewidth=0.8, label="tolerance")
     axes.legend(fontsize=8)
+    axes.set(xlabel="time [ms]", ylabel=f"{quantity.title} [{quantity.unit}]", title="error over time")
 
 
-def _draw_errors(axes: Axes, error: Float64, sigmas: Float64) -> None:
-    released = error[np.isfinite(error[:, 0]), :2]
-    reach = 1e6 * max(4.0 * float(sigmas[:2].max()), float(np.abs(released).max(initial=0.0)))
+def _draw_errors(axes: Axes, error: Float64, sigmas: Float64, quantity: _Quantity) -> None:
+    """Draw outlines of the histograms, which do not hide each other, and the expected numbers of placements."""
+    released = quantity.factor * error[np.isfinite(error[:, 0]), quantity.columns]
+    predicted = quantity.factor * sigmas[quantity.columns]
+    reach = max(4.0 * float(predicted.max()), float(np.abs(released).max(initial=0.0)))
     edges = np.linspace(-reach, reach, _BINS).tolist()
     places = np.linspace(-reach, reach, 401)
-    for column, name in enumerate("xy"):
-        axes.hist(1e6 * released[:, column], edges, alpha=0.5, color=f"C{column}", label=f"{name} measured")
-        sigma = 1e6 * sigmas[column]
+    for column, (name, sigma) in enumerate(zip(quantity.names, predicted, strict=True)):
+        axes.hist(released[:, column], edges, histtype="step", color=f"C{column}", label=f"{name} measured")
         density = np.exp(-0.5 * (places / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi))
         expected = len(released) * (edges[1] - edges[0]) * density
-        axes.plot(places, expected, color=f"C{column}", label=f"{name} predicted")
-    axes.set(xlabel="error at the release [µm]", ylabel="placements", title=f"{len(released)} placements")
+        axes.plot(places, expected, color=f"C{column}", linestyle="--", label=f"{name} predicted")
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    title = f"{len(released)} placements"
+    axes.set(xlabel=f"error at the release [{quantity.unit}]", ylabel="number of placements", title=title)
     axes.legend(fontsize=8)
 
 

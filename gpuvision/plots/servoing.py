@@ -84,7 +84,7 @@ def draw_measured_delay(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Draw commanded and measured positions, and the distribution of the delay, as PNG.
+    """Draw commanded and measured positions, and the distribution of the delay if it has jitter, as PNG.
 
     Parameters
     ----------
@@ -98,17 +98,19 @@ def draw_measured_delay(
         Whether an existing file may be replaced. Default False.
     """
     figure = _figure((12.0, 4.5))
-    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+    # Without jitter all samples have the same delay: no histogram.
+    differ = delay.delays.size > 0
+    left, *right = figure.subplots(1, 2 if differ else 1, width_ratios=(2, 1) if differ else (1,), squeeze=False)[0]
     unit = 1e6
     left.plot(_MS * time, unit * command, color="tab:blue", linewidth=0.9, label="commanded")
     left.plot(_MS * (time + delay.mean), unit * command, color="tab:blue", linewidth=0.7, ls=":", label="delayed")
     left.plot(_MS * time, unit * measured, ".", color="tab:red", markersize=2.0, label="measured")
     left.set(xlabel="time [ms]", ylabel="position [um] or [urad]")
     left.legend(fontsize=7)
-    if delay.delays.size:
-        right.hist(_MS * delay.delays, bins=40, color="tab:grey")
-    right.axvline(_MS * delay.mean, color="tab:red", linewidth=1.0)
-    right.set(xlabel="delay of single samples [ms]", ylabel="number of samples")
+    for axes in right:
+        axes.hist(_MS * delay.delays, bins=40, color="tab:grey")
+        axes.axvline(_MS * delay.mean, color="tab:red", linewidth=1.0)
+        axes.set(xlabel="delay of single samples [ms]", ylabel="number of samples")
     figure.suptitle(
         f"delay {_MS * delay.mean:.4g} ms ({delay.frames:.3g} frames), sigma {_MS * delay.mean_sigma:.2g} ms; "
         f"jitter {_MS * delay.jitter:.2g} ms",

@@ -27,7 +27,13 @@ from gpuvision.servoing.delay_response import (
     settling_frames,
     step_response,
 )
-from gpuvision.servoing.margins import margins, observer_tolerance, predictor_tolerance
+from gpuvision.servoing.margins import (
+    ObserverTolerance,
+    PredictorTolerance,
+    margins,
+    observer_tolerance,
+    predictor_tolerance,
+)
 from gpuvision.validation import finite
 
 DELAY_FILES = ("delay.png", "report.json")
@@ -142,21 +148,25 @@ class DelayAnalysis:
             "crossover_Hz": found.crossover,
         }
 
-    def _predictor(self, gain: float) -> dict[str, float]:
+    def _shorter(self, found: PredictorTolerance | ObserverTolerance) -> float | None:
+        """Return the time [s] by which a shorter delay makes the loop unstable; None if every shorter one is stable."""
+        return found.shorter * self.budget.period if found.shorter < self.frames else None
+
+    def _predictor(self, gain: float) -> dict[str, float | None]:
         found, period = predictor_tolerance(gain, self.frames), self.budget.period
         return {
             "gain_per_frame": gain,
-            "unstable_from_shorter_by_s": found.shorter * period,
+            "unstable_from_shorter_by_s": self._shorter(found),
             "unstable_from_longer_by_s": found.longer * period,
             "unstable_from_plant_gain": found.plant_gain,
         }
 
-    def _observer(self, gain: float) -> dict[str, float]:
+    def _observer(self, gain: float) -> dict[str, float | None]:
         found, period = observer_tolerance(gain, self.frames, noise_ratio=_NOISE_RATIO), self.budget.period
         return {
             "gain_per_frame": gain,
             "noise_ratio": _NOISE_RATIO,
-            "unstable_from_shorter_by_s": found.shorter * period,
+            "unstable_from_shorter_by_s": self._shorter(found),
             "unstable_from_longer_by_s": found.longer * period,
             "unstable_from_lag_s": found.lag * period,
             "unstable_from_plant_gain": found.plant_gain,

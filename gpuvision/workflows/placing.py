@@ -8,6 +8,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,7 +51,8 @@ class PlacementResult(NamedTuple):
         (n, 3): true pose of the nozzle at the release less the target [m], [m], [rad]; NaN where the part was not
         released.
     motion : tuple of numpy.ndarray
-        True pose of the nozzle less the target in each frame, (frames, 3) for each run, as the calibration sees it.
+        True pose of the nozzle less the target in each frame [m], [m], [rad], (frames, 3) for each run; the last one is
+        the error at the release.
     sources : mapping of str to numpy.ndarray
         Parts of the error (n, 3): "calibration", "drift", and "vision and servo", which is the rest.
     """
@@ -88,37 +90,36 @@ class PlacementResult(NamedTuple):
         return "\n".join(lines)
 
     def report(self) -> dict[str, Any]:
-        """Return the content of ``report.json``: SI units."""
+        """Return the content of ``report.json``: the keys name their SI units."""
         released = np.isfinite(self.error[:, 0])
         found = self.error[released]
         delay = self.machine.delay
         measured = {"total": found, **{name: each[released] for name, each in self.sources.items()}}
         return {
-            "target": self.plan.target.tolist(),
-            "rate": self.machine.rate,
+            "gpuvision": version("gpuvision"),
+            "target": _pose(self.plan.target),
+            "rate_Hz": self.machine.rate,
             "features": len(self.plan.features.length) + len(self.plan.features.fiducials.radius),
-            "search_range": self.plan.features.imaging.shift,
-            "landing": None if self.plan.landing is None else self.machine.landing,
-            "delay": {
-                "parts": delay.parts,
-                "total": delay.total,
-                "frames": delay.frames,
-                "gain": self.machine.loop_gain,
-            },
-            "predicted_sigma": {name: each.tolist() for name, each in self.budget.sigmas.items()},
-            "predicted_sigma_simulated": self.simulated_sigmas.tolist(),
+            "search_range_m": self.plan.features.imaging.shift,
+            "landing_s": None if self.plan.landing is None else self.machine.landing,
+            "period_s": self.machine.period,
+            "parts_s": delay.parts,
+            "total_delay_s": delay.total,
+            "delay_frames": delay.frames,
+            "gain_per_frame": self.machine.loop_gain,
+            "predicted_sigma": {name: _pose(each) for name, each in self.budget.sigmas.items()},
+            "predicted_sigma_simulated": _pose(self.simulated_sigmas),
             "measured_rms": {
-                name: np.sqrt(np.mean(each**2, axis=0)).tolist() if len(each) else None
-                for name, each in measured.items()
+                name: _pose(np.sqrt(np.mean(each**2, axis=0))) if len(each) else None for name, each in measured.items()
             },
             "placements": [
                 {
                     "released": each.released,
                     "reason": each.reason,
-                    "start_error": each.start_error.tolist(),
+                    "start_error": _pose(each.start_error),
                     "frames": each.frames,
                     "predicted_frames": each.predicted_frames + 1,
-                    "error": error.tolist() if each.released else None,
+                    "error": _pose(error) if each.released else None,
                 }
                 for each, error in zip(self.placements, self.error, strict=True)
             ],
@@ -234,6 +235,11 @@ def _on_board(plan: PlacementPlan, moved: Float64) -> Float64:
     c, s = np.cos(plan.camera_pose[2]), np.sin(plan.camera_pose[2])
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return np.asarray(moved @ turn.T)
+
+
+def _pose(values: Float64) -> dict[str, float]:
+    """Return a pose or an error (3,) with a key for each coordinate."""
+    return dict(zip(("x_m", "y_m", "theta_rad"), values.tolist(), strict=True))
 
 
 def _triple(name: str, values: Float64) -> str:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from gpuvision.cli.main import application
 from gpuvision.servoing.delay import gain_limit
 from gpuvision.servoing.delay_measurement import excitation
-from gpuvision.servoing.margins import observer_tolerance
+from gpuvision.servoing.margins import observer_tolerance, predictor_tolerance
 from gpuvision.workflows import analysing_delay
 
 PERIOD = 1e-3
@@ -60,6 +60,11 @@ def test_parts_and_a_recording(tmp_path: Path) -> None:
         expected = observer_tolerance(observer["gain_per_frame"], report["delay_frames"])
         assert observer["unstable_from_longer_by_s"] == pytest.approx(1e-3 * expected.longer, rel=0.01)
         assert observer["unstable_from_plant_gain"] > predictor["unstable_from_plant_gain"]
+    # At a gain of 0.2 per frame every shorter delay is stable; at 0.8 the predictor does not bear a delay of 0.
+    assert [report[each][0]["unstable_from_shorter_by_s"] for each in ("observer", "predictor")] == [None, None]
+    shorter = predictor_tolerance(0.8, report["delay_frames"]).shorter
+    assert report["predictor"][-1]["unstable_from_shorter_by_s"] == pytest.approx(1e-3 * shorter, rel=0.01)
+    assert shorter < report["delay_frames"]
     for name in ("delay.png", "measured_delay.png"):
         assert (tmp_path / "out" / name).stat().st_size > 10_000
 

@@ -7,6 +7,7 @@ import json
 import re
 import tomllib
 from importlib import resources
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +79,9 @@ def test_parts_land_where_and_when_the_prediction_says(artwork: Artwork, machine
     assert np.all(np.abs(result.sources["vision and servo"][:, :2]) < 2e-6)
     assert max(np.abs(motion[0, :2]).max() for motion in result.motion) > 50e-6
     report = result.report()
-    assert report["delay"]["frames"] == machine.delay.frames
+    assert report["delay_frames"] == machine.delay.frames
+    assert sum(report["parts_s"].values()) == pytest.approx(report["total_delay_s"])
+    assert list(report["measured_rms"]["total"].values()) == pytest.approx(np.sqrt(np.mean(result.error**2, axis=0)))
     assert len(report["placements"]) == 6
     assert "6 of 6 parts placed" in result.summary()
 
@@ -106,7 +109,7 @@ def test_narrow_pads_are_landed_by_registration_and_tracked_by_short_rulers(tmp_
         # The head rests while the first frame is registered: 20 ms.
         assert min(each.arrived for each in placement.measurements) == pytest.approx(20e-3)
     assert np.all(np.abs(result.sources["vision and servo"][:, :2]) < 2e-6)
-    assert result.report()["landing"] == 20e-3
+    assert result.report()["landing_s"] == 20e-3
 
 
 def test_a_refused_target_names_where_the_camera_looks_and_a_target_that_works(
@@ -130,7 +133,8 @@ def test_the_command_writes_report_and_pictures(
     application()([str(each) for each in near], standalone_mode=False)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert [each["released"] for each in report["placements"]] == [True, True]
-    assert report["target"] == pytest.approx(TARGET)
+    assert report["target"] == pytest.approx(dict(zip(("x_m", "y_m", "theta_rad"), TARGET, strict=True)))
+    assert report["gpuvision"] == version("gpuvision")
     assert {each.name for each in (tmp_path / "out").glob("*.png")} == {"placements.png", "features.png"}
     printed = capsys.readouterr().out
     assert "2 of 2 parts placed" in printed

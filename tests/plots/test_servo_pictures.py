@@ -1,0 +1,97 @@
+"""Pictures of placements, features and measured delays: all coordinates, the target, and no empty panel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from gpuvision.camera.orthographic import BoardView
+from gpuvision.plots.board import draw_features
+from gpuvision.plots.placement import draw_placements
+from gpuvision.plots.servoing import draw_measured_delay
+from gpuvision.servoing.delay_measurement import MeasuredDelay
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Figures that are saved from now on."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **how: figures.append(figure))
+    return figures
+
+
+def test_errors_of_position_and_angle_are_drawn_as_outlines(drawn: list[Figure], tmp_path: Path) -> None:
+    error = np.array([[1e-6, 0.0, 0.2e-3], [1.1e-6, 0.1e-6, -0.1e-3], [np.nan] * 3])
+    motion = [np.array([[3e-5, 4e-5, 5e-3], [3e-6, 4e-6, -1e-3]])]
+    draw_placements(
+        tmp_path / "placements.png",
+        period=1e-3,
+        motion=motion,
+        error=error,
+        sigmas=np.array([1e-6, 1e-6, 1e-4]),
+        delay={"exposure": 1e-3},
+        tolerance=(5e-6, 2e-3),
+    )
+    panels: dict[str, Any] = {each.get_xlabel() + each.get_ylabel(): each for each in drawn[0].axes}
+    (distance, position_limit) = panels["time [ms]distance from the target [µm]"].lines
+    (angle, angle_limit) = panels["time [ms]angle from the target [mrad]"].lines
+    np.testing.assert_allclose(distance.get_ydata(), [50.0, 5.0])
+    np.testing.assert_allclose(angle.get_ydata(), [5.0, 1.0])
+    assert (position_limit.get_ydata()[0], angle_limit.get_ydata()[0]) == pytest.approx((5.0, 2.0))
+    for unit, coordinates in (("µm", 2), ("mrad", 1)):
+        panel = panels[f"error at the release [{unit}]number of placements"]
+        outlines = [each for each in panel.patches if isinstance(each, Polygon)]
+        assert len(outlines) == len(panel.patches) == coordinates
+        assert not any(each.get_fill() for each in outlines)
+        assert max(each.get_xy()[:, 1].max() for each in outlines) in (1.0, 2.0)
+        ticks = panel.get_yticks()
+        np.testing.assert_array_equal(ticks, np.round(ticks))
+
+
+def test_a_delay_without_jitter_has_no_empty_panel(drawn: list[Figure], tmp_path: Path) -> None:
+    time = 1e-3 * np.arange(5)
+    for number, delays in enumerate((np.zeros(0), np.array([2e-3, 2.1e-3]))):
+        delay = MeasuredDelay(2e-3, 1e-6, 0.0, np.inf, 1.0, 1e-9, 2.0, delays)
+        draw_measured_delay(tmp_path / f"{number}.png", time, time, time, delay)
+    assert [len(each.axes) for each in drawn] == [1, 2]
+
+
+def test_features_show_the_target_and_the_turned_image(drawn: list[Figure], tmp_path: Path) -> None:
+    """A camera at (3, 2) mm, turned by 30 degrees, for a nozzle target 2.5 mm beside it, out of the image."""
+    features = SimpleNamespace(
+        region=np.array([[2.5e-3, 1.5e-3], [3.5e-3, 2.5e-3]]),
+        normal=np.array([[1.0, 0.0]]),
+        length=np.array([1e-4]),
+        point=np.array([[3e-3, 2e-3]]),
+        spacing=np.zeros(1),
+        fiducials=SimpleNamespace(point=np.zeros((0, 2)), radius=np.zeros(0)),
+        placement=np.array([3e-3, 2e-3]),
+        summary=lambda: "features",
+    )
+    holes = SimpleNamespace(start=np.zeros((0, 2)), end=np.zeros((0, 2)), diameter=np.zeros(0))
+    board = SimpleNamespace(copper=(), mask=(), silk=(), holes=holes, side="top")
+    view = BoardView(scale=1e-5, shape=(101, 201), pose=(3e-3, 2e-3, np.pi / 6))
+    draw_features(
+        tmp_path / "features.png",
+        cast(Any, board),
+        cast(Any, features),
+        features.region,
+        view=view,
+        target=(5.5e-3, 2e-3),
+    )
+    (axes,) = drawn[0].axes
+    crosses: dict[Any, Any] = {each.get_marker(): each for each in axes.lines}
+    assert [float(each[0]) for each in crosses["+"].get_data()] == pytest.approx([3.0, 2.0])
+    assert [float(each[0]) for each in crosses["x"].get_data()] == pytest.approx([5.5, 2.0])
+    assert axes.get_xlim()[1] > 5.5
+    (border,) = (each for each in axes.patches if isinstance(each, Polygon))
+    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
+    corners = np.array([[-1.0, 0.5], [1.0, 0.5], [1.0, -0.5], [-1.0, -0.5]]) @ [[c, s], [-s, c]] + [3.0, 2.0]
+    np.testing.assert_allclose(border.get_xy()[:4], corners, atol=1e-9)
+    assert {each.get_text() for each in drawn[0].legends[0].get_texts()} >= {"image centre", "target"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,7 +30,7 @@ Results = Annotated[
         help="Folder for report.json and delay.png; with --recording also measured_delay.png.",
     ),
 ]
-Rate = Annotated[float | None, typer.Option(metavar="HZ", min=1e-3, help="Frames per second.")]
+Rate = Annotated[float | None, typer.Option(metavar="HZ", min=1e-3, max=1e7, help="Frames per second.")]
 Exposure = Annotated[str | None, typer.Option(metavar="TIME", help="Time of exposure, such as 200us. Default: 0.")]
 Readout = Annotated[
     str | None, typer.Option(metavar="TIME", help="Time from the end of the exposure to the last pixel. Default: 0.")
@@ -103,11 +104,17 @@ def delay(
     outputs = Outputs("delay", inputs=inputs, overwrite=overwrite)
     outputs.claim_folder(out, DELAY_FILES if recording is None else (*DELAY_FILES, MEASURED_PICTURE))
     outputs.claim(as_json)
-    done = analyse_delay(
-        budget,
-        recording=None if recording is None else read_loop_recording(recording),
-        jitter=None if jitter is None else quantities(jitter, "--jitter", "s")[0],
-    )
+    deviation = None if jitter is None else _time(jitter, "--jitter")
+    if recording is None:
+        done = analyse_delay(budget, jitter=deviation)
+    else:
+        samples = read_loop_recording(recording)
+        try:
+            done = analyse_delay(budget, recording=samples, jitter=deviation)
+        except ValueError as error:
+            raise ValueError(f"{recording}: {error}") from error
+    for each in done.warnings:
+        echo(f"warning: {each}", err=True)
     done.write(out, inputs=inputs, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
     echo(f"{done.summary()}\nlook at {out / 'delay.png'} and {out / 'report.json'}", err=prints_report(as_json))
@@ -125,34 +132,52 @@ def _budget(
     """Return the budget that the options state."""
     from gpuvision.servoing.delay import DelayBudget
 
-    exposed = 0.0 if exposure is None else quantities(exposure, "--exposure", "s")[0]
+    exposed = _time(exposure, "--exposure")
     if sensor is None:
         reject_unused("without --sensor", roi=roi)
-        read = 0.0 if readout is None else quantities(readout, "--readout", "s")[0]
+        read = _time(readout, "--readout")
     else:
         reject_unused("with --sensor", readout=readout)
+        if exposure is None:
+            raise ValueError(f"--sensor {sensor} needs --exposure, such as 200us")
         read = _readout(sensor, roi, exposed, rate)
     times = {}
     for each in stages:
         name, equals, time = each.partition("=")
         if not (name and equals):
             raise ValueError(f"--stage is {each!r}, expected a name and a time: edges=0.4ms")
-        times[name] = quantities(time, f"--stage {name}", "s")[0]
-    moved = 0.0 if transfer is None else quantities(transfer, "--transfer", "s")[0]
+        if name in times:
+            raise ValueError(f"--stage {name} is given twice; give the sum, or two names")
+        times[name] = _time(time, f"--stage {name}")
+    moved = _time(transfer, "--transfer")
     return DelayBudget(period=1.0 / rate, exposure=exposed, readout=read, transfer=moved, stages=times)
+
+
+def _time(text: str | None, option: str) -> float:
+    """Return the time of an option [s]; 0 without the option."""
+    time = 0.0 if text is None else quantities(text, option, "s")[0]
+    if time < 0.0:
+        raise ValueError(f"{option} is {text!r}, expected a time of 0 or more")
+    return time
 
 
 def _readout(sensor: str, roi: str | None, exposure: float, rate: float) -> float:
     """Return the readout time of a region of a camera preset, which must reach the frame rate."""
-    from gpuvision.formats.cmos_sensor_file import read_cmos_sensor
+    from gpuvision.formats.cmos_sensor_file import CMOS_SENSORS, read_cmos_sensor
 
     shape = None
     if roi is not None:
-        columns, cross, rows = roi.partition("x")
-        if not (cross and columns.isdigit() and rows.isdigit() and int(columns) and int(rows)):
+        found = re.fullmatch(r"0*([1-9][0-9]{0,6})x0*([1-9][0-9]{0,6})", roi)
+        if found is None:
             raise ValueError(f"--roi is {roi!r}, expected columns and rows: 128x128")
-        shape = int(rows), int(columns)
-    timing = read_cmos_sensor(sensor).timing(shape, exposure or None)
+        shape = int(found[2]), int(found[1])
+    try:
+        described = read_cmos_sensor(sensor)
+    except OSError as error:
+        known = ", ".join(CMOS_SENSORS)
+        raise ValueError(f"--sensor: {sensor}: {error.strerror or error}; expected {known} or a sensor file") from error
+    timing = described.timing(shape, exposure or None)
     if timing.rate < rate:
-        raise ValueError(f"the sensor reaches {timing.rate:.4g} frames per second, --rate is {rate:g}; lower --roi")
+        reached = f"the sensor reaches {timing.rate:.4g} frames per second, --rate is {rate:g}"
+        raise ValueError(f"{reached}; lower --roi or shorten --exposure")
     return max(timing.delay - timing.exposure / 2.0, 0.0)

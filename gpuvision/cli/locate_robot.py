@@ -181,6 +181,7 @@ def _track(
 ) -> None:
     """Follow a robot through a recording and write its track."""
     from gpuvision.host import open_recording
+    from gpuvision.host.errors import RecordingError
     from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.tracking_robot import TRACK_FILES, read_odometry, track_robot
 
@@ -198,8 +199,11 @@ def _track(
     if files.out is not None:
         with outputs.folder(files.out) as inside:
             track.write(inside)
-        shown = f"\nlook at {files.out / 'track.png'} and {files.out / 'track.csv'}"
-    echo(track.summary() + shown, err=prints_report(files.as_json))
+        shown = f"look at {files.out / 'track.png'} and {files.out / 'track.csv'}"
+    problem = track.problem()
+    if problem is not None:
+        raise RecordingError("; ".join(each for each in (problem, shown) if each))
+    echo("\n".join(each for each in (track.summary(), shown) if each), err=prints_report(files.as_json))
 
 
 def _scan(

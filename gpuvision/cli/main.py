@@ -161,7 +161,7 @@ def _run() -> None:
 
     try:
         application()()
-    except (GpuVisionError, ValueError, TypeError, OverflowError, OSError) as error:
+    except (GpuVisionError, ValueError, TypeError, ArithmeticError, MemoryError, OSError) as error:
         if os.environ.get(TRACEBACK):
             raise
         print(f"gpuvision: {one_line(error)}", file=sys.stderr)

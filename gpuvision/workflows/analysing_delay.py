@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from gpuvision.formats.json import json_tree
 from gpuvision.formats.loop_recording import LoopRecording
@@ -46,6 +47,11 @@ MEASURED_PICTURE = "measured_delay.png"
 _PREDICTOR_GAINS, _NOISE_RATIO = (0.2, 0.5, 0.8), 1.0
 # Remaining error of the reported settling time, and frames of the drawn step responses.
 _SETTLED, _FRAMES = 0.01, 40
+# Longest delay [frames] (chosen): the roots of its picture take 8 s, and their time grows with the third power.
+_MAX_FRAMES = 100.0
+# Largest difference of the measured scale from 1, and of the frame times relative to each other, without a warning
+# (chosen): a wrong unit differs by a factor of 10 and more, a calibration and a clock by a few percent.
+_SCALE_ERROR, _PERIOD_ERROR = 0.2, 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +93,27 @@ class DelayAnalysis:
             "simc_p": simc_gains(total, integral=False),
             "simc_pi": simc_gains(total),
         }
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Signs of wrong units or missing parts; one line each."""
+        found = []
+        if self.measured is None:
+            if self.delay == 0.0:
+                found.append("the delay is 0: no part of it is given; the gains are those of a loop without delay")
+            return tuple(found)
+        if abs(self.measured.scale - 1.0) > _SCALE_ERROR:
+            found.append(
+                f"the measured motion is {self.measured.scale:.3g} times the commanded motion; check the units of the "
+                "columns command and measured [m] or [rad]"
+            )
+        sampled = self.measured.mean / self.measured.frames if self.measured.frames else self.budget.period
+        if abs(sampled / self.budget.period - 1.0) > _PERIOD_ERROR:
+            found.append(
+                f"the samples of the recording are {1e3 * sampled:.4g} ms apart, the frames "
+                f"{1e3 * self.budget.period:.4g} ms; check the column time [s] and the frame rate"
+            )
+        return tuple(found)
 
     def summary(self) -> str:
         """Return one line: delay, limits and bandwidth."""
@@ -172,6 +199,11 @@ class DelayAnalysis:
             "unstable_from_plant_gain": found.plant_gain,
         }
 
+    def sweep(self) -> npt.NDArray[np.float64]:
+        """Return the frame times of the last picture [s], from a tenth of the period to ten periods."""
+        # 1e-6: at the longest delay a tenth of the period is the longest delay of the gains, without its rounding.
+        return np.asarray(self.budget.period * np.geomspace(0.1 * (1.0 + 1e-6), 10.0, 60), np.float64)
+
     def picture(self) -> DelayPicture:
         """Return the data of ``delay.png``."""
         limit, period = gain_limit(self.frames), self.budget.period
@@ -187,7 +219,7 @@ class DelayAnalysis:
             steps=[(label, step_response(self.frames, gain, _FRAMES)) for label, gain in labels.items()],
             locus=root_locus(self.frames, np.linspace(0.0, 1.3, 400)[1:] * limit),
             marked=[(label, root_locus(self.frames, gain)[0]) for label, gain in labels.items()],
-            curve=delay_against_frame_time(self.budget, period * np.geomspace(0.1, 10.0, 60)),
+            curve=delay_against_frame_time(self.budget, self.sweep()),
             period=period,
         )
 
@@ -233,7 +265,8 @@ def analyse_delay(
     Raises
     ------
     ValueError
-        Neither a budget nor a recording is given, or the recording shows no delay; see `measure_delay`.
+        Neither a budget nor a recording is given, the recording shows no delay (see `measure_delay`), or the delay is
+        longer than 100 frames.
     """
     if budget is None and recording is None:
         raise ValueError("give the parts of the delay, or a recording")
@@ -242,9 +275,16 @@ def analyse_delay(
         budget = DelayBudget(period=measured.mean / measured.frames, stages={"measured": measured.mean})
     assert budget is not None
     known = 0.0 if measured is None else measured.jitter
-    return DelayAnalysis(
+    done = DelayAnalysis(
         budget=budget,
         measured=measured,
         recording=recording,
         jitter=known if jitter is None else finite(jitter, "jitter", minimum=0.0),
     )
+    if done.frames > _MAX_FRAMES * (1.0 + 1e-9):
+        advice = "exposure, readout, transfer and stages" if measured is None else "the recording"
+        raise ValueError(
+            f"the delay is {done.delay:.4g} s = {done.frames:.4g} frames of {1e3 * budget.period:.4g} ms, expected at "
+            f"most {_MAX_FRAMES:g} frames; check the units of {advice}"
+        )
+    return done

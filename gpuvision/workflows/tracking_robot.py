@@ -11,6 +11,7 @@ import csv
 import io
 import json
 import math
+from collections import Counter
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -35,6 +36,8 @@ TRACK_FILES = ("track.csv", "track.json", "track.png")
 _COLUMNS = ("frame", "time", "x", "y", "theta", "sigma_x", "sigma_y", "sigma_theta", "probability", "status")
 _ODOMETRY = "forward,left,turn"
 _LONGEST_LINE, _LONGEST_SHOWN = 1000, 60  # characters of a line that is read, and of a header in a message
+# Largest motion between two frames [m] or [rad] (chosen): the size of a large field.
+_LARGEST_MOTION = 1e3
 
 MAX_MOTIONS = FileLimit("GPUVISION_MAX_MOTIONS", 1_000_000)
 """Motions of a CSV file of odometry. Chosen: 1 000 000, 9 hours at 30 frames per second."""
@@ -92,11 +95,20 @@ class RobotTrack:
         last = self.states[-1]
         found = f"{len(self.states)} frames, {len(self.refused)} of them refused; last state {last.status.name or 'OK'}"
         x, y, theta = last.pose
+        if not math.isfinite(x):
+            return f"{found}\nno pose at the last frame"
         sigmas = np.sqrt(np.diag(last.covariance))
         return (
             f"{found}, probability {last.probability:.3f}\nx {x:.3f} m, y {y:.3f} m, heading {math.degrees(theta):.2f} "
             f"degrees; sigmas {1e3 * sigmas[0]:.2g} mm, {1e3 * sigmas[1]:.2g} mm, {math.degrees(sigmas[2]):.2g} degrees"
         )
+
+    def problem(self) -> str | None:
+        """Return the most frequent reason for which no frame has a pose; None if a frame has one."""
+        if any(math.isfinite(state.pose[0]) for state in self.states):
+            return None
+        reasons = Counter(self.refused.values()).most_common(1)
+        return f"no pose in {len(self.states)} frames" + (f": {reasons[0][0]}" if reasons else "")
 
     def rows(self) -> list[dict[str, Any]]:
         """Return a row for each frame: metres, radians, seconds; None where a value is not known."""
@@ -190,6 +202,9 @@ def track_robot(
         sigmas = np.array([uncertainty.initial, uncertainty.initial, uncertainty.initial_turn])
         initial = PoseEstimate(np.array(initial_pose, np.float64), np.diag(sigmas**2))
     robot, states, refused = RobotFilter(field, initial, limits=limits), list[RobotState](), dict[int, str]()
+    if motions is not None and source.length is not None and len(motions) != source.length - 1:
+        source.close()
+        raise _wrong_number(len(motions), source.length)
     frame, arrived = np.empty((1, *source.shape), source.dtype), np.zeros(1, np.int64)
     try:
         while source.wait() and source.read_into(frame, arrived):
@@ -208,10 +223,12 @@ def track_robot(
     if not states:
         raise RecordingError("the recording has no frame")
     if motions is not None and len(motions) != len(states) - 1:
-        raise ValueError(
-            f"the odometry has {len(motions)} motions, expected {len(states) - 1} between {len(states)} frames"
-        )
+        raise _wrong_number(len(motions), len(states))
     return RobotTrack(states=tuple(states), refused=refused, field=field, device=device)
+
+
+def _wrong_number(motions: int, frames: int) -> ValueError:
+    return ValueError(f"the odometry has {motions} motions, expected {frames - 1} between {frames} frames")
 
 
 def _motion(
@@ -227,6 +244,21 @@ def _motion(
     return motions[number], np.diag(sigmas**2)
 
 
+def _motion_of(line: str, place: str) -> list[float]:
+    """Return the three numbers of a line of odometry."""
+    try:
+        motion = [float(each) for each in line.split(",")]
+    except ValueError as error:
+        shown = repr(line.strip()[:_LONGEST_SHOWN])
+        raise RecordingError(f"{place}: not a readable list of motions: {shown}, expected {_ODOMETRY}") from error
+    if len(motion) != 3 or not np.isfinite(motion).all():
+        raise RecordingError(f"{place}: expected three finite numbers, {_ODOMETRY}")
+    for value in motion:
+        if abs(value) > _LARGEST_MOTION:
+            raise RecordingError(f"{place}: {value:g}, expected a motion of at most {_LARGEST_MOTION:g} m or rad")
+    return motion
+
+
 def read_odometry(path: Path) -> Float64:
     """Read the motions between frames: CSV with the header ``forward,left,turn`` [m], [m], [rad].
 
@@ -235,7 +267,7 @@ def read_odometry(path: Path) -> Float64:
     OSError
         The file cannot be read.
     RecordingError
-        The file has another header or content, or more than `MAX_MOTIONS` motions.
+        The file has another header or content, a motion above 1000 m or rad, or more than `MAX_MOTIONS` motions.
     """
     motions: list[list[float]] = []
     with reading(path, "list of motions", RecordingError), path.open(encoding="utf-8-sig") as file:
@@ -246,8 +278,5 @@ def read_odometry(path: Path) -> Float64:
             if not line.strip():
                 continue
             MAX_MOTIONS.check(len(motions) + 1, f"{path}: {len(motions) + 1} motions or more", RecordingError)
-            motion = [float(each) for each in line.split(",")]
-            if len(motion) != 3 or not np.isfinite(motion).all():
-                raise RecordingError(f"{path}: line {number}: expected three finite numbers, {_ODOMETRY}")
-            motions.append(motion)
+            motions.append(_motion_of(line, f"{path}: line {number}"))
     return np.array(motions, np.float64).reshape(-1, 3)

@@ -11,8 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 from gpuvision.cli.main import application
-from gpuvision.servoing.delay import gain_limit
+from gpuvision.servoing.delay import DelayBudget, gain_limit
 from gpuvision.servoing.delay_measurement import excitation
+from gpuvision.servoing.delay_response import delay_against_frame_time
 from gpuvision.servoing.margins import observer_tolerance, predictor_tolerance
 from gpuvision.workflows import analysing_delay
 
@@ -85,11 +86,24 @@ def test_sensor_gives_the_readout(tmp_path: Path, quick_picture: None) -> None:
     [
         ((), "give --rate and the parts of the delay, or --recording"),
         (("--exposure", "1ms"), "--exposure has no effect without --rate"),
+        (
+            ("--rate", "1000", "--exposure", "400"),
+            "200 s = 2e.05 frames of 1 ms, expected at most 100 frames; check the",
+        ),
         (("--rate", "1000", "--stage", "edges"), "--stage is 'edges'"),
         (("--rate", "1000", "--exposure", "1mm"), "--exposure is '1mm', expected 1 number: s"),
         (("--rate", "1000", "--roi", "8x8"), "--roi has no effect without --sensor"),
         (("--rate", "1000", "--sensor", "pb1024", "--readout", "1ms"), "--readout has no effect with --sensor"),
         (("--rate", "1000", "--sensor", "pb1024", "--exposure", "1us", "--roi", "8by8"), "--roi is '8by8'"),
+        (("--rate", "1000", "--sensor", "pb1024", "--exposure", "1us", "--roi", "²x3"), "--roi is '²x3'"),
+        (("--rate", "1000", "--sensor", "pb1024"), "--sensor pb1024 needs --exposure, such as 200us"),
+        (
+            ("--rate", "1000", "--sensor", "foo", "--exposure", "1us"),
+            "foo: No such file .* lupa300, pb1024 or a sensor",
+        ),
+        (("--rate", "1000", "--exposure", "-200us"), "--exposure is '-200us', expected a time of 0 or more"),
+        (("--rate", "1000", "--stage", "edges=1ms", "--stage", "edges=2ms"), "--stage edges is given twice"),
+        (("--rate", "1000", "--sensor", "pb1024", "--exposure", "5ms", "--roi", "128x128"), "shorten --exposure"),
         (("--rate", "90000", "--sensor", "pb1024", "--exposure", "1us"), "--rate is 90000; lower --roi"),
     ],
 )
@@ -122,3 +136,53 @@ def test_sensor_file_is_kept(
     with pytest.raises(FileExistsError, match=f"it is the input {kept}"):
         run("--rate", 100, "--exposure", "200us", "--sensor", kept, *outputs, "--overwrite")
     assert Path(kept).read_text() == text
+
+
+@pytest.mark.parametrize("rate", ["1e300", "inf"])
+def test_impossible_rate_is_refused(tmp_path: Path, rate: str) -> None:
+    done = CliRunner().invoke(application(), ["delay", "--rate", rate, "--transfer", "1ms", "--out", str(tmp_path)])
+    assert done.exit_code == 2
+    assert "--rate" in done.output
+
+
+def test_delay_of_a_hundred_frames_is_drawn() -> None:
+    done = analysing_delay.analyse_delay(DelayBudget(period=PERIOD, transfer=100 * PERIOD))
+    curve = delay_against_frame_time(done.budget, done.sweep())
+    assert np.isfinite(curve.bandwidth).all()
+    assert curve.frames.max() == pytest.approx(1000.0, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("position_scale", "rate", "expected"),
+    [
+        (1.0, 1000, ""),
+        (1e3, 1000, "times the commanded motion; check the units of the columns command and measured"),
+        (1.0, 500, "warning: the samples of the recording are 1 ms apart, the frames 2 ms; check the column time"),
+    ],
+)
+def test_wrong_units_are_reported(
+    tmp_path: Path, quick_picture: None, position_scale: float, rate: float, expected: str
+) -> None:
+    write_recording(tmp_path / "loop.csv", 2.4e-3)
+    header, *lines = (tmp_path / "loop.csv").read_text().splitlines()
+    rows = np.array([[float(each) for each in line.split(",")] for line in lines])
+    rows *= [1.0, 1.0, position_scale]
+    np.savetxt(tmp_path / "loop.csv", rows, delimiter=",", header=header, comments="")
+    words = ["--rate", rate, "--transfer", "1ms", "--recording", tmp_path / "loop.csv", "--out", tmp_path / "out"]
+    done = CliRunner().invoke(application(), ["delay", *map(str, words)])
+    assert done.exit_code == 0
+    assert expected in done.stderr
+    assert ("warning" in done.stderr) == bool(expected)
+
+
+def test_missing_parts_are_reported(tmp_path: Path, quick_picture: None) -> None:
+    done = CliRunner().invoke(application(), ["delay", "--rate", "1000", "--out", str(tmp_path)])
+    assert done.exit_code == 0
+    assert "warning: the delay is 0: no part of it is given" in done.stderr
+
+
+def test_faults_of_a_recording_name_the_file(tmp_path: Path) -> None:
+    rows = [f"{n},{n},\n" for n in range(30)]
+    (tmp_path / "loop.csv").write_text("time,command,measured\n" + "".join(rows))
+    with pytest.raises(ValueError, match=r"loop\.csv: "):
+        run("--recording", tmp_path / "loop.csv", "--out", tmp_path / "out")

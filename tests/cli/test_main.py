@@ -163,3 +163,18 @@ def test_public_names_are_there_and_the_same_for_type_checkers() -> None:
     stub = ast.parse(Path(gpuvision.__file__).with_suffix(".pyi").read_text())
     listed = {alias.name for node in ast.walk(stub) if isinstance(node, ast.ImportFrom) for alias in node.names}
     assert set(gpuvision.__all__) == listed
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("division by zero"), MemoryError("unable to allocate 9 TiB")])
+def test_numerical_errors_and_lack_of_memory_are_one_line(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        raise error
+
+    monkeypatch.delenv(cli.TRACEBACK, raising=False)
+    monkeypatch.setattr(cli, "application", lambda: fail)
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 1
+    assert capsys.readouterr().err == f"gpuvision: {error}\n"

@@ -15,11 +15,11 @@ HEADER = "time,command,measured\n"
 
 def test_rows_are_read(tmp_path: Path) -> None:
     path = tmp_path / "loop.csv"
-    path.write_text(HEADER + "0,1e-3,\n0.001,2e-3,1.5e-3\n\n")
+    path.write_text(HEADER + "0,1e-3,\n0.001,2e-3,1.5e-3\n\n0.002,2e-3,nan\n")
     found = read_loop_recording(path)
-    assert found.time.tolist() == [0.0, 0.001]
-    assert found.command.tolist() == [1e-3, 2e-3]
-    assert np.isnan(found.measured[0])
+    assert found.time.tolist() == [0.0, 0.001, 0.002]
+    assert found.command.tolist() == [1e-3, 2e-3, 2e-3]
+    assert np.isnan(found.measured[[0, 2]]).all()
     assert found.measured[1] == 1.5e-3
 
 
@@ -32,6 +32,11 @@ def test_rows_are_read(tmp_path: Path) -> None:
         (HEADER + "0,nan,0\n", "line 2: expected finite numbers"),
         (HEADER + "0,0,0\n1,0,inf\n", "line 3: expected finite numbers"),
         (HEADER + "0,x,0\n", "loop.csv"),
+        (HEADER + "0,0,0\n1,x,0\n", r"line 3: '1,x,0', expected numbers"),
+        (HEADER + "0,0,0\n1,1e308,0\n", r"line 3: command is 1e\+308, expected a magnitude of at most 1e\+06 m or rad"),
+        (HEADER + "0,0,0\n1,0,-1e7\n", r"line 3: measured is -1e\+07"),
+        (HEADER + "0,0,0\n0.5,0,0\n0.5,0,0\n", r"line 4: time is 0\.5 after 0\.5, expected a later one"),
+        ("", "the file is empty; expected the header time,command,measured"),
     ],
 )
 def test_other_files_are_refused(tmp_path: Path, text: str, message: str) -> None:

@@ -120,6 +120,8 @@ def test_wrong_odometry_is_refused(drive: tuple[np.ndarray, np.ndarray], tmp_pat
     [
         ("forward,left,turn\n1,2,3\n1,2\n", "line 3: expected three finite numbers"),
         ("forward,left,turn\n1,2,a\n", "not a readable list of motions"),
+        ("forward,left,turn\n1,2,3\n1,2,a\n", "line 3: not a readable list of motions: '1,2,a'"),
+        ("forward,left,turn\n1e300,0,0\n", r"line 2: 1e\+300, expected a motion of at most 1000 m or rad"),
         ("forward,left,turn\n1,2,3\n\n4,5,6\n7,8,9\n", "3 motions or more, .* set GPUVISION_MAX_MOTIONS"),
     ],
 )
@@ -135,3 +137,27 @@ def test_odometry_is_read(tmp_path: Path) -> None:
     assert read_odometry(tmp_path / "a.csv").tolist() == [[0.1, 0.0, -0.02], [0.2, 0.3, 0.4]]
     (tmp_path / "b.csv").write_text("forward,left,turn\n")
     assert read_odometry(tmp_path / "b.csv").shape == (0, 3)
+
+
+def test_the_command_fails_without_a_pose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "carpet.npy", np.full((2, *SHAPE), 50, np.uint8))
+    words = ["locate-robot", "carpet.npy", "--field", "robocup_msl", "--scale", "4cm", "--rate", "10", "--out", "out"]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["gpuvision", *words])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("gpuvision: no pose in 2 frames: ")
+    assert "nan" not in said.err
+    assert said.err.endswith("; look at out/track.png and out/track.csv\n")
+    assert (tmp_path / "out" / "track.csv").exists()
+
+
+def test_short_odometry_is_refused_before_the_first_frame(tmp_path: Path) -> None:
+    source = ArraySource(np.zeros((4, *SHAPE), np.uint8))
+    with pytest.raises(ValueError, match="has 2 motions, expected 3 between 4 frames"):
+        track_robot(source, read_field("robocup_msl"), rate=10.0, odometry=np.zeros((2, 3)), scale=-1.0)

@@ -229,6 +229,8 @@ def _camera_at(text: str | None, gcode: Path | None, dialect: GcodeDialect | Non
     if gcode is None:
         reject_unused("without --gcode", camera_at=text, gcode_dialect=dialect)
         return None
+    if str(gcode) == "-":
+        raise ValueError("--gcode is '-', expected the name of a file")
     if text is None:
         raise ValueError("--gcode needs --camera-at: where on the machine the image was taken, such as 120mm,80mm,0deg")
     return quantities(text, "--camera-at", "m,m,rad")

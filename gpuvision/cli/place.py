@@ -22,6 +22,7 @@ from gpuvision.cli.arguments import (
     write_report,
 )
 
+_LARGEST_BOARD = 1.0  # largest coordinate on a board [m] (chosen: panels are smaller)
 _FILES = ("report.json", "placements.png", "features.png")
 
 Gerbers = Annotated[
@@ -36,7 +37,9 @@ Target = Annotated[
     str,
     typer.Option(metavar="X,Y,THETA", help="Place of the part on the board and its angle, such as 12mm,8mm,90deg."),
 ]
-Rate = Annotated[float | None, typer.Option(min=1.0, help="Frames per second. Default: the value in the machine file.")]
+Rate = Annotated[
+    float | None, typer.Option(min=1.0, max=1e7, help="Frames per second. Default: the value in the machine file.")
+]
 Results = Annotated[
     Path,
     typer.Option(
@@ -77,6 +80,8 @@ def place(
     from gpuvision.workflows.placing import simulate_placements
 
     target = quantities(at, "--at", "m,m,rad")
+    if max(abs(target[0]), abs(target[1])) > _LARGEST_BOARD:
+        raise ValueError(f"--at is {at!r}, expected at most {_LARGEST_BOARD:g} m; numbers need units: 9mm,9mm,90deg")
     outputs = Outputs("place", inputs=[gerbers, machine, *named_files(machine)], overwrite=overwrite)
     outputs.claim(as_json)
     outputs.claim_folder(out, _FILES)

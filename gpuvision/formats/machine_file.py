@@ -20,6 +20,7 @@ MACHINES = ("look_while_place",)
 """Names of the machines in the package."""
 
 _NO_COVARIANCE = ((0.0, 0.0, 0.0),) * 3
+_LARGEST_PIXEL = 1e-3  # size of a pixel on the board [m] (chosen): a track is narrower
 _AXES = {"x": "m", "y": "m", "theta": "rad"}
 
 
@@ -106,7 +107,7 @@ def _camera(table: Section) -> PlacementCamera:
         raise table.error(f"camera.sensor: {shown}: {error.strerror}; expected {presets} or a sensor file") from error
     window = table.numbers("window", "px", (2,))
     values = {
-        "pixel": table.number("pixel", "m", above=0.0),
+        "pixel": table.number("pixel", "m", above=0.0, at_most=_LARGEST_PIXEL),
         "exposure": table.number("exposure", "s", above=0.0),
         "electrons": table.number("electrons", "electrons", None, above=0.0),
         "blur_px": table.number("blur_px", "px", 0.5, at_least=0.0),
@@ -122,6 +123,8 @@ def _camera(table: Section) -> PlacementCamera:
 def _calibration(table: Section) -> Transform:
     pose = table.numbers("pipette", "m, m, rad", (3,))
     covariance = table.rows("pipette_covariance", "m^2, m rad, rad^2", 3, _NO_COVARIANCE)
+    if len(covariance) != 3:
+        raise table.error(f"{table.dotted('pipette_covariance')} has {len(covariance)} rows, expected 3")
     table.finish()
     with table.checking():
         return Transform.rigid(PIPETTE, CAMERA, pose, covariance)

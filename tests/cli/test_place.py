@@ -34,3 +34,8 @@ def test_camera_preset_of_the_machine_file_is_kept(tmp_path: Path, monkeypatch: 
     with pytest.raises(FileExistsError, match=r"it is the input camera\.toml"):
         run(*words, "--overwrite")
     assert Path("camera.toml").read_text() == text
+
+
+def test_target_without_units_is_refused_with_an_example(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="--at is '9,9,90', expected at most 1 m; numbers need units: 9mm,9mm,90deg"):
+        run(tmp_path, "--machine", "look_while_place", "--at", "9,9,90", "--out", tmp_path / "out")

@@ -76,6 +76,14 @@ def test_all_keys_of_an_axis_are_read(tmp_path: Path) -> None:
             {"calibration": PRESET["calibration"] | {"pipette_covariance": [[-1.0, 0, 0]] * 3}},
             "calibration: covariance",
         ),
+        (
+            {"calibration": PRESET["calibration"] | {"pipette_covariance": [[1e-12, 0, 0]] * 2}},
+            "calibration.pipette_covariance has 2 rows, expected 3",
+        ),
+        (
+            {"camera": PRESET["camera"] | {"pixel": 10.0}},
+            "camera.pixel is 10.0 m, expected a number [m] above 0 and of",
+        ),
         ({"axes": {"z": {}}}, "unknown key 'axes.z'"),
         ({"axes": {"x": {"coulomb": 1.0}}}, "axes.x: an axis with friction"),
         ({"tolerance": PRESET["tolerance"] | {"max_refused": 0}}, "tolerance.max_refused is 0"),

@@ -60,7 +60,7 @@ def draw_features(
         Whether an existing file may be replaced. Default False.
     """
     box = np.asarray(region, np.float64)
-    corners = box[[0, 1, 1, 0], [0, 0, 1, 1]] if view is None else _image_corners(view)
+    corners = np.stack([box[[0, 1, 1, 0], 0], box[[0, 0, 1, 1], 1]], axis=1) if view is None else _image_corners(view)
     shown = corners if target is None else np.vstack([corners, np.asarray(target, np.float64)])
     box = np.stack([np.minimum(box[0], shown.min(axis=0)), np.maximum(box[1], shown.max(axis=0))])
     window = np.stack([np.minimum(box[0], features.region[0]), np.maximum(box[1], features.region[1])])

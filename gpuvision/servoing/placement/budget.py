@@ -59,7 +59,7 @@ def noise_gain(delay: float, gain: float) -> float:
     Notes
     -----
     Independent errors of the frames add: the sum of the squared steps of the step response, in closed form by the
-    recursion of [2]_. Without delay it is ``gain / (2 - gain)``.
+    recursion of Astrom (1970). Without delay it is ``gain / (2 - gain)``.
 
     Raises
     ------

@@ -184,7 +184,7 @@ def test_wrong_frames_are_refused() -> None:
     with pytest.raises(ValueError, match=r"flat\[0\] has the shape \(1, 4, 4\)"):
         fit_sensor([flat[0][:1]], dark)
     with pytest.raises(TypeError, match=r"flat\[1\] must be an array"):
-        fit_sensor([flat[0], [[1]]], dark)  # type: ignore[list-item]
+        fit_sensor([flat[0], [[1]]], dark)
     with pytest.raises(ValueError, match="no frames"):
         fit_sensor([], dark)
     with pytest.raises(ValueError, match="not finite"):

@@ -104,7 +104,7 @@ def test_budget() -> None:
 )
 def test_budget_refuses(given: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        DelayBudget(**given)  # type: ignore[arg-type]
+        DelayBudget(**given)
 
 
 def test_negative_delay_is_an_error() -> None:

@@ -122,4 +122,4 @@ def test_excitation_rests_moves_and_returns() -> None:
 )
 def test_useless_recordings_are_refused(change: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        measure_delay(*change(*recording(2e-3, 0.0, 1e-6)))  # type: ignore[operator]
+        measure_delay(*change(*recording(2e-3, 0.0, 1e-6)))

@@ -144,7 +144,7 @@ def test_wrong_composition_is_an_error_not_a_number() -> None:
     with pytest.raises(ValueError, match="expected the same frame in the middle"):
         one @ one
     with pytest.raises(TypeError):
-        one @ np.eye(3)  # type: ignore[operator]
+        one @ np.eye(3)
     artwork = Transform.rigid("artwork", "expected", (0, 0, 0))
     with pytest.raises(ValueError, match="expected artwork, expected, camera, pipette"):
         placement_error(
@@ -167,12 +167,12 @@ def test_wrong_composition_is_an_error_not_a_number() -> None:
             lambda: Transform(source="a", target="b", matrix=np.array([[1, 1, 0], [0, 1, 0]]), kind="similarity"),
             "no simi",
         ),
-        (lambda: Transform(source="a", target="b", matrix=np.eye(2, 3), kind="round"), "kind is 'round'"),  # type: ignore[arg-type]
+        (lambda: Transform(source="a", target="b", matrix=np.eye(2, 3), kind="round"), "kind is 'round'"),
     ],
 )
 def test_wrong_transforms_are_refused(make: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        make()  # type: ignore[operator]
+        make()
 
 
 @pytest.mark.parametrize("name", ["pose", "scale", "pose_covariance", "scale_sigma"])

@@ -149,7 +149,7 @@ def test_wall_clock_runs_the_same_loop() -> None:
 
 def test_loop_needs_a_frame_time() -> None:
     with pytest.raises(ValueError, match="period is 0"):
-        ServoLoop(None, None, None, None, None, period=0.0)  # type: ignore[arg-type]
+        ServoLoop(None, None, None, None, None, period=0.0)
     assert math.isinf(LoopLimits().encoder_error[0])
 
 

@@ -29,8 +29,8 @@ def van_loan(lag: float | None, density: float, step: float) -> tuple[npt.NDArra
     inputs = np.array([0.0, 0.0 if lag is None else 1.0 / lag])
 
     def integral(of: object) -> npt.NDArray[np.float64]:
-        shape = np.shape(of(0.0))  # type: ignore[operator]
-        parts = [quad(lambda t, k=k: np.ravel(of(t))[k], 0.0, step, epsabs=0.0)[0] for k in range(np.prod(shape))]  # type: ignore[operator]
+        shape = np.shape(of(0.0))
+        parts = [quad(lambda t, k=k: np.ravel(of(t))[k], 0.0, step, epsabs=0.0)[0] for k in range(np.prod(shape))]
         return np.array(parts).reshape(shape)
 
     impulse = np.array([0.0, 1.0])
@@ -75,7 +75,7 @@ def scene(seed: int = 3) -> tuple[list[tuple[float, object]], list[PoseMeasureme
 
 
 def fresh(model: MotionModel = MODEL, **given: float) -> PoseObserver:
-    observer = PoseObserver(model, **given)  # type: ignore[arg-type]
+    observer = PoseObserver(model, **given)
     observer.reset(0.0, np.zeros(3), 1e-10 * np.eye(3))
     return observer
 

@@ -50,7 +50,7 @@ _ITEMS = 64
 
 
 class FeaturePose(NamedTuple):
-    """Pose of a camera over a board, and how the features agree with it.
+    """Pose of a camera over a board, with the residuals of the features.
 
     Attributes
     ----------
@@ -60,8 +60,8 @@ class FeaturePose(NamedTuple):
         precision.
         Where the status is not OK, all fields are NaN unless their description says otherwise.
     covariance : float64, (3, 3)
-        Covariance of the pose: not below that of the sigmas of the features, however well these agree. float32 on
-        devices without double precision.
+        Covariance of the pose. Residuals smaller than the sigmas of the features do not reduce it. float32 on devices
+        without double precision.
     status : uint8
         `Status` flags, as in `BoardPose`: NO_DATA, AMBIGUOUS, OUT_OF_RANGE, NOT_FINITE.
     residuals, weights : float32, (rows,)
@@ -173,7 +173,7 @@ class CameraFeatures:
 
 
 def _table(rows: Rows, names: tuple[str, ...]) -> npt.NDArray[np.float32]:
-    """Return rows as a table for a kernel; one row of zeros where there is none, because a buffer has a size."""
+    """Return rows as a table for a kernel: one row of zeros for no rows, because a buffer cannot be empty."""
     return np.array(rows or [(0.0,) * len(names)], np.float32).reshape(-1, len(names))
 
 
@@ -205,12 +205,12 @@ class PlaceFeatures(VisionOperation[PlacedFeatures]):
         work = build.work(1, each=1, group=_ITEMS)
         shapes = {name: (count, size) if count else None for name, count, size in _placed(counts)}
         return build.launch(
-            "feature_pose/feature_places.cl",
+            "feature_pose/feature_pose.cl",
             "place_features",
             work=work,
             more_inputs=[((2,), build.real)],
             outputs=build.outputs(shapes),
-            defines=type_defines("WIDE", dtype),
+            defines={**type_defines("WIDE", dtype), **flags(PLACE_FEATURES=True)},
             arguments=of.tables(dtype),
             passes_once=work.vectors,
         )
@@ -225,7 +225,7 @@ class SolveFeatures(VisionOperation[FeaturePose]):
     """Pose of the camera from measured features: last stage of `EstimateFeaturePose`.
 
     Inputs are the expected pose; position, sigma, status of the rulers; shift, size, covariance, status of the matched
-    and of the drilled fiducials; those that exist.
+    fiducials; the same of the drilled fiducials. A kind without features has no inputs.
 
     Parameters
     ----------

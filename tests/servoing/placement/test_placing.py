@@ -172,7 +172,7 @@ def test_the_delay_is_that_of_the_sensor() -> None:
 
     def latency(readout: SensorReadout, **pixel: object) -> float:
         described = {"rows": 256, "columns": 256, "pitch": 1e-5, "quantum_efficiency": 0.5, "gain": 0.1}
-        sensor = CmosSensor(**described, dark_noise=10.0, full_well=2e4, bits=10, readout=readout, **pixel)  # type: ignore[arg-type]
+        sensor = CmosSensor(**described, dark_noise=10.0, full_well=2e4, bits=10, readout=readout, **pixel)
         camera = dataclasses.replace(MACHINE.camera, sensor=sensor, window=(128, 128), exposure=0.2e-3)
         machine = dataclasses.replace(MACHINE, camera=camera, rate=1000.0, transfer=0.0, stages={}, gain=None)
         if not readout.buffers:

@@ -13,6 +13,8 @@ import operator
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -286,6 +288,51 @@ class Section:
     def _value_error(self, key: str, value: Any, unit: str, expected: str) -> DescriptionError:
         shown = _shown(f"{_represented(value)} {unit}".rstrip())
         return self.error(f"{self.dotted(key)} is {shown}, expected {expected}")
+
+
+def preset_names(folder: str) -> tuple[str, ...]:
+    """Return the names of the presets in a folder of ``gpuvision/presets``, in order."""
+    return tuple(sorted(Path(each.name).stem for each in _presets(folder).iterdir()))
+
+
+def _presets(folder: str) -> Traversable:
+    return resources.files("gpuvision").joinpath("presets", folder)
+
+
+def read_preset(path: str | Path, folder: str, kind: str) -> Section:
+    """Read a TOML file, or a preset of the package by its name.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of a file, or one of `preset_names`.
+    folder : str
+        Folder of ``gpuvision/presets``.
+    kind : str
+        Content of the file, for error messages.
+
+    Returns
+    -------
+    Section
+        Table of the whole file.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is no such file and no such preset; the message names the presets.
+    OSError, DescriptionError
+        As `read_toml`.
+    """
+    names = preset_names(folder)
+    if str(path) in names:
+        with resources.as_file(_presets(folder) / f"{path}.toml") as file:
+            return read_toml(file)
+    path = Path(path)
+    if not path.exists():
+        close = difflib.get_close_matches(path.stem, names, 1)
+        hint = f"did you mean '{close[0]}'?" if close else f"give a file or one of {', '.join(names)}"
+        raise FileNotFoundError(f"there is no {kind} file {one_line(str(path))}; {hint}")
+    return read_toml(path)
 
 
 def read_toml(path: Path) -> Section:

@@ -163,7 +163,7 @@ def _time(text: str | None, option: str) -> float:
 
 def _readout(sensor: str, roi: str | None, exposure: float, rate: float) -> float:
     """Return the readout time of a region of a camera preset, which must reach the frame rate."""
-    from gpuvision.formats.cmos_sensor_file import CMOS_SENSORS, read_cmos_sensor
+    from gpuvision.formats.cmos_sensor_file import read_cmos_sensor
 
     shape = None
     if roi is not None:
@@ -171,11 +171,7 @@ def _readout(sensor: str, roi: str | None, exposure: float, rate: float) -> floa
         if found is None:
             raise ValueError(f"--roi is {roi!r}, expected columns and rows: 128x128")
         shape = int(found[2]), int(found[1])
-    try:
-        described = read_cmos_sensor(sensor)
-    except OSError as error:
-        known = ", ".join(CMOS_SENSORS)
-        raise ValueError(f"--sensor: {sensor}: {error.strerror or error}; expected {known} or a sensor file") from error
+    described = read_cmos_sensor(sensor)
     timing = described.timing(shape, exposure or None)
     if timing.rate < rate:
         reached = f"the sensor reaches {timing.rate:.4g} frames per second, --rate is {rate:g}"

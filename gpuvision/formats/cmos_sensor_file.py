@@ -5,12 +5,11 @@ The package contains the sensors in `CMOS_SENSORS`; ``docs/reference/camera_pres
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
 from gpuvision.camera.cmos_sensor import CmosSensor
 from gpuvision.camera.sensor_readout import SensorReadout
-from gpuvision.schema import Section, read_toml
+from gpuvision.schema import Section, read_preset
 
 CMOS_SENSORS = ("lupa300", "pb1024")
 """Names of the sensors in the package."""
@@ -35,10 +34,7 @@ def read_cmos_sensor(path: str | Path) -> CmosSensor:
     DescriptionError
         A key is missing, unknown or has a wrong value; the message names the key.
     """
-    if str(path) in CMOS_SENSORS:
-        with resources.as_file(resources.files("gpuvision") / "presets" / "cameras" / f"{path}.toml") as file:
-            return _sensor(read_toml(file))
-    return _sensor(read_toml(Path(path)))
+    return _sensor(read_preset(path, "cameras", "image sensor"))
 
 
 def _sensor(top: Section) -> CmosSensor:

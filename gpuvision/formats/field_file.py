@@ -6,11 +6,10 @@ The package contains the fields in `FIELDS`.
 from __future__ import annotations
 
 import math
-from importlib import resources
 from pathlib import Path
 
 from gpuvision.matching.field.distance_map import Arc, Field
-from gpuvision.schema import Section, read_toml
+from gpuvision.schema import Section, read_preset
 
 FIELDS = ("robocup_msl", "robocup_junior")
 """Names of the fields in the package."""
@@ -35,10 +34,7 @@ def read_field(path: str | Path) -> Field:
     DescriptionError
         A key is missing, unknown or has a wrong value; the message names the key.
     """
-    if str(path) in FIELDS:
-        with resources.as_file(resources.files("gpuvision") / "presets" / "fields" / f"{path}.toml") as file:
-            return _field(read_toml(file))
-    return _field(read_toml(Path(path)))
+    return _field(read_preset(path, "fields", "field"))
 
 
 def _field(top: Section) -> Field:

@@ -6,12 +6,11 @@ The package contains the machines in `MACHINES`; ``docs/reference/machine_files.
 from __future__ import annotations
 
 import math
-from importlib import resources
 from pathlib import Path
 
 from gpuvision.formats.cmos_sensor_file import CMOS_SENSORS, read_cmos_sensor
-from gpuvision.host.reading import one_line
-from gpuvision.schema import Section, read_toml
+from gpuvision.host.reading import reason_of
+from gpuvision.schema import Section, read_preset, read_toml
 from gpuvision.servoing.axis import Axis, FineStage
 from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform
 from gpuvision.servoing.placement.machine import Machine, PlacementCamera, ThermalDrift, Tolerance
@@ -46,10 +45,7 @@ def read_machine(path: str | Path, *, rate: float | None = None) -> Machine:
         A key is missing, unknown or has a wrong value, or the file of the sensor cannot be read; the message names the
         key.
     """
-    if str(path) in MACHINES:
-        with resources.as_file(resources.files("gpuvision") / "presets" / "machines" / f"{path}.toml") as file:
-            return _machine(read_toml(file), rate)
-    return _machine(read_toml(Path(path)), rate)
+    return _machine(read_preset(path, "machines", "machine"), rate)
 
 
 def named_files(path: str | Path) -> tuple[Path, ...]:
@@ -103,8 +99,7 @@ def _camera(table: Section) -> PlacementCamera:
     try:
         sensor = read_cmos_sensor(file)
     except OSError as error:
-        shown, presets = one_line(str(file)), ", ".join(CMOS_SENSORS)
-        raise table.error(f"camera.sensor: {shown}: {error.strerror}; expected {presets} or a sensor file") from error
+        raise table.error(f"camera.sensor: {reason_of(error)}") from error
     window = table.numbers("window", "px", (2,))
     values = {
         "pixel": table.number("pixel", "m", above=0.0, at_most=_LARGEST_PIXEL),

@@ -37,10 +37,8 @@ Tables of the file (the files in ``gpuvision/presets/sensors`` are commented exa
 
 from __future__ import annotations
 
-import difflib
 import math
 from dataclasses import dataclass, field, replace
-from importlib import resources
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -56,7 +54,7 @@ from gpuvision.ranging.range_image import Limits, StraightTransport
 from gpuvision.ranging.rotating_sigma import RotatingSheetSigma
 from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Along
-from gpuvision.schema import DescriptionError, Section, read_toml
+from gpuvision.schema import DescriptionError, Section, preset_names, read_preset
 from gpuvision.sensor.focus import FOCUS_PLACE, read_focus
 from gpuvision.sensor.light_source import Light, read_light
 from gpuvision.sensor.optics import read_optics
@@ -199,19 +197,8 @@ class Sensor:
         DescriptionError
             A key is missing or unknown, or a value is out of range; the message has key, value, unit and range.
         """
-        brought = {
-            Path(each.name).stem: each for each in resources.files("gpuvision").joinpath("presets", "sensors").iterdir()
-        }
-        if str(path) in brought:
-            with resources.as_file(brought[str(path)]) as file:
-                return cls.from_section(read_toml(file), encoder=encoder)
-        path = Path(path)
-        if not path.exists():
-            close = difflib.get_close_matches(path.stem, brought, 1)
-            hint = f"did you mean '{close[0]}'?" if close else f"give a file or one of {', '.join(sorted(brought))}"
-            raise FileNotFoundError(f"there is no sensor file {path}; {hint}")
-        read = cls.from_section(read_toml(path), encoder=encoder)
-        return replace(read, files=(path, *read.files))
+        read = cls.from_section(read_preset(path, "sensors", "sensor"), encoder=encoder)
+        return read if str(path) in preset_names("sensors") else replace(read, files=(Path(path), *read.files))
 
     @classmethod
     def from_section(cls, top: Section, *, encoder: str | Path | None = None) -> Sensor:

@@ -99,7 +99,7 @@ def test_sensor_gives_the_readout(tmp_path: Path, quick_picture: None) -> None:
         (("--rate", "1000", "--sensor", "pb1024"), "--sensor pb1024 needs --exposure, such as 200us"),
         (
             ("--rate", "1000", "--sensor", "foo", "--exposure", "1us"),
-            "foo: No such file .* lupa300, pb1024 or a sensor",
+            "there is no image sensor file foo; give a file or one of lupa300, pb1024",
         ),
         (("--rate", "1000", "--exposure", "-200us"), "--exposure is '-200us', expected a time of 0 or more"),
         (("--rate", "1000", "--stage", "edges=1ms", "--stage", "edges=2ms"), "--stage edges is given twice"),

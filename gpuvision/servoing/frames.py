@@ -2,7 +2,7 @@
 
 The frames of a Look-While-Place machine are the artwork F_a, the artwork where it is expected F_e, the camera F_c, the
 pipette (nozzle) F_p, and the motion axes. A `Transform` maps coordinates of one frame to another one and carries both
-names, so that a product of transforms that do not meet in one frame is an error.
+names: a product of two transforms without a common frame in the middle is an error.
 
 References
 ----------
@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.matching.pose.motion import rotation
+from gpuvision.validation import numbers
 
 Float64 = npt.NDArray[np.float64]
 Kind = Literal["rigid", "similarity", "affine"]
@@ -329,12 +330,14 @@ def placement_error(
 
 
 def compose_poses(outer: Float64, inner: Float64) -> Float64:
-    """Return the poses (..., 3) of inner frames, given in an outer frame, in the frame in which the outer one is given.
+    """Compose poses: return the poses (..., 3) of the inner frames in the base frame.
 
     Parameters
     ----------
-    outer, inner : numpy.ndarray
-        (..., 3): x, y [m] and theta [rad].
+    outer : numpy.ndarray
+        (..., 3): x, y [m] and theta [rad] of the outer frames in the base frame.
+    inner : numpy.ndarray
+        (..., 3): x, y [m] and theta [rad] of the inner frames in the outer frames.
     """
     c, s = np.cos(outer[..., 2]), np.sin(outer[..., 2])
     x, y, theta = np.moveaxis(inner, -1, 0)
@@ -343,10 +346,17 @@ def compose_poses(outer: Float64, inner: Float64) -> Float64:
 
 
 def invert_pose(pose: Float64) -> Float64:
-    """Return the pose (..., 3) of the outer frame in the frame whose pose is given."""
+    """Return the inverse of poses (..., 3): the pose of the base frame in the frame with the given pose."""
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x, y, theta = np.moveaxis(pose, -1, 0)
     return np.stack([-c * x - s * y, s * x - c * y, -theta], axis=-1)
+
+
+def pose_difference(pose: Float64, other: Float64) -> Float64:
+    """Return ``pose - other`` (3,), with the angle in -pi to pi."""
+    difference = pose - other
+    difference[2] -= 2.0 * math.pi * round(float(difference[2]) / (2.0 * math.pi))
+    return difference
 
 
 def move_covariance(covariance: Float64, outer: Float64, inner: Float64) -> Float64:
@@ -380,16 +390,11 @@ def _square(matrix: Float64) -> Float64:
 
 
 def _array(values: npt.ArrayLike, shape: tuple[int, ...], what: str) -> Float64:
-    array = np.array(values, dtype=np.float64)
-    if array.shape != shape:
-        raise ValueError(f"{what} has shape {array.shape}, expected {shape}")
-    if not np.all(np.isfinite(array)):
-        raise ValueError(f"{what} has a number that is not finite")
-    return array
+    return np.array(numbers(values, shape, what))
 
 
 def _covariance(values: npt.ArrayLike | None, size: int) -> Float64:
-    """Return a checked covariance; 0 where none is given."""
+    """Return a checked covariance; zeros for None."""
     if values is None:
         return np.zeros((size, size))
     covariance = _array(values, (size, size), "covariance")

@@ -1,4 +1,4 @@
-"""Guards of a servo loop: how far the head may move on the last trusted pose, and when the loop gives up."""
+"""Guards of a servo loop: bound of the travel since the last trusted pose, and fault counters that end the loop."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.servoing.frames import pose_difference
 from gpuvision.servoing.observer import PoseMeasurement, Verdict
 from gpuvision.validation import finite, integer, numbers
 
@@ -49,18 +50,20 @@ class LoopLimits:
         Number of measurements in a row beyond the gate after which the loop gives up. Default 10 (chosen): a valid
         measurement is beyond the gate once in 1000.
     margin_sigmas : float
-        Standard deviations of a measured pose that the head may move beyond its error. Default 3.
+        Number of standard deviations of a measured pose by which the travel may exceed the error of this pose.
+        Default 3.
     lag : tuple of float
-        Time constants with which the axes follow the commanded velocity [s]: the motion that remains after an exposure
-        counts to the travel. Default 0.
+        Time constants with which the axes follow the commanded velocity [s]. The travel includes the motion that
+        remains from the velocity at the exposure. Default 0.
     watchdog : float
         Time without a command after which the plant stops by itself [s]; see `Plant`. Default: never, and the last
         command lasts until a late frame.
     encoder_error : tuple of float
-        Largest difference of encoder and integrated command [m], [m], [rad], above the lag times the speed of the
-        axes. Zero of the encoders is the first reading with which the next one agrees. Default: not checked.
+        Largest difference of encoder and integrated command [m], [m], [rad]; give more than the lag times the speed of
+        the axes. The zero of the encoders is the first reading that the next reading confirms. Default: not checked.
     readings : int
-        Number of readings in a row after which an encoder or a stop ends the loop; shorter faults are ignored.
+        Number of readings in a row after which a wrong encoder or an axis at its limit ends the loop. Shorter faults
+        are ignored.
         Default 5 (chosen).
     missed : int
         Number of late frames in a row after which the loop gives up. Default 10 (chosen).
@@ -91,23 +94,23 @@ class LoopLimits:
 
 
 class TravelGuard:
-    """Bound of the commanded motion since the last trusted exposure by the error that it showed.
+    """Guard that bounds the commanded motion since the last trusted exposure by the error of the pose.
 
     Parameters
     ----------
     margin_sigmas : float
-        Standard deviations of the measured pose by which the motion may exceed the error.
+        Number of standard deviations of the measured pose by which the motion may exceed the error.
     lag : array_like
         (3,) time constants with which the axes follow the commanded velocity [s]. Default 0.
 
     Notes
     -----
-    However long the camera is blind, each axis moves at most as far as the last trusted pose was away from the target.
-    Bounded is the integral of the commands since the exposure plus lag times the velocity at the exposure: the place
-    where an axis with this lag comes to rest, and by which its motion is bounded. A resonance adds its swing.
+    Without a new pose each axis moves at most by the distance of the last trusted pose from the target, plus the margin.
+    The guard bounds the integral of the commands since the exposure plus lag times the velocity at the exposure: the
+    position at which an axis with this lag comes to rest. The swing of a resonance is not included.
 
-    The bound holds for frames in time. Before a late frame the last command lasts for longer: n periods move an axis by
-    up to n times the bound, unless a watchdog of one period stops the plant (`LoopLimits.watchdog`).
+    The bound holds for frames that begin in time. Before a late frame the last command lasts longer: n periods move an
+    axis by up to n times the bound, unless a watchdog of one period stops the plant (`LoopLimits.watchdog`).
     """
 
     def __init__(self, margin_sigmas: float, lag: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
@@ -153,7 +156,7 @@ class TravelGuard:
         """
         if math.isinf(self._exposed):
             return np.zeros(3)
-        bound = np.abs(wrapped(target - self._pose)) + self._margin
+        bound = np.abs(pose_difference(target, self._pose)) + self._margin
         travelled = self._travelled(time)
         low, high = (-bound - travelled) / period, (bound - travelled) / period
         cut = np.clip(velocity, np.minimum(low, 0.0), np.maximum(high, 0.0))
@@ -173,7 +176,7 @@ class TravelGuard:
         return commanded + (speed - commanded) * np.where(self._lag > 0.0, decay, 0.0)
 
     def _travelled(self, time: float) -> Float64:
-        """Return the travel (3,) since the last trusted exposure to which the commands up to a time lead."""
+        """Return the travel (3,) since the last trusted exposure, by the commands up to a time."""
         total, end = np.zeros(3), time
         for start, velocity, speed in reversed(self._commands):
             total += velocity * (end - max(start, self._exposed))
@@ -183,14 +186,8 @@ class TravelGuard:
         return total
 
 
-def wrapped(error: Float64) -> Float64:
-    """Return a difference of poses (3,) with the angle in -pi to pi."""
-    error[2] -= 2.0 * math.pi * round(float(error[2]) / (2.0 * math.pi))
-    return error
-
-
 class FaultCounter:
-    """Faults in a row, and the outcome that they lead to."""
+    """Counters of consecutive faults, and the outcome when a counter reaches its limit."""
 
     def __init__(self, limits: LoopLimits) -> None:
         self._limits = limits
@@ -221,7 +218,7 @@ class FaultCounter:
         self._stopped = self._stopped + 1 if np.any(at_limit * error > 0.0) else 0
 
     def tick(self, late: bool) -> None:
-        """Count the begin of a frame."""
+        """Count the begin of a frame, in time or late."""
         self._missed = self._missed + 1 if late else 0
 
     def outcome(self, age: float) -> Outcome | None:

@@ -1,7 +1,7 @@
-"""Servo loop: measured poses, observer, controller and guards steer a plant; plant, sensor and clock real or simulated.
+"""Servo loop of measured poses, observer, controller and guards; plant, sensor and clock are real or simulated.
 
 In each frame the loop takes the poses that have arrived, corrects the observer, and commands a velocity until the next
-frame. See `TravelGuard` and `Outcome` for what it does when something fails.
+frame. `TravelGuard` and `Outcome` describe the reaction to faults.
 
 References
 ----------
@@ -20,14 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.servoing.controllers import Controller
-from gpuvision.servoing.guard import FaultCounter, LoopLimits, Outcome, TravelGuard, wrapped
-from gpuvision.servoing.observer import MotionEstimate, Observer, PoseMeasurement, Verdict
+from gpuvision.servoing.frames import pose_difference
+from gpuvision.servoing.guard import FaultCounter, LoopLimits, Outcome, TravelGuard
+from gpuvision.servoing.observer import SAME_TIME, MotionEstimate, Observer, PoseMeasurement, Verdict
 from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
-
-# Differences of two equal times by rounding [s].
-_SAME_TIME = 1e-9
 
 
 class PlantReading(NamedTuple):
@@ -54,8 +52,8 @@ class Plant(Protocol):
     def command(self, time: float, velocity: Float64) -> None:
         """Move with a velocity (3,) [m/s], [m/s], [rad/s] from a time on, until the next command.
 
-        A plant with a watchdog stops by itself a fixed time after its last command: a computer that hangs does not move
-        the head on. Give this time as `LoopLimits.watchdog`, one frame or a little more.
+        A plant with a watchdog stops by itself a fixed time after its last command, so that the head stops when the
+        computer hangs. Give this time as `LoopLimits.watchdog`: one frame or a little more.
         """
 
     def read(self, time: float) -> PlantReading:
@@ -80,7 +78,7 @@ class Clock(Protocol):
 
 
 class SimulatedClock:
-    """Clock that jumps to the time that is waited for."""
+    """Simulated clock: waiting sets it to the requested time at once."""
 
     def __init__(self) -> None:
         self._time = 0.0
@@ -96,13 +94,12 @@ class SimulatedClock:
 
 
 class WallClock:
-    """Time since the clock was made; waits by sleeping, and the last part of the time in a loop.
+    """Wall clock from 0 at its construction; it waits by sleeping, and by polling at the end.
 
     Parameters
     ----------
     spin : float
-        Time before the end in which the clock does not sleep [s]: the operating system may wake a sleeper late. Default
-        0.2 ms.
+        Time of polling at the end of a wait [s]: the operating system may end a sleep late. Default 0.2 ms.
 
     Attributes
     ----------
@@ -181,8 +178,8 @@ class LoopRecord(NamedTuple):
 class ServoLoop:
     """Loop that steers a plant to a target by measured poses.
 
-    A run resets the controller. A measurement that was exposed after the begin of its frame is refused: its times are
-    not those of the loop's clock.
+    A run resets the controller. The loop refuses a measurement that was exposed after the begin of the frame: its times
+    belong to another clock.
 
     Parameters
     ----------
@@ -267,7 +264,7 @@ class _Run:
         self.commanded, self.last = np.zeros(3), (self.start, np.zeros(3))
 
     def finish(self) -> LoopRecord:
-        """Run all frames, stop the head, whatever happens, and return the record."""
+        """Run all frames and return the record; stop the head at the end and after any error."""
         try:
             outcome, row = self._frames()
         finally:
@@ -309,11 +306,11 @@ class _Run:
         return Outcome.TIME_OVER, row
 
     def _frame(self, row: int, now: float, elapsed: float) -> Outcome | None:
-        """Do one frame, a time after the last one; return the reason to end the loop, or None."""
+        """Do one frame; return the reason to end the loop, or None. ``elapsed`` is the time since the last frame [s]."""
         loop = self.loop
         self._watch(now)
         for measurement in loop.sensor(now):
-            is_future = measurement.exposed > now + _SAME_TIME
+            is_future = measurement.exposed > now + SAME_TIME
             verdict = Verdict.REFUSED if is_future else loop.observer.add(measurement)
             self.measurements.append((measurement, verdict))
             self.faults.verdict(verdict)
@@ -322,7 +319,7 @@ class _Run:
         reading = loop.plant.read(now)
         state = loop.observer.estimate(now)
         target, speed = self.goal(now)
-        error = wrapped(target - state.pose)
+        error = pose_difference(target, state.pose)
         self.commanded += self.last[1] * (now - self.last[0])
         self.faults.reading(reading.position, reading.at_limit, self.commanded, error)
         self._record(row, now, target, state, reading.position)
@@ -337,7 +334,7 @@ class _Run:
     def _watch(self, now: float) -> None:
         """Tell observer and guard that the watchdog of the plant stopped the head, if it did."""
         stopped = self.last[0] + self.limits.watchdog
-        if now > stopped + _SAME_TIME:
+        if now > stopped + SAME_TIME:
             self.loop.observer.command(stopped, np.zeros(3))
             self.guard.stop(stopped)
             self.commanded += self.last[1] * self.limits.watchdog

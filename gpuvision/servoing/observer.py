@@ -21,9 +21,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.servoing.frames import pose_difference
 from gpuvision.validation import finite, integer, numbers
 
 Float64 = npt.NDArray[np.float64]
+
+SAME_TIME = 1e-9
+"""Two times that differ by less are the same time [s] (chosen): far above rounding, far below a frame time."""
 
 
 class PoseMeasurement(NamedTuple):
@@ -175,8 +179,6 @@ def _axis_transition(step: float, lag: float | None) -> tuple[float, float, floa
 
 # Squared Mahalanobis distance that a valid measurement exceeds with a probability of 0.001 (chi square, 3 degrees).
 _GATE = 16.266
-# Two exposures nearer than this are the same frame [s] (chosen): below the shortest frame time by far.
-_SAME_TIME = 1e-9
 # Smallest diagonal of the Cholesky factor of a correlation matrix that is not singular (chosen): the root of the
 # rounding errors is 1e-8.
 _SINGULAR = 1e-6
@@ -200,8 +202,8 @@ class PoseObserver:
 
     Notes
     -----
-    Memory is allocated once. A measurement costs one prediction and one correction, and one prediction (and correction)
-    for each command (and measurement) after its exposure: about 10 us each.
+    Memory is allocated once. A measurement costs one prediction and one correction, one prediction for each later
+    command in the history, and one prediction and one correction for each later measurement.
     """
 
     def __init__(self, model: MotionModel, *, history: int = 256, gate: float = _GATE) -> None:
@@ -252,9 +254,9 @@ class PoseObserver:
             The time is before the last command or measurement.
         """
         last = self._end - 1
-        if time < self._times[last] - _SAME_TIME:
+        if time < self._times[last] - SAME_TIME:
             raise ValueError(f"a command at {time:.6f} s is before the last entry at {self._times[last]:.6f} s")
-        if time > self._times[last] + _SAME_TIME:
+        if time > self._times[last] + SAME_TIME:
             last = self._insert(self._end, time)
             self._propagate(last)
         self._commands[last] = velocity
@@ -267,11 +269,11 @@ class PoseObserver:
         if not _is_valid(measurement):
             return Verdict.REFUSED
         time = measurement.exposed
-        if time < self._times[self._first] - _SAME_TIME:
+        if time < self._times[self._first] - SAME_TIME:
             return Verdict.TOO_OLD
-        place = self._first + int(np.searchsorted(self._times[self._first : self._end], time + _SAME_TIME, "right"))
+        place = self._first + int(np.searchsorted(self._times[self._first : self._end], time + SAME_TIME, "right"))
         for k in range(place - 1, self._first - 1, -1):
-            if self._times[k] < time - _SAME_TIME:
+            if self._times[k] < time - SAME_TIME:
                 break
             if self._measured[k]:
                 return Verdict.DUPLICATE
@@ -296,7 +298,7 @@ class PoseObserver:
             The time is before the last command or measurement.
         """
         last = self._end - 1
-        if time < self._times[last] - _SAME_TIME:
+        if time < self._times[last] - SAME_TIME:
             raise ValueError(f"the time {time:.6f} s is before the last entry at {self._times[last]:.6f} s")
         state, covariance = self._predict(last, time)
         return MotionEstimate(time, state[:3].copy(), state[3:].copy(), covariance[:3, :3].copy())
@@ -359,16 +361,15 @@ def _is_valid(measurement: PoseMeasurement) -> bool:
 
 def _innovation(state: Float64, covariance: Float64, pose: Float64, noise: Float64) -> tuple[float, Float64, Float64]:
     """Return the squared Mahalanobis distance of a pose, its residual, and the inverse of the residual's covariance."""
-    residual = pose - state[:3]
-    residual[2] -= 2.0 * math.pi * round(residual[2] / (2.0 * math.pi))
+    residual = pose_difference(pose, state[:3])
     inverse = np.asarray(np.linalg.inv(covariance[:3, :3] + noise), np.float64)
     return float(residual @ inverse @ residual), residual, inverse
 
 
 class LatestPose:
-    """Observer without a model: the pose is that of the latest exposure, however old.
+    """Observer without a model: the estimate is the measured pose of the latest exposure.
 
-    The loop then feels the whole delay: its gain must stay below `gain_limit`.
+    Nothing compensates the delay: the gain of the loop must stay below `gain_limit`.
     """
 
     def __init__(self) -> None:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.stats import f as f_distribution
 
-from gpuvision.servoing.guard import wrapped
+from gpuvision.servoing.frames import pose_difference
 from gpuvision.servoing.loop import LoopRecord
 from gpuvision.servoing.observer import Verdict
 from gpuvision.validation import finite, integer, numbers
@@ -167,7 +167,7 @@ def vibration_of_loop(record: LoopRecord, since: float) -> ResidualVibration:
     if len(taken) < 8:
         raise ValueError(f"{len(taken)} accepted poses since {since:g} s, expected 8 or more; run the loop for longer")
     times = np.array([each.exposed for each in taken])
-    errors = np.array([wrapped(record.target[-1] - each.pose) for each in taken])
+    errors = np.array([pose_difference(record.target[-1], each.pose) for each in taken])
     frequency, damping = np.zeros(3), np.full(3, 0.02)
     for axis in range(3):
         found = fit_vibration(times, errors[:, axis])

@@ -7,16 +7,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.servoing.observer import PoseMeasurement
+from gpuvision.servoing.observer import SAME_TIME, PoseMeasurement
 from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
 
 Fault = Callable[[int, PoseMeasurement], Sequence[PoseMeasurement]]
-"""Function that turns frame number and measurement into the measurements that arrive: none, another, or several."""
-
-# A measurement counts as arrived this time before its arrival [s]: equal times differ by rounding.
-_SAME_TIME = 1e-9
+"""Function of frame number and measurement that returns the measurements that arrive: 0, 1 or more."""
 
 
 class SimulatedPoseSensor:
@@ -29,8 +26,8 @@ class SimulatedPoseSensor:
     period : float
         Time between two frames [s].
     delay : float
-        Time from the middle of the exposure to the arrival of the pose [s]. A frame arrives at time 0: the phase of the
-        camera is that of a loop with the same period, whatever the delay.
+        Time from the middle of the exposure to the arrival of the pose [s]. Without jitter frame k arrives at
+        ``k * period``, for every delay: in time for frame k of a loop that starts at 0.
     exposure : float
         Time of exposure [s]: the pose is the mean over it. Default 0.
     covariance : array_like
@@ -69,12 +66,12 @@ class SimulatedPoseSensor:
 
     def __call__(self, time: float) -> list[PoseMeasurement]:
         """Return the measurements that arrived since the last call, up to a time [s]."""
-        while self._exposed(self._frame) + 0.5 * self.exposure <= time + _SAME_TIME:
+        while self._exposed(self._frame) + 0.5 * self.exposure <= time + SAME_TIME:
             measurement = self._measure(self._frame)
             self._waiting += [measurement] if self._fault is None else self._fault(self._frame, measurement)
             self._frame += 1
-        arrived = [each for each in self._waiting if each.arrived <= time + _SAME_TIME]
-        self._waiting = [each for each in self._waiting if each.arrived > time + _SAME_TIME]
+        arrived = [each for each in self._waiting if each.arrived <= time + SAME_TIME]
+        self._waiting = [each for each in self._waiting if each.arrived > time + SAME_TIME]
         return sorted(arrived, key=lambda each: each.arrived)
 
     def _exposed(self, frame: int) -> float:

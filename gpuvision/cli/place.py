@@ -65,7 +65,8 @@ def place(
     """Simulate placements of a part: the camera of the head steers the nozzle to its place on a rendered board.
 
     Every frame is rendered, measured by calipers (rulers), and answered by the controller after the delay of the
-    machine. The report compares the error at the release and the number of frames with their predictions.
+    machine. The report has the error at the release and its prediction. The release waits for the predicted number of
+    frames: more frames show that the machine settles more slowly than predicted.
     """
     from gpuvision.formats.json import json_tree
     from gpuvision.formats.machine_file import named_files, read_machine

@@ -101,18 +101,23 @@ def _camera(table: Section) -> PlacementCamera:
     except OSError as error:
         raise table.error(f"camera.sensor: {reason_of(error)}") from error
     window = table.numbers("window", "px", (2,))
-    values = {
-        "pixel": table.number("pixel", "m", above=0.0, at_most=_LARGEST_PIXEL),
-        "exposure": table.number("exposure", "s", above=0.0),
-        "electrons": table.number("electrons", "electrons", None, above=0.0),
-        "blur_px": table.number("blur_px", "px", 0.5, at_least=0.0),
-    }
+    pixel = table.number("pixel", "m", above=0.0, at_most=_LARGEST_PIXEL)
+    exposure = table.number("exposure", "s", above=0.0)
+    electrons = table.number("electrons", "electrons", None, above=0.0)
+    blur_px = table.number("blur_px", "px", 0.5, at_least=0.0)
     table.finish()
     with table.checking():
         if any(each != int(each) for each in window):
             raise ValueError(f"window is {list(window)}, expected whole numbers of rows and columns")
         rows, columns = (int(each) for each in window)
-        return PlacementCamera(sensor=sensor, window=(rows, columns), **values)  # type: ignore[arg-type]
+        return PlacementCamera(
+            sensor=sensor,
+            pixel=pixel,
+            window=(rows, columns),
+            exposure=exposure,
+            electrons=electrons,
+            blur_px=blur_px,
+        )
 
 
 def _calibration(table: Section) -> Transform:

@@ -22,6 +22,7 @@ from gpuvision.matching.artwork.shapes import Layer, Shape, area
 from gpuvision.matching.board.located_board import LocatedBoard
 from gpuvision.matching.board.measurement_result import Copper
 from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform, compose_poses, invert_pose
+from gpuvision.validation import numbers
 from gpuvision.workflows.locating_board import locate_board
 
 Float64 = npt.NDArray[np.float64]
@@ -141,13 +142,15 @@ def locate_part(
     ------
     ValueError
         A frame or a parameter is wrong, or too few edges are in view.
+    TypeError
+        ``expected`` is not a list of three numbers.
     """
     if (pipette_in_camera.source, pipette_in_camera.target) != (PIPETTE, CAMERA):
         raise ValueError(
             f"pipette_in_camera leads from {pipette_in_camera.source!r} to {pipette_in_camera.target!r}, expected from "
             "pipette to camera"
         )
-    part_in_camera = compose_poses(pipette_in_camera.pose, np.asarray(expected, np.float64))
+    part_in_camera = compose_poses(pipette_in_camera.pose, np.array(numbers(expected, (3,), "expected")))
     x, y, theta = invert_pose(part_in_camera).tolist()
     located = locate_board(
         image,

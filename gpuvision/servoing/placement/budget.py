@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.servoing.delay import characteristic_polynomial
-from gpuvision.servoing.frames import Transform, compose_poses, invert_pose
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.placing import REMAINDER
 from gpuvision.servoing.placement.plan import PlacementPlan
@@ -96,22 +95,14 @@ def predict_budget(machine: Machine, plan: PlacementPlan) -> ErrorBudget:
     differences between the pixels, which are the same in all frames of a head at rest. "servo" is the rest of the step
     response that `ReleaseRule` allows, evenly distributed, and the step of the encoder.
     """
-    averaged = noise_gain(machine.response_frames, machine.loop_gain)
+    averaged, turn = noise_gain(machine.response_frames, machine.loop_gain), plan.camera_to_board
     steps = np.array([axis.encoder for axis in machine.axes])
     rest = REMAINDER * np.array([machine.tolerance.position] * 2 + [machine.tolerance.angle])
     sources = {
-        "calibration": _at_board(machine.pipette_in_camera, plan, machine.pipette_in_camera.pose_covariance),
+        "calibration": turn @ machine.pipette_in_camera.pose_covariance @ turn.T,
         "etch bias": plan.etch_bias,
-        "drift": _at_board(machine.pipette_in_camera, plan, machine.drift.covariance),
+        "drift": turn @ machine.drift.covariance @ turn.T,
         "vision": (averaged * (1.0 - plan.fixed_pattern) + plan.fixed_pattern) * plan.vision,
         "servo": np.diag(rest**2 / 3.0 + steps**2 / 12.0),
     }
     return ErrorBudget(sources, np.sum(list(sources.values()), axis=0))
-
-
-def _at_board(calibrated: Transform, plan: PlacementPlan, covariance: Float64) -> Float64:
-    """Return the covariance of the nozzle on the board for a covariance of its pose in the camera frame."""
-    theta = float(compose_poses(plan.target, invert_pose(calibrated.pose))[2])
-    c, s = np.cos(theta), np.sin(theta)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(turn @ covariance @ turn.T)

@@ -28,7 +28,7 @@ REMAINDER = 0.2
 
 
 class ReleaseRule:
-    """Settling rule: the part is released when theory and measurement say that the head has settled.
+    """Settling rule: release the part when the predicted number of frames has passed and the error is within tolerance.
 
     The first measured error and the gain of the loop give the number of frames after which the rest of the step
     response is `REMAINDER` of the tolerance; from then on the first measured error within the tolerance releases. If an
@@ -43,7 +43,9 @@ class ReleaseRule:
 
     Notes
     -----
-    Implements `gpuvision.servoing.loop.SettlingRule`. A start near the target waits for fewer frames.
+    Implements `gpuvision.servoing.loop.SettlingRule`. A start near the target waits for fewer frames. The rule waits
+    for the predicted number of frames, so that agreement with this number is no check of the prediction. A placement
+    that takes many more frames shows that the machine settles more slowly than predicted.
     """
 
     def __init__(self, machine: Machine, observer: LatestPose) -> None:

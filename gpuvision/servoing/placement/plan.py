@@ -20,6 +20,7 @@ from gpuvision.matching.board.view_features import select_features_in_view
 from gpuvision.matching.features.exposure import sensor_imaging
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.imaging import Imaging
+from gpuvision.matching.pose.motion import rotation
 from gpuvision.matching.pose.pose import SolvePose
 from gpuvision.matching.pose.registration import CoarseRegistration, prepare_board_registration
 from gpuvision.servoing.frames import compose_poses, invert_pose, move_covariance
@@ -71,6 +72,13 @@ class PlacementPlan:
     fixed_pattern: float
     etch_bias: Float64
 
+    @property
+    def camera_to_board(self) -> Float64:
+        """(3, 3) matrix that turns errors x, y, theta of the nozzle in the camera frame into the axes of the board."""
+        turn = np.eye(3)
+        turn[:2, :2] = rotation(float(self.camera_pose[2]))
+        return turn
+
 
 def plan_placement(
     artwork: Artwork,
@@ -112,7 +120,7 @@ def plan_placement(
     frame and rulers with a search range of `tracking_imaging` follow it.
     """
     if artwork.side != "top":
-        raise ValueError("the artwork is that of the bottom side; the camera frame is defined for the top side")
+        raise ValueError("the artwork shows the bottom side; the camera frame is defined for the top side")
     place = np.array(numbers(target, (3,), "target"))
     calibrated = machine.pipette_in_camera.pose
     camera_pose = compose_poses(place, invert_pose(calibrated))
@@ -161,8 +169,8 @@ def tracking_imaging(machine: Machine, reflectance: BoardReflectance | None = No
     """Return image quality and search range of the frames after the landing.
 
     The rulers of a frame are placed at the pose of the last frame. The head moves by the gain times the error at most
-    between them; the error is that of the landing zone, at the camera. The tolerance of the coarse registration is
-    added.
+    between them; the largest error is the landing zone, seen at the camera. The tolerance of the coarse registration
+    is added.
     """
     wide, tolerance = placement_imaging(machine, reflectance), machine.tolerance
     shift = machine.loop_gain * landing_range(machine) + _TOLERANCE_PX * machine.camera.pixel
@@ -233,7 +241,9 @@ class _Guidance:
         if _largest_leverage(features) > SolvePose.max_leverage:
             raise ValueError("a direction of the pose depends on one edge only, which no other edge checks")
         if features.condition > SolvePose.max_condition:
-            raise ValueError("the edges determine a direction of the pose only but for the etch bias, or hardly")
+            raise ValueError(
+                "the edges hardly separate a direction of the pose from the etch bias, or from another one"
+            )
         return features
 
 

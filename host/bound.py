@@ -64,14 +64,13 @@ class Bound(Generic[R]):
         self.queue = device.queue if queue is None else queue
         self._launch = launch
         self._computed_specs = {name: spec for name, spec in launch.outputs.items() if spec is not None}
+        self._input_specs = launch.inputs
         self._global, self._local = launch.global_size, launch.local_size
         # `Device.wait` with its branch on the runtime resolved here: a short call takes only a few microseconds in
         # total.
         self._wait: Callable[[Any], object] = device.wait if device.kind == "pocl" else cl.Event.wait
         self._empty = not all(launch.global_size)
         self.inputs = tuple(inputs) or self._new_inputs(launch.inputs)
-        count, kind = len(self.inputs), type(operation).__name__
-        self._input_names = [f"{kind}: input {number} of {count}" for number in range(1, count + 1)]
         self.outputs = self.allocate()
         self._tables = [self._upload(each) for each in launch.arguments if isinstance(each, np.ndarray)]
         self._in_flight: collections.deque[tuple[Any, Any]] = collections.deque()
@@ -118,6 +117,12 @@ class Bound(Generic[R]):
         """Arguments of `pyopencl.enqueue_nd_range_kernel` for a launch: queue, kernel, global size, local size."""
         site = self._site()
         return site.queue, site.kernel, self._global, self._local
+
+    @functools.cached_property
+    def _input_names(self) -> list[str]:
+        """Names of the inputs in messages."""
+        count, kind = len(self.inputs), type(self.operation).__name__
+        return [f"{kind}: input {number} of {count}" for number in range(1, count + 1)]
 
     def allocate(self) -> R:
         """Return new device arrays for the outputs."""
@@ -194,7 +199,7 @@ class Bound(Generic[R]):
         """Run on NumPy arrays and wait; where memory is shared, the kernel reads and writes them in place."""
         if len(frames) != len(self.inputs):
             raise self._wrong_count(len(frames))
-        for name, frame, (shape, dtype) in zip(self._input_names, frames, self._launch.inputs, strict=True):
+        for name, frame, (shape, dtype) in zip(self._input_names, frames, self._input_specs, strict=True):
             check_host(frame, shape, dtype, name)
         if out is None:
             out = self._result({k: np.empty(shape, dtype) for k, (shape, dtype) in self._computed_specs.items()})

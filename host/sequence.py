@@ -1,4 +1,4 @@
-"""Sequences of operations that run as one operation: they are enqueued together, without work of the host in between.
+"""Sequence of operations that runs as one operation: all launches are enqueued without work of the host in between.
 
 The stages of a sequence pass arrays on in device memory. The inputs of a stage are inputs of the sequence or outputs of
 any earlier stage, so that several stages read the same frame.
@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
-import pyopencl as cl
 
-from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
+from gpuvision.host.arrays import DeviceArray, HostArray, host_view
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
 from gpuvision.host.launch import Spec, Specs, nbytes_of
@@ -127,6 +126,7 @@ class BoundSequence(Bound[R]):
         specs = operation.specs(device, shape, dtype)
         self.operation, self.device = operation, device
         self.queue = device.queue if queue is None else queue
+        self._empty = False
         self._layout = layout
         self._input_specs = specs.inputs
         self._computed_specs = {field: spec for field, spec in specs.outputs.items() if spec is not None}
@@ -154,7 +154,7 @@ class BoundSequence(Bound[R]):
     @property
     def enqueue_arguments(self) -> tuple[Any, Any, tuple[int, ...], tuple[int, ...] | None]:
         """Raise an error: a sequence has several launches; see `stages`."""
-        raise TypeError("a sequence is enqueued by several launches; take those of its stages")
+        raise TypeError("a sequence has several launches; use enqueue_arguments of each of its stages")
 
     def __call__(self, *frames: DeviceArray, out: R | None = None, wait_for: Sequence[Any] | None = None) -> Any:
         """Enqueue all stages and return the event of the last one; arguments as in `Bound`."""
@@ -191,24 +191,13 @@ class BoundSequence(Bound[R]):
         self.device.wait(event)
         return self.outputs if out is None else out
 
-    def on_host(self, frames: Sequence[HostArray], out: R | None = None) -> R:
-        """Copy NumPy arrays to the inputs, run, and copy the outputs to NumPy arrays."""
-        if len(frames) != len(self.inputs):
-            raise self._wrong_count(len(frames))
-        for number, (frame, spec, array) in enumerate(zip(frames, self._input_specs, self.inputs, strict=True), 1):
-            check_host(frame, *spec, f"{type(self.operation).__name__}: input {number} of {len(frames)}")
-            if self.device.shares_memory:
-                host_view(array)[...] = frame
-            else:
-                cl.enqueue_copy(self.queue, memory_of(array), frame, is_blocking=False)
+    def _run_in_place(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
+        """Copy to the inputs, run, and copy from the outputs: stages keep the arrays to which they are bound."""
+        for array, frame in zip(self.inputs, frames, strict=True):
+            host_view(array)[...] = frame
         self.device.wait(self())
-        if out is None:
-            out = self._result({k: np.empty(shape, dtype) for k, (shape, dtype) in self._computed_specs.items()})
-        self._check_fields(out)
-        for name, (shape, dtype) in self._computed_specs.items():
-            check_host(getattr(out, name), shape, dtype, f"out.{name}")
-            getattr(out, name)[...] = getattr(self.outputs, name).get(queue=self.queue)
-        return out
+        for array, target in zip(self._computed(self.outputs), targets, strict=True):
+            target[...] = host_view(array)
 
 
 def _first(stage: Stage, arrays: Mapping[str, Spec | None]) -> Spec:

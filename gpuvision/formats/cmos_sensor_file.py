@@ -5,6 +5,7 @@ The package contains the sensors in `CMOS_SENSORS`; ``docs/reference/camera_pres
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from gpuvision.camera.cmos_sensor import CmosSensor
@@ -42,28 +43,33 @@ def _sensor(top: Section) -> CmosSensor:
     array, response, noise = (top.section(key) for key in ("array", "response", "noise"))
     readout = _readout(top.section("readout"))
     top.finish()
-    values = {
-        "rows": array.integer("rows", at_least=1),
-        "columns": array.integer("columns", at_least=1),
-        "pitch": array.number("pitch", "m", above=0.0),
-        "pixel": array.choice("pixel", ("integrating", "direct_read"), "integrating"),
-        "response_time": array.number("response_time", "s", 0.0, at_least=0.0),
-        "quantum_efficiency": response.number("quantum_efficiency", "electrons per photon", above=0.0, at_most=1.0),
-        "wavelength": response.number("wavelength", "m", 550e-9, above=0.0),
-        "gain": response.number("gain", "grey levels per electron", above=0.0),
-        "full_well": response.number("full_well", "electrons", above=0.0),
-        "bits": response.integer("bits", at_least=1, at_most=16),
-        "dark_level": response.number("dark_level", "grey levels", 0.0, at_least=0.0),
-        "nonlinearity": response.number("nonlinearity", "", 0.0, at_least=0.0, below=0.5),
-        "dark_noise": noise.number("dark_noise", "electrons", at_least=0.0),
-        "dsnu": noise.number("dsnu", "electrons", 0.0, at_least=0.0),
-        "prnu": noise.number("prnu", "", 0.0, at_least=0.0),
-        "dark_current": noise.number("dark_current", "electrons/s", 0.0, at_least=0.0),
-    }
+    # Unknown keys are refused before `CmosSensor` compares the values: a misspelt key has a default here.
+    make = partial(
+        CmosSensor,
+        rows=array.integer("rows", at_least=1),
+        columns=array.integer("columns", at_least=1),
+        pitch=array.number("pitch", "m", above=0.0),
+        pixel=array.choice("pixel", ("integrating", "direct_read"), "integrating"),
+        response_time=array.number("response_time", "s", 0.0, at_least=0.0),
+        quantum_efficiency=response.number("quantum_efficiency", "electrons per photon", above=0.0, at_most=1.0),
+        wavelength=response.number("wavelength", "m", 550e-9, above=0.0),
+        gain=response.number("gain", "grey levels per electron", above=0.0),
+        full_well=response.number("full_well", "electrons", above=0.0),
+        bits=response.integer("bits", at_least=1, at_most=16),
+        dark_level=response.number("dark_level", "grey levels", 0.0, at_least=0.0),
+        nonlinearity=response.number("nonlinearity", "", 0.0, at_least=0.0, below=0.5),
+        dark_noise=noise.number("dark_noise", "electrons", at_least=0.0),
+        dsnu=noise.number("dsnu", "electrons", 0.0, at_least=0.0),
+        prnu=noise.number("prnu", "", 0.0, at_least=0.0),
+        dark_current=noise.number("dark_current", "electrons/s", 0.0, at_least=0.0),
+        readout=readout,
+        name=name,
+        estimated=tuple(estimated.split()),
+    )
     for each in (array, response, noise):
         each.finish()
     with top.checking():
-        return CmosSensor(name=name, estimated=tuple(estimated.split()), readout=readout, **values)  # type: ignore[arg-type]
+        return make()
 
 
 def _readout(table: Section) -> SensorReadout:

@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyopencl as cl
 from numpy.typing import DTypeLike
 
 from gpuvision.host import BoundSequence, Device, host_view
-from gpuvision.host.arrays import check_host, memory_of
+from gpuvision.host.arrays import check_host
 from gpuvision.matching.pose.feature_pose import EstimateFeaturePose, FeaturePose
 
 
@@ -87,7 +86,7 @@ class BoundFeatures:
         Raises
         ------
         TypeError, ValueError
-            Dtype, shape or layout of the frame differ from the bound ones.
+            Dtype, shape or layout of the frame differ from the bound dtype, shape or layout.
         """
         if frame is not None:
             check_host(frame, self.frame.shape, self.frame.dtype, "frame")
@@ -95,17 +94,6 @@ class BoundFeatures:
         self._pose[:] = predicted_pose
         self._corner[:] = corner
         if not self._shares:
-            return self._with_copies()
+            return self._bound.on_host((self.frame, self._pose, self._corner), self._result)
         self.device.wait(self._bound())
-        return self._result
-
-    def _with_copies(self) -> FeaturePose:
-        """Run on a device with memory of its own."""
-        bound, queue = self._bound, self._bound.queue
-        for array, host in zip(bound.inputs, (self.frame, self._pose, self._corner), strict=True):
-            cl.enqueue_copy(queue, memory_of(array), host, is_blocking=False)
-        bound()
-        for name, output in bound.outputs._asdict().items():
-            cl.enqueue_copy(queue, getattr(self._result, name), memory_of(output), is_blocking=False)
-        queue.finish()
         return self._result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
 from typing import Any
@@ -237,6 +238,24 @@ def test_frames_of_a_camera_need_no_copy(
     np.testing.assert_array_equal(again.pose, pose)
     # The same arrays in every call: nothing is allocated.
     assert all(a is b for a, b in zip(again, result, strict=True))
+
+
+def test_a_device_with_separate_memory_gives_the_same_pose(
+    features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
+) -> None:
+    separate = copy.copy(device)
+    separate.shares_memory = False
+    expected, found = (bind(features, each)(seen[0], NEAR) for each in (device, separate))
+    np.testing.assert_array_equal(found.pose, expected.pose)
+    np.testing.assert_array_equal(found.covariance, expected.covariance)
+
+
+def test_results_must_lie_apart(features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device) -> None:
+    operation = bind(features, device).operation
+    frames = seen[0], NEAR, np.zeros(2, np.float32)
+    result = operation(*frames, device=device)
+    with pytest.raises(ValueError, match="arrays apart"):
+        operation(*frames, device=device, out=result._replace(scale=result.residual_scale))
 
 
 def test_a_board_that_is_not_there_is_refused(features: FeatureSet, device: Device) -> None:

@@ -194,8 +194,8 @@ class LineReadout(VisionOperation[LineReading]):
     Cost of ``sigma`` over the readout of 16 frames (512, 1024) uint8 without it, two-core machine, PoCL and Intel:
     ``"windowed"`` 12 and 15 %, ``"gauss3"`` 3 and 3 %, ``"fir"`` 13 and 10 %, ``"ml"`` 20 and 15 %, ``"centroid"``
     14 and 19 % (medians of interleaved runs on a machine with other load; ``gpuvision profile line`` repeats them in
-    the rows ``-sigma/16``). The sums of ``"centroid"`` for integer frames round ``sigma`` to 1e-4 of its value where the
-    line is steep and thin.
+    the rows ``-sigma/16``). The sums of ``"centroid"`` for integer frames round ``sigma`` to 1e-4 of its value where
+    the line is steep and thin.
 
     References
     ----------

@@ -105,9 +105,9 @@ class TravelGuard:
 
     Notes
     -----
-    Without a new pose each axis moves at most by the distance of the last trusted pose from the target, plus the margin.
-    The guard bounds the integral of the commands since the exposure plus lag times the velocity at the exposure: the
-    position at which an axis with this lag comes to rest. The swing of a resonance is not included.
+    Without a new pose each axis moves at most by the distance of the last trusted pose from the target, plus the
+    margin. The guard bounds the integral of the commands since the exposure plus lag times the velocity at the
+    exposure: the position at which an axis with this lag comes to rest. The swing of a resonance is not included.
 
     The bound holds for frames that begin in time. Before a late frame the last command lasts longer: n periods move an
     axis by up to n times the bound, unless a watchdog of one period stops the plant (`LoopLimits.watchdog`).

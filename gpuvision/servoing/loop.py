@@ -306,7 +306,7 @@ class _Run:
         return Outcome.TIME_OVER, row
 
     def _frame(self, row: int, now: float, elapsed: float) -> Outcome | None:
-        """Do one frame; return the reason to end the loop, or None. ``elapsed`` is the time since the last frame [s]."""
+        """Do one frame, ``elapsed`` seconds after the last one; return the reason to end the loop, or None."""
         loop = self.loop
         self._watch(now)
         for measurement in loop.sensor(now):

@@ -80,7 +80,8 @@ FrameRate = Annotated[
     float | None,
     typer.Option(
         metavar="FPS",
-        min=1e-6,
+        min=1e-3,
+        max=1e7,
         help="INPUT is a recording with this number of frames per second: follow the robot through it. DIR gets "
         "track.csv, track.json and track.png.",
     ),

@@ -38,6 +38,9 @@ class Controller(Protocol):
     ) -> Float64:
         """Return the commanded velocity (3,) for an error, its derivative and the target's velocity, (3,) each."""
 
+    def applied(self, velocity: Float64) -> None:
+        """Take the velocity (3,) that was sent to the plant instead of the last command, after all guards."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PidGains:
@@ -128,7 +131,8 @@ class PidController:
     The command is ``proportional (part + integral of part / integral) + feed_forward target'`` with ``part = error +
     derivative error'``: the form of `simc_gains`. The derivative of the error is the target's velocity less the
     observer's, and needs no filter. A command beyond the limit is cut, and the integral part of this axis stands still
-    while ``part`` would drive the command further beyond the limit (conditional integration) [1]_.
+    while ``part`` would drive the command further beyond the limit (conditional integration) [1]_. The same holds for a
+    command that a guard cut: `ServoLoop` calls `applied` with the velocity that it sent.
 
     References
     ----------
@@ -147,7 +151,8 @@ class PidController:
 
     def reset(self) -> None:
         """Set the integral part to 0."""
-        self._integral = np.zeros(3)
+        self._integral, self._before = np.zeros(3), np.zeros(3)
+        self._part, self._command = np.zeros(3), np.zeros(3)
 
     def __call__(
         self, error: Float64, velocity: Float64, period: float, target_velocity: Float64 | None = None
@@ -172,11 +177,25 @@ class PidController:
             wanted = wanted + self.feed_forward * target_velocity
         if math.isinf(gains.integral):
             return np.clip(wanted, -self.limit, self.limit)
-        grown = self._integral + gains.proportional / gains.integral * period * part
-        total = wanted + grown
-        pushes = (np.abs(total) > self.limit) & (np.sign(total) == np.sign(part))
-        self._integral = np.where(pushes, self._integral, grown)
+        self._part, self._before = np.array(part), self._integral
+        self._integral = self._before + gains.proportional / gains.integral * period * part
+        self._command = wanted + self._integral
+        self.applied(np.clip(self._command, -self.limit, self.limit))
         return np.clip(wanted + self._integral, -self.limit, self.limit)
+
+    def applied(self, velocity: Float64) -> None:
+        """Take the velocity that was sent to the plant instead of the last command.
+
+        The integral part of an axis returns to its value before the last command if the velocity differs from the
+        command, and the error drives the command further away from the velocity.
+
+        Parameters
+        ----------
+        velocity : numpy.ndarray
+            (3,): velocity after all guards [m/s], [m/s], [rad/s].
+        """
+        is_driven_away = (self._command - velocity) * self._part > 0.0
+        self._integral = np.where(is_driven_away, self._before, self._integral)
 
 
 class SmithPredictor:

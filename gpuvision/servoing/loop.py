@@ -349,6 +349,7 @@ class _Run:
             velocity = self.guard.limit(now, velocity, target, loop.period)
         loop.plant.command(now, velocity)
         loop.observer.command(now, velocity)
+        loop.controller.applied(velocity)
         self.last = now, velocity
         self.columns[4, row] = velocity
 

@@ -28,6 +28,7 @@ from gpuvision.matching.field.distance_map import Field
 from gpuvision.matching.field.odometry import PoseEstimate
 from gpuvision.matching.field.robot_filter import RobotFilter, RobotFilterLimits, RobotState
 from gpuvision.plots.field import draw_robot_track
+from gpuvision.validation import finite
 from gpuvision.workflows.locating_robot import locate_robot, scan_floor
 
 Float64 = npt.NDArray[np.float64]
@@ -173,7 +174,7 @@ def track_robot(
     field
         The field.
     rate
-        Frames per second, above 0.
+        Frames per second, 0.001 to 1e7.
     odometry
         (frames - 1, 3) motions (forward, left, turn) from each frame to the next [m], [m], [rad]. None: unknown.
     initial_pose
@@ -189,12 +190,11 @@ def track_robot(
     Raises
     ------
     ValueError
-        The rate is not above 0, or the odometry has another number of rows than there are motions.
+        The rate is out of range, or the odometry has another number of rows than there are motions.
     RecordingError
         A frame cannot be read, or there is none.
     """
-    if not 0.0 < rate < math.inf:
-        raise ValueError(f"the rate is {rate}, expected frames per second above 0")
+    finite(rate, "rate", minimum=1e-3, maximum=1e7)
     device = Device.best() if device is None else device
     motions = None if odometry is None else np.asarray(odometry, np.float64).reshape(-1, 3)
     initial = None

@@ -329,6 +329,25 @@ def test_watchdog_is_checked(wrong: float) -> None:
         SimulatedPlant(watchdog=wrong)
 
 
+def test_integral_part_stands_still_while_a_guard_cuts_the_command() -> None:
+    """Forty frames without pose, during which the loop holds the head, add no overshoot."""
+
+    def lost(frame: int, seen: PoseMeasurement) -> Sequence[PoseMeasurement]:
+        return [] if 5 <= frame < 45 else [seen]
+
+    def overshoot(fault: Fault | None) -> float:
+        plant, observer = SimulatedPlant((Axis(lag=1e-3),) * 3), PoseObserver(MODEL)
+        observer.reset(-DELAY, np.zeros(3), COVARIANCE)
+        sensor = SimulatedPoseSensor(plant.pose, period=PERIOD, delay=DELAY, covariance=COVARIANCE, fault=fault, seed=2)
+        controller = PidController(PidGains(proportional=100.0, integral=0.05))
+        loop = ServoLoop(plant, sensor, observer, controller, SimulatedClock(), period=PERIOD, limits=LIMITS)
+        record = loop.run(TARGET, 0.3)
+        assert record.outcome is Outcome.TIME_OVER
+        return float((plant.pose(record.time) / TARGET).max(axis=0).max()) - 1.0
+
+    assert overshoot(lost) < overshoot(None) + 0.01
+
+
 def test_controller_is_given_the_time_since_its_last_call() -> None:
     """One frame is late by two frames: the integral part grows by three frames."""
 

@@ -114,6 +114,22 @@ def test_anti_windup() -> None:
     assert free(far, np.zeros(3), PERIOD) == pytest.approx(far * 10.0 * (1.0 + PERIOD / 0.1))
 
 
+def test_anti_windup_of_an_applied_velocity() -> None:
+    """The integral part grows on an axis with the full velocity, and on one whose error reduces it."""
+    controller, far = PidController(PidGains(proportional=10.0, integral=0.1)), np.array([1.0, -1.0, 1.0])
+    for _ in range(100):
+        command = controller(far, np.zeros(3), PERIOD)
+        controller.applied(np.array([0.0, 0.5 * command[1], command[2]]))
+    grown = 10.0 * PERIOD / 0.1  # of one frame
+    expected = [10.0 + grown, -10.0 - grown, 10.0 + 101.0 * grown]
+    assert controller(far, np.zeros(3), PERIOD) == pytest.approx(expected)
+    controller.applied(np.zeros(3))
+    reduced = controller(np.array([0.0, 0.0, -0.1]), np.zeros(3), PERIOD)
+    controller.applied(np.zeros(3))
+    assert reduced == pytest.approx([0.0, 0.0, -1.0 + 99.9 * grown])
+    assert controller(np.zeros(3), np.zeros(3), PERIOD)[2] == pytest.approx(99.9 * grown)
+
+
 def test_derivative_and_feed_forward() -> None:
     controller = PidController(PidGains(proportional=10.0, derivative=0.2), feed_forward=0.5)
     error, speed = np.array([1.0, 2.0, 3.0]), np.array([-1.0, 0.0, 1.0])

@@ -105,8 +105,9 @@ def test_wrong_odometry_is_refused(drive: tuple[np.ndarray, np.ndarray], tmp_pat
     source, field = ArraySource(views[:1]), read_field("robocup_msl")
     with pytest.raises(ValueError, match="has 2 motions, expected 0 between 1 frames"):
         track_robot(source, field, rate=10.0, odometry=np.zeros((2, 3)), scale=SCALE, line_width=WIDE)
-    with pytest.raises(ValueError, match="rate"):
-        track_robot(source, field, rate=0.0, scale=SCALE, line_width=WIDE)
+    for rate in (0.0, 2e7, math.inf):
+        with pytest.raises(ValueError, match="rate"):
+            track_robot(source, field, rate=rate, scale=SCALE, line_width=WIDE)
     (tmp_path / "a.csv").write_text("x,y\n1,2\n")
     with pytest.raises(RecordingError, match="expected forward,left,turn"):
         read_odometry(tmp_path / "a.csv")
@@ -155,6 +156,21 @@ def test_the_command_fails_without_a_pose(
     assert "nan" not in said.err
     assert said.err.endswith("; look at out/track.png and out/track.csv\n")
     assert (tmp_path / "out" / "track.csv").exists()
+
+
+@pytest.mark.parametrize("rate", ["1e-4", "2e7", "1e300", "inf"])
+def test_impossible_rates_are_refused(
+    rate: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "carpet.npy", np.full((2, *SHAPE), 50, np.uint8))
+    words = ["locate-robot", "carpet.npy", "--field", "robocup_msl", "--scale", "4cm", "--rate", rate, "--out", "out"]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["gpuvision", *words])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2
+    assert "--rate" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_short_odometry_is_refused_before_the_first_frame(tmp_path: Path) -> None:

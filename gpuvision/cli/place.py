@@ -21,6 +21,7 @@ from gpuvision.cli.arguments import (
     quantities,
     write_report,
 )
+from gpuvision.cli.select import Side
 
 _LARGEST_BOARD = 1.0  # largest coordinate on a board [m] (chosen: panels are smaller)
 _FILES = ("report.json", "placements.png", "features.png")
@@ -57,6 +58,7 @@ def place(
     count: Annotated[int, typer.Option(min=1, max=10_000, help="Number of placements.")] = 20,
     budget: Annotated[int, typer.Option(min=3, max=1000, help="Number of calipers (rulers).")] = 60,
     seed: Annotated[int, typer.Option(min=0, max=(1 << 32) - 1, help="Seed of all random numbers.")] = 0,
+    side: Annotated[Side, typer.Option(help="Side of the board on which parts are placed.")] = Side.top,
     layers: LayerNames = None,
     as_json: ReportFile = None,
     device: DeviceLabel = None,
@@ -88,7 +90,7 @@ def place(
     outputs.claim_folder(out, _FILES)
     described = read_machine(machine, rate=rate)
     clearance = edge_clearance(placement_imaging(described))
-    artwork = read_artwork(gerbers, side="top", layers=layers_of(layers), clearance=clearance)
+    artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=clearance)
     for each in artwork.warnings:
         echo(f"warning: {each}", err=True)
     with progress_bar("placing") as progress:
@@ -106,7 +108,7 @@ def place(
     write_report(as_json, report, outputs)
     with outputs.folder(out) as inside:
         write_text_atomic(inside / "report.json", json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n")
-        view, region = described.camera.view(result.plan.camera_pose), result.plan.features.region
+        view, region = result.machine.camera.view(result.plan.camera_pose), result.plan.features.region
         draw_features(
             inside / "features.png", artwork, result.plan.features, region, view=view, target=result.plan.target[:2]
         )

@@ -42,7 +42,7 @@ class PlacementResult(NamedTuple):
     plan : PlacementPlan
         Features and camera pose.
     machine : Machine
-        Machine.
+        Machine over the side of the artwork.
     budget : ErrorBudget
         Predicted error by source.
     placements : tuple of Placement
@@ -142,11 +142,11 @@ def simulate_placements(
     Parameters
     ----------
     artwork : Artwork
-        Top side of the board, read with the clearance of `placement_imaging`.
+        Side of the board on which parts are placed, read with the clearance of `placement_imaging`.
     target : array_like
-        (3,): pose of the part on the board, x, y [m], theta [rad].
+        (3,): pose of the part in the frame of the board's files, x, y [m], theta [rad], as in `plan_placement`.
     machine : Machine
-        Machine.
+        Machine. `Machine.for_side` turns it to the side of the artwork.
     count : int
         Number of placements, 1 or more. Default 20.
     budget : float
@@ -175,6 +175,7 @@ def simulate_placements(
     """
     integer(count, "count", minimum=1)
     device = Device.best() if device is None else device
+    machine = machine.for_side(artwork.side)
     plan = plan_placement(artwork, target, machine, budget=budget)
     rng = np.random.default_rng(seed)
     tolerance, calibrated = machine.tolerance, machine.pipette_in_camera.pose

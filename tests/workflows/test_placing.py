@@ -6,6 +6,7 @@ import dataclasses
 import json
 import re
 import tomllib
+from collections.abc import Callable
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
@@ -20,9 +21,16 @@ from gpuvision.formats.machine_file import read_machine
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.features.feature_set import edge_clearance
-from gpuvision.servoing.frames import move_covariance
-from gpuvision.servoing.placement.machine import Machine
+from gpuvision.matching.pose.motion import rotation
+from gpuvision.servoing.frames import Transform, compose_poses, invert_pose, move_covariance
+from gpuvision.servoing.loop import SimulatedClock
+from gpuvision.servoing.placement.budget import predict_budget
+from gpuvision.servoing.placement.machine import Machine, ThermalDrift
+from gpuvision.servoing.placement.placing import place_part
 from gpuvision.servoing.placement.plan import placement_imaging, plan_placement
+from gpuvision.servoing.placement.vision import BoardPoseSensor, Frame, SimulatedCamera
+from gpuvision.servoing.plant import SimulatedPlant
+from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
 from gpuvision.workflows.placing import simulate_placements
 
 PRESET = tomllib.loads(
@@ -52,6 +60,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def artwork(folder: Path, machine: Machine) -> Artwork:
     return read_artwork(folder, layers=LAYERS, clearance=edge_clearance(placement_imaging(machine)))
+
+
+def narrow_pads(folder: Path) -> Path:
+    """Write a board with twelve pads of 0.34 mm."""
+    pads = [(8.6 + 0.5 * column, 7.5 + row) for column in range(6) for row in range(2)]
+    head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
+    flashes = "".join(f"X{round(1e6 * x)}Y{round(1e6 * y)}D03*\n" for x, y in pads)
+    (folder / "copper.gbr").write_text(f"{head}%ADD10R,0.34X0.34*%\nD10*\n{flashes}M02*\n")
+    border = "X0Y0D02*\nX20000000Y0D01*\nX20000000Y16000000D01*\nX0Y16000000D01*\nX0Y0D01*\n"
+    (folder / "outline.gbr").write_text(f"{head}%ADD10C,0.1*%\nD10*\n{border}M02*\n")
+    return folder
 
 
 def test_parts_of_the_predicted_covariance_add_up(artwork: Artwork, machine: Machine) -> None:
@@ -88,12 +107,7 @@ def test_parts_land_where_and_when_the_prediction_says(artwork: Artwork, machine
 
 def test_narrow_pads_are_landed_by_registration_and_tracked_by_short_rulers(tmp_path: Path, device: Device) -> None:
     """Edges of 0.34 mm have no room for rulers that cover a landing zone of 0.1 mm, but for the motion of a frame."""
-    pads = [(8.6 + 0.5 * column, 7.5 + row) for column in range(6) for row in range(2)]
-    head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
-    flashes = "".join(f"X{round(1e6 * x)}Y{round(1e6 * y)}D03*\n" for x, y in pads)
-    (tmp_path / "copper.gbr").write_text(f"{head}%ADD10R,0.34X0.34*%\nD10*\n{flashes}M02*\n")
-    border = "X0Y0D02*\nX20000000Y0D01*\nX20000000Y16000000D01*\nX0Y16000000D01*\nX0Y0D01*\n"
-    (tmp_path / "outline.gbr").write_text(f"{head}%ADD10C,0.1*%\nD10*\n{border}M02*\n")
+    narrow_pads(tmp_path)
     machine = read_machine("look_while_place")
     layers = {name: LAYERS[name] for name in ("copper.gbr", "outline.gbr")}
     board = read_artwork(tmp_path, layers=layers, clearance=edge_clearance(placement_imaging(machine)))
@@ -142,6 +156,97 @@ def test_the_command_writes_report_and_pictures(
     with pytest.raises(ValueError, match="expected 3 or more together"):
         application()([str(each) for each in far], standalone_mode=False)
     assert not (tmp_path / "none").exists()
+
+
+class MirrorCamera:
+    """Camera below the board: frames of a camera above the same drawing, with the columns reversed.
+
+    A board that is turned over about its y axis has the coordinates (-x, y), in which the machine works as on a top
+    side.
+    """
+
+    def __init__(
+        self, board: ReflectanceMap, machine: Machine, nozzle: Callable[[np.ndarray], np.ndarray], device: Device
+    ) -> None:
+        turned_over = np.array([-1.0, 1.0, -1.0])
+        camera_in_nozzle = invert_pose(machine.pipette_in_camera.pose)
+
+        def above(time: np.ndarray) -> np.ndarray:
+            return compose_poses(nozzle(time) * turned_over, camera_in_nozzle) * turned_over
+
+        self._camera = SimulatedCamera(board, machine, above, np.zeros(3), device=device)
+        self.dtype = self._camera.dtype
+
+    def __call__(self, time: float) -> list[Frame]:
+        return [frame._replace(image=np.ascontiguousarray(frame.image[:, ::-1])) for frame in self._camera(time)]
+
+
+def bottom(layers: dict[str, str]) -> dict[str, str]:
+    return {name: layer.replace("top", "bottom") for name, layer in layers.items()}
+
+
+@pytest.mark.parametrize("is_narrow", [False, True], ids=["rulers", "registration"])
+def test_a_part_lands_on_the_bottom_side(
+    folder: Path, machine: Machine, tmp_path: Path, device: Device, *, is_narrow: bool
+) -> None:
+    """Calibration and start error have all three components; the frames come from a rendering of the top side."""
+    if is_narrow:
+        machine = read_machine("look_while_place")
+        folder, target = narrow_pads(tmp_path), np.array([10.85e-3, 8.5e-3, 0.2])
+    else:
+        target = np.array([*TARGET[:2], 0.2])
+    covariance = np.diag([1e-6, 2e-6, 1e-4]) @ [[1.0, 0.5, 0.2], [0.5, 1.0, 0.3], [0.2, 0.3, 1.0]]
+    nozzle = Transform.rigid("pipette", "camera", (-1.0e-3, 0.5e-3, 0.1), covariance @ np.diag([1e-6, 2e-6, 1e-4]))
+    machine = dataclasses.replace(machine, pipette_in_camera=nozzle)
+    layers = {name: layer for name, layer in LAYERS.items() if (folder / name).exists()}
+    clearance = edge_clearance(placement_imaging(machine))
+    above = read_artwork(folder, layers=layers, clearance=clearance)
+    artwork = read_artwork(folder, side="bottom", layers=bottom(layers), clearance=clearance)
+    below = machine.for_side("bottom")
+    plan = plan_placement(artwork, target, below)
+    assert (plan.landing is not None) == is_narrow
+    centre, half = plan.camera_pose[:2], 2.5e-3
+    board = ReflectanceMap.of(
+        above, pixel=machine.camera.pixel, region=(centre - half, centre + half), blur_px=machine.camera.blur_px
+    )
+    plant = SimulatedPlant(machine.axes, start=target + np.array([60e-6, -40e-6, 2e-3]))
+    camera = MirrorCamera(board, machine, plant.pose, device)
+    sensor = BoardPoseSensor(camera, below, plan, camera.dtype, device=device)
+    landing = machine.landing if is_narrow else 0.0
+    placement = place_part(below, target, plant, sensor, SimulatedClock(), landing=landing)
+    assert placement.released
+    error = plant.pose(placement.record.time[-1]) - target
+    np.testing.assert_allclose(error[:2], 0.0, atol=2e-6)
+    assert abs(error[2]) < 1e-3
+    # The budget in the files' frame: the errors of the nozzle on the turned-over board, with x and theta reversed.
+    turn, mirror = np.eye(3), np.diag([-1.0, 1.0, -1.0])
+    turn[:2, :2] = rotation(-float(plan.camera_pose[2]))
+    expected = mirror @ turn @ machine.pipette_in_camera.pose_covariance @ turn.T @ mirror
+    found = predict_budget(below, plan).sources["calibration"]
+    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_a_machine_is_turned_to_a_side_and_back(artwork: Artwork, machine: Machine) -> None:
+    machine = dataclasses.replace(machine, drift=ThermalDrift(expansion=(1e-6, 2e-6), temperature_sigma=1.0))
+    below = machine.for_side("bottom")
+    assert below.for_side("bottom") is below
+    assert below.drift.expansion == (-1e-6, 2e-6)
+    again = below.for_side("top")
+    np.testing.assert_allclose(again.pipette_in_camera.matrix, machine.pipette_in_camera.matrix, atol=1e-15)
+    assert (again.drift, again.camera) == (machine.drift, machine.camera)
+    with pytest.raises(ValueError, match=r"the artwork shows the top side; use machine.for_side\('top'\)"):
+        plan_placement(artwork, TARGET, below)
+
+
+def test_the_command_places_on_the_bottom_side(folder: Path, machine_file: Path, tmp_path: Path) -> None:
+    layers = [word for name, layer in bottom(LAYERS).items() for word in ("--layers", f"{name}={layer}")]
+    words = ["place", folder, "--machine", machine_file, "--count", 1, "--side", "bottom", *layers]
+    # The camera is 1 mm beside the nozzle, in x on the other side than above the top side.
+    words += ["--at", "13.8mm,6.4mm,0deg", "--out", tmp_path / "out"]
+    application()([str(each) for each in words], standalone_mode=False)
+    (placement,) = json.loads((tmp_path / "out" / "report.json").read_text())["placements"]
+    assert placement["released"]
+    assert abs(placement["error"]["x_m"]) < 5e-6
 
 
 @pytest.mark.realdata

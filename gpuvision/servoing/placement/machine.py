@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from gpuvision.camera.cmos_sensor import CmosSensor
 from gpuvision.camera.orthographic import BoardView
+from gpuvision.matching.artwork.board_artwork import Side
 from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.delay import DelayBudget, gain_limit, non_oscillating_gain
 from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform
@@ -41,6 +42,8 @@ class PlacementCamera:
         Photoelectrons of a white board during the exposure. Default: 0.8 of the saturation of the sensor.
     blur_px : float
         Standard deviation of the blur of the lens [px], without the extent of a pixel; default 0.5.
+    mirrored : bool
+        The camera sees the bottom side of the board, as `BoardView.mirrored`; see `Machine.for_side`. Default False.
 
     Raises
     ------
@@ -54,6 +57,7 @@ class PlacementCamera:
     exposure: float
     electrons: float | None = None
     blur_px: float = 0.5
+    mirrored: bool = False
 
     def __post_init__(self) -> None:
         finite(self.pixel, "pixel", above=0.0)
@@ -77,7 +81,7 @@ class PlacementCamera:
     def view(self, pose: Float64) -> BoardView:
         """Return the view of the board from a pose (3,) of the camera, x, y [m], theta [rad]."""
         x, y, theta = pose.tolist()
-        return BoardView(scale=self.pixel, shape=self.window, pose=(x, y, theta))
+        return BoardView(scale=self.pixel, shape=self.window, pose=(x, y, theta), mirrored=self.mirrored)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +159,8 @@ class Machine:
         Camera of the head.
     pipette_in_camera : Transform
         Calibrated pose of the nozzle ("pipette") in the camera frame ("camera"): origin at the image centre, x along
-        increasing columns, y along decreasing rows; see `gpuvision.servoing.machine_calibration`.
+        increasing columns, y along decreasing rows; see `gpuvision.servoing.machine_calibration`. Over the bottom side
+        see `for_side`.
     tolerance : Tolerance
         Limits of a placement.
     axes : tuple of Axis
@@ -254,3 +259,37 @@ class Machine:
         if self.gain is not None:
             return self.gain
         return non_oscillating_gain(self.response_frames)
+
+    def for_side(self, side: Side) -> Machine:
+        """Return the machine over a side of the board.
+
+        Parameters
+        ----------
+        side : {"top", "bottom"}
+            Side that the camera sees.
+
+        Returns
+        -------
+        Machine
+            Over the bottom side, x of the camera frame is reversed: x along decreasing columns, y along decreasing
+            rows. The calibration and the drift are converted to this frame.
+
+        Notes
+        -----
+        All poses stay in the frame of the board's files, the view of the top side. The camera sees it mirrored. With
+        M = diag(-1, 1), a point p of the camera frame F_c lies at ``t + R(theta) M p`` on the board, and a rotation by
+        an angle appears as a rotation by its negative. In the frame M F_c this is again a rigid transform, in which the
+        nozzle has the pose (-x, y, -theta).
+        """
+        if self.camera.mirrored == (side == "bottom"):
+            return self
+        x, y, theta = self.pipette_in_camera.pose
+        mirror = np.diag([-1.0, 1.0, -1.0])
+        covariance = mirror @ self.pipette_in_camera.pose_covariance @ mirror
+        expansion_x, expansion_y = self.drift.expansion
+        return replace(
+            self,
+            camera=replace(self.camera, mirrored=not self.camera.mirrored),
+            pipette_in_camera=Transform.rigid(PIPETTE, CAMERA, (-x, y, -theta), covariance),
+            drift=replace(self.drift, expansion=(-expansion_x, expansion_y)),
+        )

@@ -93,11 +93,12 @@ def plan_placement(
     Parameters
     ----------
     artwork : Artwork
-        Top side of the board, read with the clearance of `placement_imaging`.
+        Side of the board in view, read with the clearance of `placement_imaging`.
     target : array_like
-        (3,): pose of the part (and of the nozzle) on the board, x, y [m], theta [rad].
+        (3,): pose of the part (and of the nozzle) in the frame of the board's files, x, y [m], theta [rad]. On the
+        bottom side a positive theta is clockwise as the camera sees it.
     machine : Machine
-        Machine.
+        Machine over this side: `Machine.for_side`.
     budget : float
         Number of rulers, default 60; fiducials in view are used in addition.
     reflectance : BoardReflectance, optional
@@ -110,8 +111,8 @@ def plan_placement(
     Raises
     ------
     ValueError
-        The side is the bottom, or the camera sees too few edges at the target. The message names the nearest targets
-        and the window that work, where there are any.
+        The machine is over the other side, or the camera sees too few edges at the target. The message names the
+        nearest targets and the window that work, where there are any.
 
     Notes
     -----
@@ -119,8 +120,8 @@ def plan_placement(
     is worse than the tolerance (3 standard deviations of a frame), a coarse registration finds the pose of the first
     frame and rulers with a search range of `tracking_imaging` follow it.
     """
-    if artwork.side != "top":
-        raise ValueError("the artwork shows the bottom side; the camera frame is defined for the top side")
+    if machine.camera.mirrored != (artwork.side == "bottom"):
+        raise ValueError(f"the artwork shows the {artwork.side} side; use machine.for_side({artwork.side!r})")
     place = np.array(numbers(target, (3,), "target"))
     calibrated = machine.pipette_in_camera.pose
     camera_pose = compose_poses(place, invert_pose(calibrated))

@@ -88,6 +88,7 @@ class SimulatedCamera:
         render = RenderBoard(
             board=board,
             shape=camera.window,
+            mirrored=camera.mirrored,
             sensor=camera.sensor,
             electrons=camera.white_electrons,
             exposure=camera.exposure,

@@ -7,6 +7,7 @@ closest queried key.
 from __future__ import annotations
 
 import contextlib
+import copy
 import difflib
 import math
 import operator
@@ -69,6 +70,10 @@ class Section:
 
     def __contains__(self, key: str) -> bool:
         return key in self._table
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a copy of the table as in the file."""
+        return copy.deepcopy(dict(self._table))
 
     @property
     def name(self) -> str:

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -255,3 +256,59 @@ def calibrated(
         transport=transport,
         step=transport.length,
     )
+
+
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
+
+
+def scene_axes(truth: LaserSensor) -> Float64:
+    """Return the axes (rows x, y, z) of the scene in the camera's frame: y against the movement of the part, z up."""
+    z, y = up(truth), -truth.step / np.linalg.norm(truth.step)
+    return np.stack([np.cross(y, z), y, z])
+
+
+def sensor_table(truth: LaserSensor, window: tuple[int, int], frame: tuple[int, int]) -> dict[str, Any]:
+    """Return a sensor file with a light for a simulation: a window of the image at (column, row), (columns, rows).
+
+    The camera is in the file ``camera.toml`` beside it, see `camera_table`. The scene's origin is that of the sheet.
+    """
+    to_scene = scene_axes(truth)
+    flat = not any(truth.bend)
+    return {
+        "kind": "camera",
+        "name": "laser sensor",
+        "frame": {"columns": frame[0], "rows": frame[1]},
+        # A threshold that cuts the flanks of the line moves the centroid by more than this camera's noise.
+        "line": {"method": "windowed", "window": 5, "threshold": 1.0, "minimum_peak": 20.0},
+        "camera": {"file": "camera.toml", "window": list(window)},
+        "triangulation": {
+            "sheet_origin": truth.origin.tolist(),
+            "g_axis": truth.g.tolist(),
+            "h_axis": truth.h.tolist(),
+            **({} if flat else {"bend": list(truth.bend)}),
+        },
+        "transport": {
+            "kind": "straight",
+            "step": STEP,
+            "g_axis": (to_scene @ truth.g).tolist(),
+            "h_axis": (to_scene @ truth.h).tolist(),
+            "direction": [0.0, 1.0, 0.0],
+        },
+        "output": {"cell": 0.3e-3, "max_gap": 1.2e-3, "max_step": 3e-3},
+        "light": {
+            "power": 1.0,
+            "thickness": 0.2e-3,
+            "sub_sheets": 9,
+            "aperture": 2e-3,
+            "blur": 0.9,
+            "exposure": 2.5e-6,
+            "full_well": 10_000.0,
+            "read_noise": 20.0,
+        },
+    }
+
+
+def camera_table(truth: LaserSensor) -> dict[str, Any]:
+    """Return a camera file with all 14 coefficients."""
+    terms = {name: float(each) for name, each in zip(COEFFICIENTS, truth.distortion, strict=True)}
+    return {"image": {"size": list(SIZE)}, "camera": {"matrix": truth.matrix.tolist()} | terms}

@@ -34,7 +34,8 @@ def demo(
     from gpuvision.workflows.demo import SENSORS, make_part, make_scan_task
     from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES
     from gpuvision.workflows.scanning import scan
-    from gpuvision.workflows.simulating import simulate, simulate_recording
+    from gpuvision.workflows.simulated_recording import simulate_recording
+    from gpuvision.workflows.simulating import simulate
     from gpuvision.workflows.simulation_result import simulation_files
 
     outputs = Outputs("demo", overwrite=overwrite)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from gpuvision.simulation.scene.scene import Scene
     from gpuvision.simulation.sensors.masks import Mask
     from gpuvision.workflows.light_cache import SimulationTask
+    from gpuvision.workflows.simulation_result import Simulation
 
 
 class Unit(StrEnum):
@@ -113,6 +114,14 @@ Limit = Annotated[
 Profiles = Annotated[
     int | None, typer.Option(min=1, help="Number of profiles around the middle of the part. Default: the whole part.")
 ]
+WithRecording = Annotated[
+    bool,
+    typer.Option(
+        "--recording",
+        help="Also write the simulated recording, recording.npy, and recording.toml, the sensor file with which "
+        "gpuvision scan reads it.",
+    ),
+]
 Scheduler = Annotated[
     str | None,
     typer.Option(
@@ -142,6 +151,7 @@ def simulate(
     profiles: Profiles = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the noise. Default: 1.")] = None,
     noise: Annotated[bool, typer.Option(help="Simulate the noise of the sensor.")] = True,
+    recording: WithRecording = False,
     device: DeviceLabel = None,
     scheduler: Scheduler = None,
     as_json: ReportFile = None,
@@ -150,12 +160,13 @@ def simulate(
     """Predict the range image that a sensor makes of a PART, its errors, and their causes.
 
     The light of each profile is stored in DIR. A stopped run continues there; a run with another --mask, --seed or
-    --noise reuses the stored light.
+    --noise reuses the stored light. With --recording, gpuvision scan reads what the sensor would record.
     """
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
     from gpuvision.workflows.sensor_pair import pair_files
+    from gpuvision.workflows.simulated_recording import RECORDING_FILES
     from gpuvision.workflows.simulating import prepare_simulation
     from gpuvision.workflows.simulation_result import simulation_files
 
@@ -171,6 +182,11 @@ def simulate(
     outputs = Outputs("simulate", inputs=read, overwrite=overwrite)
     has_mask = mask == "best"
     names_out = simulation_files(has_mask=has_mask) + (() if second is None else pair_files(has_mask=has_mask))
+    described_by = [sensor] if second is None else [sensor, second]
+    if recording:
+        names_out += tuple(
+            f"{place}{name}" for place in ("", "second/")[: len(described_by)] for name in RECORDING_FILES
+        )
     outputs.claim_folder(out, names_out)
     outputs.claim(as_json)
     before = _mask(mask)
@@ -196,8 +212,10 @@ def simulate(
         "device": None if device is None else Device.named(device),
         "scheduler": scheduler,
     }
-    summary, report = _run(task, other, rule or Rule.stronger, out, made, f"simulating {part.name}", read, overwrite)
-    write_report(as_json, report, outputs)
+    found, summary = _run(task, other, rule or Rule.stronger, out, made, f"simulating {part.name}", read, overwrite)
+    if recording:
+        summary += f"\n{_write_recordings(found, described_by, out, made, read, overwrite)}"
+    write_report(as_json, found[0].report(), outputs)
     echo(
         f"{summary}\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}",
         err=prints_report(as_json),
@@ -256,20 +274,42 @@ def _run(
     description: str,
     inputs: Sequence[str | Path],
     overwrite: bool,
-) -> tuple[str, dict[str, Any]]:
-    """Simulate one sensor or two, write the results, and return the summary and the first sensor's report."""
+) -> tuple[list[Simulation], str]:
+    """Simulate one sensor or two, write the results, and return the simulations and the summary."""
     from gpuvision.simulation.errors.sensor_fusion import SensorFusion
     from gpuvision.workflows.sensor_pair import SensorPair
     from gpuvision.workflows.simulating import simulate as run
 
     with progress_bar(description) as progress:
-        done = run(task, out, progress=progress, **made)
-    summary, scale = done.summary(), None
+        done = [run(task, out, progress=progress, **made)]
+    summary, scale = done[0].summary(), None
     if other is not None:
         with progress_bar(f"{description}, second sensor") as progress:
-            pair = SensorPair.fuse(done, run(other, out, progress=progress, **made), SensorFusion(rule=rule.value))
+            done.append(run(other, out, progress=progress, **made))
+        pair = SensorPair.fuse(*done, SensorFusion(rule=rule.value))
         pair.write(out, inputs=inputs, overwrite=overwrite)
         summary += f"\n{pair.summary()}"
         scale = pair.picture_scale
-    done.write(out, inputs=inputs, overwrite=overwrite, scale=scale)
-    return summary, done.report()
+    done[0].write(out, inputs=inputs, overwrite=overwrite, scale=scale)
+    return done, summary
+
+
+def _write_recordings(
+    found: Sequence[Simulation],
+    sensor_files: Sequence[str],
+    out: Path,
+    made: dict[str, Any],
+    inputs: Sequence[str | Path],
+    overwrite: bool,
+) -> str:
+    """Write the recording of each sensor, and return lines with the commands that scan them."""
+    from gpuvision.workflows.simulated_recording import RECORDING_FILES, write_recording
+
+    lines = []
+    for each, file, folder in zip(found, sensor_files, (out, out / "second"), strict=False):
+        mask = made["mask"] if each.mask is None else each.mask.mask
+        given = {"seed": made["seed"], "device": made["device"], "mask": mask}
+        write_recording(each.task, folder, file, light=out, inputs=inputs, overwrite=overwrite, **given)
+        recording, sensor = (folder / name for name in RECORDING_FILES)
+        lines.append(f"next: gpuvision scan {recording} --sensor {sensor} --out {folder / 'scan'}")
+    return "\n".join(lines)

@@ -158,6 +158,28 @@ def minimum_sample_power(sensor: Sensor) -> float:
     return grey * light.full_well / _MAX_GREY_LEVEL * ELECTRON / (light.responsivity * light.exposure)
 
 
+def line_noise(sensor: Sensor) -> dict[str, float]:
+    """Return the noise of a simulated camera in the units of the table ``[line]``.
+
+    Parameters
+    ----------
+    sensor : Sensor
+
+    Returns
+    -------
+    dict
+        ``read_noise`` [grey levels] and ``gain`` [grey levels per electron]. The readout adds the quantisation.
+
+    Raises
+    ------
+    ValueError
+        As `require_light`.
+    """
+    light = require_light(sensor)
+    gain = _MAX_GREY_LEVEL / light.full_well
+    return {"read_noise": gain * light.read_noise, "gain": gain}
+
+
 def make_simulator(sensor: Sensor, view: SensorView, mask: Mask | None = None) -> PsdSimulator | CameraSimulator:
     """Make the simulator that computes readings of a sensor from the light on it.
 

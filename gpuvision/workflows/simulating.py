@@ -199,39 +199,6 @@ def simulate(
     )
 
 
-def simulate_recording(
-    task: SimulationTask,
-    folder: str | Path,
-    *,
-    mask: Mask | None = None,
-    seed: int | None = 1,
-    device: Device | None = None,
-) -> Array:
-    """Return the sensor's simulated recording, in the form that `gpuvision.workflows.scanning.scan` takes.
-
-    Light that ``folder`` already holds is not computed again.
-
-    Parameters
-    ----------
-    task, folder, mask, seed, device
-        As for `simulate`.
-
-    Returns
-    -------
-    numpy.ndarray
-        Camera: grey levels (profiles, rows, columns). PSD: currents or codes (profiles, strips, 2).
-    """
-    store = LightStore(Path(folder), task)
-    compute_missing_blocks(store, device=device)
-    simulator = make_simulator(task.sensor, make_sensor_view(task.sensor), mask)
-    record = simulator.currents if isinstance(simulator, PsdSimulator) else simulator.frames
-    parts, first = [], 0
-    for block in store:
-        parts.append(record(block.exposures, seed=seed, first_profile=first))
-        first += len(parts[-1])
-    return np.concatenate(parts)
-
-
 def load_part(
     path: str | Path, metres: float, materials: Sequence[Material] | None, albedo: float
 ) -> tuple[Scene, tuple[Material, ...]]:

@@ -24,6 +24,7 @@ from gpuvision.simulation.errors.error_attribution import ErrorAttribution
 from gpuvision.simulation.sensors.masks import MaskOptimisation
 from gpuvision.simulation.sensors.readings import PATHS, Reading
 from gpuvision.workflows.light_cache import SimulationTask
+from gpuvision.workflows.simulated_recording import RECORDING_FILES
 
 Array = npt.NDArray[Any]
 
@@ -159,7 +160,7 @@ class Simulation:
         ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` hold the height map as it will be
         measured, ``range_image.ply`` the organised points, ``errors.png`` and ``causes.png`` the errors and their
         causes, ``simulation.npz`` the arrays, ``report.json`` the report. ``mask.txt`` holds a mask that was optimised;
-        the unchanged mask of an earlier simulation is removed.
+        the unchanged mask and recording of an earlier simulation are removed.
 
         Parameters
         ----------
@@ -183,8 +184,8 @@ class Simulation:
         title = self.task.sensor.name or "Simulation"
         scale = PictureScale.of([attribution], self.limit) if scale is None else scale
         outputs = Outputs("simulate", inputs=[*inputs, *self.task.sensor.files], overwrite=overwrite)
-        # The mask of an earlier simulation would seem to belong to these readings.
-        with outputs.folder(folder, optional=[_MASK_FILE]) as inside:
+        # The mask and the recording of an earlier simulation would seem to belong to these readings.
+        with outputs.folder(folder, optional=[_MASK_FILE, *RECORDING_FILES]) as inside:
             write_tiff(inside / "range_image.tiff", self.heights.z, self.grid)
             write_png16(inside / "range_image.png", self.heights.z, self.grid)
             write_ply(

@@ -14,7 +14,8 @@ from gpuvision.cli import main as cli
 from gpuvision.host import Device
 from gpuvision.workflows.demo import SENSORS, make_scan_task
 from gpuvision.workflows.scanning import scan
-from gpuvision.workflows.simulating import simulate, simulate_recording
+from gpuvision.workflows.simulated_recording import simulate_recording
+from gpuvision.workflows.simulating import simulate
 
 PROFILES = 40  # the middle of the part, 10 mm: a tenth of the box, a half of the cylinder, most of the steps
 

@@ -306,7 +306,8 @@ def _write_recordings(
     from gpuvision.workflows.simulated_recording import RECORDING_FILES, write_recording
 
     lines = []
-    for each, file, folder in zip(found, sensor_files, (out, out / "second"), strict=False):
+    folders = (out, out / "second")[: len(found)]
+    for each, file, folder in zip(found, sensor_files, folders, strict=True):
         mask = made["mask"] if each.mask is None else each.mask.mask
         given = {"seed": made["seed"], "device": made["device"], "mask": mask}
         write_recording(each.task, folder, file, light=out, inputs=inputs, overwrite=overwrite, **given)

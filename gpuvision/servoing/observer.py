@@ -277,15 +277,16 @@ class PoseObserver:
                 break
             if self._measured[k]:
                 return Verdict.DUPLICATE
-        state, covariance = self._predict(place - 1, time)
-        distance, _, _ = _innovation(state, covariance, measurement.pose, measurement.covariance)
-        if not distance <= self.gate:
+        predicted = self._predict(place - 1, time)
+        innovation = _innovation(*predicted, measurement.pose, measurement.covariance)
+        if not innovation.distance <= self.gate:
             return Verdict.GATED
         node = self._insert(place, time)
         self._commands[node] = self._commands[node - 1]
         self._measured[node] = True
         self._poses[node], self._noises[node] = measurement.pose, measurement.covariance
-        for k in range(node, self._end):
+        self._states[node], self._covariances[node] = _correct(*predicted, innovation)
+        for k in range(node + 1, self._end):
             self._propagate(k)
         return Verdict.ACCEPTED
 
@@ -336,34 +337,48 @@ class PoseObserver:
         """Compute an entry from the one before it."""
         state, covariance = self._predict(node - 1, self._times[node])
         if self._measured[node]:
-            _, residual, inverse = _innovation(state, covariance, self._poses[node], self._noises[node])
-            gain = covariance[:, :3] @ inverse
-            state = state + gain @ residual
-            covariance = covariance - gain @ covariance[:3]
-            covariance = 0.5 * (covariance + covariance.T)
+            innovation = _innovation(state, covariance, self._poses[node], self._noises[node])
+            state, covariance = _correct(state, covariance, innovation)
         self._states[node], self._covariances[node] = state, covariance
 
 
 def _is_valid(measurement: PoseMeasurement) -> bool:
-    values = (measurement.exposed, measurement.arrived, *measurement.pose.tolist(), *measurement.covariance.flat)
+    """Return whether all numbers are finite and the covariance is positive definite, judged by its lower triangle."""
+    covariance = measurement.covariance.ravel().tolist()
+    values = (measurement.exposed, measurement.arrived, *measurement.pose.tolist(), *covariance)
     if measurement.status != 0 or not all(map(math.isfinite, values)) or measurement.exposed > measurement.arrived:
         return False
-    variances = np.diagonal(measurement.covariance)
-    if not np.all(variances > 0.0):
+    xx, _, _, xy, yy, _, xt, yt, tt = covariance
+    if min(xx, yy, tt) <= 0.0:
         return False
-    sigma = np.sqrt(variances)
-    try:
-        root = np.linalg.cholesky(measurement.covariance / np.outer(sigma, sigma))
-    except np.linalg.LinAlgError:
+    # Rows 2 and 3 of the Cholesky factor of the correlation matrix.
+    x, y, t = math.sqrt(xx), math.sqrt(yy), math.sqrt(tt)
+    second = xy / x / y
+    square = 1.0 - second * second
+    if square <= _SINGULAR**2:
         return False
-    return bool(np.diagonal(root).min() > _SINGULAR)
+    third = xt / x / t
+    last = (yt / y / t - third * second) / math.sqrt(square)
+    return 1.0 - third * third - last * last > _SINGULAR**2
 
 
-def _innovation(state: Float64, covariance: Float64, pose: Float64, noise: Float64) -> tuple[float, Float64, Float64]:
-    """Return the squared Mahalanobis distance of a pose, its residual, and the inverse of the residual's covariance."""
+class _Innovation(NamedTuple):
+    distance: float  # squared Mahalanobis distance of the measured pose
+    residual: Float64
+    inverse: Float64  # of the covariance of the residual
+
+
+def _innovation(state: Float64, covariance: Float64, pose: Float64, noise: Float64) -> _Innovation:
     residual = pose_difference(pose, state[:3])
     inverse = np.asarray(np.linalg.inv(covariance[:3, :3] + noise), np.float64)
-    return float(residual @ inverse @ residual), residual, inverse
+    return _Innovation(float(residual @ inverse @ residual), residual, inverse)
+
+
+def _correct(state: Float64, covariance: Float64, innovation: _Innovation) -> tuple[Float64, Float64]:
+    """Return the state and the covariance after a measurement."""
+    gain = covariance[:, :3] @ innovation.inverse
+    corrected = covariance - gain @ covariance[:3]
+    return state + gain @ innovation.residual, 0.5 * (corrected + corrected.T)
 
 
 class LatestPose:

@@ -393,6 +393,9 @@ from .servoing.loop import (
 from .servoing.loop import (
     WallClock as WallClock,
 )
+from .servoing.low_latency import (
+    low_latency as low_latency,
+)
 from .servoing.observer import (
     MotionModel as MotionModel,
 )

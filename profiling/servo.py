@@ -1,12 +1,18 @@
 """Servo loop in wall-clock time: vision, observer and control of each frame, with the camera in another process.
 
 A process renders frames of a board at a fixed rate, 128 x 128 to 256 x 256 pixels with the noise of a sensor, and moves
-the camera as commanded. This process waits for a frame, measures 60 calipers (rulers; 48 in the smallest frame) at the
-predicted pose (`FeatureSet.bind`), updates the observer, computes the command, and writes it. The time of a frame runs
-from its publication until its command. A frame is missed if a newer frame was published before it was taken.
+the camera as commanded (`gpuvision.profiling.servo_camera`). This process sleeps until a frame is published, measures
+60 calipers (rulers; 48 in the smallest frame) at the predicted pose (`FeatureSet.bind`), updates the observer, computes
+the command, and writes it. The time of a frame runs from its publication until its command.
+
+A frame is missed if a newer frame was published before it was taken. The frames of the camera are at least three
+quarters of a period apart. A missed frame counts as interrupted if the frame before it needed less processor time than
+the period: the loop was ready, but another program or the hypervisor had the core.
 
 ``python -m gpuvision.profiling.servo`` runs the loop alone: ``--seconds 60 --rate 1000 --device pocl``; with
-``--highest`` it searches the highest rate that the loop sustains, with ``--quick`` by runs of half a second.
+``--empty`` without vision, observer and control, which shows the interruptions by the machine; with ``--highest`` it
+searches the highest rate that the loop sustains, with ``--quick`` by runs of half a second. ``--priority`` sets the
+real-time priority of both processes (`low_latency`), by default 10 where the user may; ``--cores`` their cores.
 ``gpuvision profile servo`` does both for a short time, and compares the vision with Numba and NumPy
 (`gpuvision.profiling.feature_pose`).
 """
@@ -15,38 +21,30 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import multiprocessing
-import os
-import tempfile
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from multiprocessing.shared_memory import SharedMemory
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.formats.cmos_sensor_file import read_cmos_sensor
-from gpuvision.host import Device, host_view, to_numpy
-from gpuvision.matching.artwork.artwork import Artwork, read_artwork
+from gpuvision.host import Device, to_numpy
+from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.features.feature_set import FeatureSet, choose_features
 from gpuvision.matching.features.imaging import Imaging
 from gpuvision.profiling import feature_pose
 from gpuvision.profiling.harness import Case
+from gpuvision.profiling.servo_camera import PIXEL, START, TARGET, Camera, board, camera_process
+from gpuvision.servoing.low_latency import low_latency, real_time_is_allowed
 from gpuvision.servoing.observer import MotionModel, PoseMeasurement, PoseObserver
-from gpuvision.simulation.board_image.board_image import RenderBoard
-from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
 
 SIZES = feature_pose.SIZES
-PIXEL, RULERS = 10e-6, 60
-TARGET = np.array([3e-3, 3e-3, 0.0])  # pose of the camera that the loop holds [m, m, rad]
-_START = np.array([15e-6, -12e-6, 1.5e-3])  # distance of the first pose from it
+RULERS = 60
 _GAIN = 0.2  # of the proportional control, per frame
-_PAD, _PITCH = 0.3e-3, 0.55e-3  # m
+_STILL = np.zeros(3)
 _BORDER = 14  # distance of the rulers' centres from the border of the frame [px]: half their length, and motion
-_SLOTS = 4  # frames in shared memory
 _CASE_SECONDS, _CASE_RATE = 3.0, 1000.0
 _TRIAL_SECONDS, _QUICK_SECONDS = 1.0, 0.5  # of a run in the search for the highest rate: in a case, and by --quick
 _SETTLING_FRAMES = 20  # frames after a change of the rate that do not count
@@ -54,7 +52,7 @@ _LEAST_RATE, _MOST_RATE = 31.25, 32000.0  # limits of the search [1/s]
 _BISECTIONS = 5  # the highest rate is found to a factor of 2^(1/32), 2 %
 _ATTEMPTS = 2  # runs at a rate before it counts as not sustained: another process may have interrupted the first one
 _DELIVERED = 0.98  # part of the wanted rate that the camera must publish
-_READY_S = 120.0  # longest start of the other process: it compiles the renderer
+_PRIORITY = 10  # real-time priority of both processes where the user may set one
 
 
 Limit = Literal["loop", "camera", "search"]
@@ -84,8 +82,14 @@ class LoopTimes:
     ----------
     latencies : (frames,)
         Time from the publication of each frame until its command [us].
+    computing : (frames,)
+        Processor time of each frame [us].
     missed : int
         Frames that were replaced by newer ones before they were taken.
+    interrupted : int
+        Missed frames during which the loop was ready, but not on a core.
+    camera_stalls : int
+        Frames that the camera published a quarter of a period late or more. Not counted as missed.
     refused : int
         Frames whose pose was refused.
     error : (3,)
@@ -95,7 +99,10 @@ class LoopTimes:
     """
 
     latencies: NDArray[np.float64]
+    computing: NDArray[np.float64]
     missed: int
+    interrupted: int
+    camera_stalls: int
     refused: int
     error: NDArray[np.float64]
     rate: float
@@ -114,23 +121,19 @@ class LoopTimes:
     def summary(self) -> dict[str, float]:
         """Percentiles [us] and counts."""
         p50, p99, most = np.percentile(self.latencies, (50, 99, 100)) if len(self.latencies) else (np.nan,) * 3
-        counts = {"frames": len(self.latencies), "missed": self.missed, "refused": self.refused}
-        return {"p50_us": float(p50), "p99_us": float(p99), "max_us": float(most), **counts}
-
-
-def board() -> Artwork:
-    """Return a board of 6 x 6 mm with square pads."""
-    places = np.arange(0.5e-3, 5.6e-3, _PITCH)
-    flashes = [f"X{round(1e9 * x)}Y{round(1e9 * y)}D03*" for x in places for y in places]
-    head, end = ["%FSLAX46Y46*%", "%MOMM*%", "%LPD*%", "G01*"], ["M02*", ""]
-    corners = [(0, 0), (6, 0), (6, 6), (0, 6), (0, 0)]
-    border = [f"X{x * 10**6}Y{y * 10**6}D0{1 if number else 2}*" for number, (x, y) in enumerate(corners)]
-    side = 1e3 * _PAD
-    with tempfile.TemporaryDirectory() as folder:
-        copper = [*head, f"%ADD10R,{side:g}X{side:g}*%", "D10*", *flashes, *end]
-        Path(folder, "copper.gbr").write_text("\n".join(copper))
-        Path(folder, "outline.gbr").write_text("\n".join([*head, "%ADD10C,0.1*%", "D10*", *border, *end]))
-        return read_artwork(folder, layers={"copper.gbr": "top copper", "outline.gbr": "mechanical outline"})
+        busy = np.percentile(self.computing, (50, 99, 100)) if len(self.computing) else (np.nan,) * 3
+        names = ("computing_p50_us", "computing_p99_us", "computing_max_us")
+        return {
+            "p50_us": float(p50),
+            "p99_us": float(p99),
+            "max_us": float(most),
+            **{name: float(value) for name, value in zip(names, busy, strict=True)},
+            "frames": len(self.latencies),
+            "missed": self.missed,
+            "interrupted": self.interrupted,
+            "camera_stalls": self.camera_stalls,
+            "refused": self.refused,
+        }
 
 
 def features_of(artwork: Artwork, size: int) -> FeatureSet:
@@ -140,122 +143,86 @@ def features_of(artwork: Artwork, size: int) -> FeatureSet:
     return choose_features(artwork, (TARGET[:2] - half, TARGET[:2] + half), imaging, budget=RULERS)
 
 
-class _Shared:
-    """Memory of both processes: header, commanded velocity, true pose, times, and the ring of frames."""
+@dataclass(frozen=True)
+class _Frames:
+    """Times of the frames that a loop took [ns], in the order of the frames."""
 
-    def __init__(self, size: int, name: str | None = None) -> None:
-        numbers = 8 * (4 + 3 + 3 + _SLOTS + 1)
-        self.memory = SharedMemory(name=name, create=name is None, size=numbers + _SLOTS * size * size)
-        buffer = self.memory.buf
-        self.header: Any = np.ndarray(4, np.int64, buffer)  # number of the newest frame, ready, run, stop
-        self.velocity: Any = np.ndarray(3, np.float64, buffer, 32)
-        self.pose: Any = np.ndarray(3, np.float64, buffer, 56)
-        self.times: Any = np.ndarray(_SLOTS, np.int64, buffer, 80)
-        self.step: Any = np.ndarray(1, np.float64, buffer, numbers - 8)  # time between two frames [s]
-        self.frames: Any = np.ndarray((_SLOTS, size, size), np.uint8, buffer, numbers)
+    number: NDArray[np.int64]
+    published: NDArray[np.int64]
+    taken: NDArray[np.int64]
+    commanded: NDArray[np.int64]
+    computing: NDArray[np.int64]  # processor time from taken to commanded
 
-    def close(self) -> None:
-        """Release the memory; views of it must be gone."""
-        self.header = self.velocity = self.pose = self.times = self.step = self.frames = None
-        self.memory.close()
+    @staticmethod
+    def empty(count: int) -> _Frames:
+        # Ones: the first write to a page would cost a page fault inside the loop.
+        return _Frames(*(np.ones(count, np.int64) for _ in range(5)))
 
-
-def _render(name: str, size: int, label: str) -> None:
-    """Render frames at the wanted rate and move the camera as commanded, until the stop; runs in another process."""
-    shared, device = _Shared(size, name), Device.named(label)
-    box = (tuple(TARGET[:2] - 2e-3), tuple(TARGET[:2] + 2e-3))
-    values = ReflectanceMap.of(board(), pixel=PIXEL, region=box)
-    operation = RenderBoard(board=values, shape=(size, size), sensor=read_cmos_sensor("pb1024"))
-    queue = device.new_queue(inline=device.has_inline_queues)
-    bound = operation.bind(device, (1, 1, 3), np.float64, queue=queue)
-    pose = TARGET + _START
-    outputs: Any = bound.outputs
-    poses, numbers, image = (host_view(each) for each in (*bound.inputs, outputs.image))
-    shared.header[0], shared.header[1] = -1, 1
-    while not shared.header[2]:
-        time.sleep(1e-3)
-    due, number = time.perf_counter_ns(), 0
-    while not shared.header[3]:
-        poses[0, 0], numbers[0], step = pose, number, float(shared.step[0])
-        bound.run()
-        while time.perf_counter_ns() < due:
-            os.sched_yield()
-        slot = number % _SLOTS
-        shared.frames[slot] = image[0]
-        shared.pose[:] = pose
-        shared.times[slot] = time.perf_counter_ns()
-        shared.header[0] = number
-        pose = pose + step * shared.velocity
-        shared.velocity[:] = 0.0  # a command holds for one frame: without a new one the camera stands still
-        number, due = number + 1, max(due + round(1e9 * step), time.perf_counter_ns() - round(1e9 * step))
-    shared.close()
-
-
-@contextlib.contextmanager
-def _camera(size: int, device: Device) -> Iterator[_Shared]:
-    """Start the process that renders, and end it."""
-    shared = _Shared(size)
-    arguments = (shared.memory.name, size, device.label)
-    process = multiprocessing.get_context("spawn").Process(target=_render, args=arguments, daemon=True)
-    process.start()
-    try:
-        end = time.monotonic() + _READY_S
-        while not shared.header[1]:
-            if not process.is_alive() or time.monotonic() > end:
-                raise RuntimeError("the process of the camera did not start")
-            time.sleep(0.01)
-        yield shared
-    finally:
-        shared.header[3] = 1
-        process.join(10.0)
-        memory = shared.memory
-        shared.close()
-        memory.unlink()
+    def times(self, rate: float, late: int, refused: int, error: NDArray[np.float64]) -> LoopTimes:
+        """Return the times of the loop at a wanted rate [1/s]."""
+        skipped = np.diff(self.number) - 1
+        was_interrupted = self.computing[:-1] < 1e9 / rate
+        duration = max(1e-9 * float(self.published[-1] - self.published[0]), 1e-9)
+        return LoopTimes(
+            latencies=1e-3 * (self.commanded - self.published),
+            computing=1e-3 * self.computing,
+            missed=int(skipped.sum()),
+            interrupted=int(skipped[was_interrupted].sum()),
+            camera_stalls=late,
+            refused=refused,
+            error=error,
+            rate=float(self.number[-1] - self.number[0]) / duration,
+        )
 
 
 class _Loop:
     """Loop over the frames of a camera, at one rate after another."""
 
-    def __init__(self, device: Device, size: int, camera: _Shared) -> None:
-        self.camera, self.taken, self.pose = camera, -1, TARGET + _START
+    def __init__(self, device: Device, size: int, camera: Camera, *, is_empty: bool = False) -> None:
+        self.camera, self.pose, self.is_empty = camera, TARGET + START, is_empty
         self.bound = features_of(board(), size).bind(
             device, (size, size), np.uint8, copper="bright", threshold=20.0, noise=2.0, etch_bias_sigma=0.0
         )
 
     def run(self, rate: float, seconds: float, *, settling: int = 0) -> LoopTimes:
         """Run at a rate [1/s] for some seconds and return the times, without those of the first settling frames."""
-        camera, still = self.camera, np.zeros(3)
+        camera = self.camera
         # A random walk with the largest step of a frame, 3 um and 0.3 mrad: missed frames do not spoil the prediction.
         model = MotionModel(lag=(0.0, 0.0, 0.0), position_noise=(9e-12 * rate, 9e-12 * rate, 9e-8 * rate))
-        observer = PoseObserver(model)
-        now = 1e-9 * time.perf_counter_ns()  # time of the last command [s]
-        observer.reset(now, self.pose, np.diag((1e-10, 1e-10, 1e-6)))
-        camera.step[0], camera.header[2] = 1.0 / rate, 1
-        latencies, published = np.empty(round(rate * seconds) + settling), np.empty(2, np.int64)
-        refused = missed = begun = 0
-        for number in range(len(latencies)):
-            while camera.header[0] == self.taken:
-                os.sched_yield()
-            newest = int(camera.header[0])
-            skipped, self.taken, slot = newest - self.taken - 1, newest, newest % _SLOTS
-            if number == settling:
-                published[0], begun = camera.times[slot], newest
-            missed += skipped if number >= settling else 0
-            published[1] = camera.times[slot]
-            exposed = 1e-9 * int(published[1])
-            found = self.bound(camera.frames[slot], observer.estimate(max(exposed, now)).pose)
-            now = 1e-9 * time.perf_counter_ns()
-            status = int(to_numpy(found.status))
-            refused += status != 0
-            measured = (np.array(found.pose, np.float64), np.array(found.covariance, np.float64))
-            observer.add(PoseMeasurement(exposed, now, *measured, status))
-            self.pose = observer.estimate(now).pose
-            velocity = _GAIN * rate * (TARGET - self.pose)
-            observer.command(now, still)
-            camera.velocity[:] = velocity if status == 0 else still
-            latencies[number] = 1e-3 * (time.perf_counter_ns() - int(published[1]))
-        delivered = (newest - begun) / max(1e-9 * int(published[1] - published[0]), 1e-9)
-        return LoopTimes(latencies[settling:], missed, refused, camera.pose - TARGET, delivered)
+        self.observer, self.now = PoseObserver(model), 1e-9 * time.perf_counter_ns()
+        self.observer.reset(self.now, self.pose, np.diag((1e-10, 1e-10, 1e-6)))
+        count = round(rate * seconds)
+        frames, refused, late = _Frames.empty(count), 0, 0
+        gain, late_after = _GAIN * rate, 1.25e9 / rate
+        taken = camera.start(rate)
+        for number in range(-settling, count):
+            newest = camera.wait_after(taken)
+            begun, busy = time.perf_counter_ns(), time.thread_time_ns()
+            times = camera.published_ns(taken, newest)
+            taken = newest
+            is_refused = not self.is_empty and self._command(newest, times[-1], gain)
+            if number < 0:
+                continue
+            frames.computing[number] = time.thread_time_ns() - busy
+            frames.commanded[number] = time.perf_counter_ns()
+            frames.number[number], frames.published[number], frames.taken[number] = newest, times[-1], begun
+            refused += is_refused
+            if number:
+                late += sum(after - before > late_after for before, after in itertools.pairwise(times))
+        return frames.times(rate, late, refused, camera.pose - TARGET)
+
+    def _command(self, number: int, published: int, gain: float) -> bool:
+        """Measure a frame and command the velocity; return whether the pose was refused."""
+        exposed = 1e-9 * published
+        found = self.bound(self.camera.frame(number), self.observer.estimate(max(exposed, self.now)).pose)
+        self.now = 1e-9 * time.perf_counter_ns()
+        status = int(to_numpy(found.status))
+        measured = (np.array(found.pose, np.float64), np.array(found.covariance, np.float64))
+        self.observer.add(PoseMeasurement(exposed, self.now, *measured, status))
+        self.pose = self.observer.estimate(self.now).pose
+        self.observer.command(self.now, _STILL)
+        self.camera.velocity[:] = gain * (TARGET - self.pose) if status == 0 else _STILL
+        return status != 0
 
     def highest_rate(self, start: float, seconds: float) -> HighestRate:
         """Search the highest sustained rate by runs of some seconds, from a rate on [1/s]."""
@@ -306,19 +273,54 @@ def search_highest(failure: Callable[[float], Limit | None], start: float) -> Hi
     return HighestRate(low, limit)
 
 
+class Placement(NamedTuple):
+    """Cores and real-time priority of both processes.
+
+    Attributes
+    ----------
+    loop, camera : int or None
+        Core of the process; None: any.
+    priority : int
+        Real-time priority; 0: none.
+    """
+
+    loop: int | None = None
+    camera: int | None = None
+    priority: int = 0
+
+    @staticmethod
+    def default() -> Placement:
+        """Return any core, with a real-time priority if the user may set one."""
+        return Placement(priority=_PRIORITY if real_time_is_allowed() else 0)
+
+
 @contextlib.contextmanager
-def _loop(device: Device, size: int) -> Iterator[_Loop]:
-    with _camera(size, device) as camera:
-        yield _Loop(device, size, camera)
+def _loop(device: Device, size: int, placement: Placement | None = None, *, is_empty: bool = False) -> Iterator[_Loop]:
+    """Start the camera and a loop; the body runs with low latency."""
+    where = Placement.default() if placement is None else placement
+    with camera_process(size, device, core=where.camera, priority=where.priority) as camera:
+        loop = _Loop(device, size, camera, is_empty=is_empty)
+        with low_latency(core=where.loop, priority=where.priority):
+            yield loop
 
 
-def run_loop(device: Device, size: int, *, rate: float, seconds: float) -> LoopTimes:
+def run_loop(
+    device: Device,
+    size: int,
+    *,
+    rate: float,
+    seconds: float,
+    placement: Placement | None = None,
+    is_empty: bool = False,
+) -> LoopTimes:
     """Run the loop at a frame rate [1/s] for some seconds and return its times."""
-    with _loop(device, size) as loop:
+    with _loop(device, size, placement, is_empty=is_empty) as loop:
         return loop.run(rate, seconds)
 
 
-def highest_rate(device: Device, size: int, *, seconds: float, start: float = _CASE_RATE) -> HighestRate:
+def highest_rate(
+    device: Device, size: int, *, seconds: float, start: float = _CASE_RATE, placement: Placement | None = None
+) -> HighestRate:
     """Search the highest rate at which the loop misses no frame and its 99th percentile is within the period.
 
     Parameters
@@ -331,8 +333,10 @@ def highest_rate(device: Device, size: int, *, seconds: float, start: float = _C
         Time of each of about 8 runs [s].
     start : float
         First rate [1/s].
+    placement : Placement, optional
+        Cores and priority. Default: `Placement.default`.
     """
-    with _loop(device, size) as loop:
+    with _loop(device, size, placement) as loop:
         return loop.highest_rate(start, seconds)
 
 
@@ -356,17 +360,26 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES), help="rows and columns [px]")
     parser.add_argument("--highest", action="store_true", help="search the highest rate that the loop sustains")
     parser.add_argument("--quick", action="store_true", help="runs of half a second")
+    parser.add_argument("--empty", action="store_true", help="take the frames and compute nothing")
+    parser.add_argument(
+        "--priority", type=int, default=None, help="real-time priority; 0: none; default: 10 if allowed"
+    )
+    parser.add_argument(
+        "--cores", type=int, nargs=2, default=(None, None), help="cores of loop and camera; default: any"
+    )
     options = parser.parse_args()
     device = Device.best() if options.device is None else Device.named(options.device)
     seconds = options.seconds or (_QUICK_SECONDS if options.quick else 5.0 if options.highest else 60.0)
+    priority = Placement.default().priority if options.priority is None else options.priority
+    placement = Placement(*options.cores, priority)
     for size in options.sizes:
         if options.highest:
-            highest = highest_rate(device, size, seconds=seconds, start=options.rate)
+            highest = highest_rate(device, size, seconds=seconds, start=options.rate, placement=placement)
             print(size, f"highest rate {highest.rate:.0f} Hz, limited by the {highest.limit}")
             continue
-        loop = run_loop(device, size, rate=options.rate, seconds=seconds)
-        error = ", ".join(f"{each:+.2e}" for each in loop.error)
-        print(size, {name: round(value, 1) for name, value in loop.summary.items()}, f"error {error}")
+        times = run_loop(device, size, rate=options.rate, seconds=seconds, placement=placement, is_empty=options.empty)
+        error = ", ".join(f"{each:+.2e}" for each in times.error)
+        print(size, {name: round(value, 1) for name, value in times.summary.items()}, f"error {error}")
 
 
 if __name__ == "__main__":

@@ -145,6 +145,7 @@ MODULES = (
     "gpuvision.servoing.delay_response",
     "gpuvision.servoing.guard",
     "gpuvision.servoing.loop",
+    "gpuvision.servoing.low_latency",
     "gpuvision.servoing.margins",
     "gpuvision.servoing.observer",
     "gpuvision.servoing.plant",

@@ -12,9 +12,39 @@ pytest.importorskip("numba", reason="the extra 'profile' is not installed")
 from gpuvision.profiling import feature_pose, servo
 
 
+def loop_times(latencies: np.ndarray, missed: int, refused: int, rate: float) -> servo.LoopTimes:
+    return servo.LoopTimes(latencies, 0.5 * latencies, missed, 1, 4, refused, np.zeros(3), rate)
+
+
 def test_summary_has_percentiles_and_counts() -> None:
-    times = servo.LoopTimes(np.arange(101.0), 3, 2, np.zeros(3), 1000.0)
-    assert times.summary == {"p50_us": 50.0, "p99_us": 99.0, "max_us": 100.0, "frames": 101, "missed": 3, "refused": 2}
+    times = loop_times(np.arange(101.0), 3, 2, 1000.0)
+    assert times.summary == {
+        "p50_us": 50.0,
+        "p99_us": 99.0,
+        "max_us": 100.0,
+        "computing_p50_us": 25.0,
+        "computing_p99_us": 49.5,
+        "computing_max_us": 50.0,
+        "frames": 101,
+        "missed": 3,
+        "interrupted": 1,
+        "camera_stalls": 4,
+        "refused": 2,
+    }
+
+
+def test_missed_frames_are_counted_and_attributed() -> None:
+    """A period of 1 ms: 2 frames missed by an interruption, 3 while the loop computed for 4 ms."""
+    frames = servo._Frames.empty(5)
+    frames.number[:] = 10, 11, 14, 15, 19
+    frames.published[:] = 1_000_000 * frames.number
+    frames.commanded[:] = frames.published + 300_000
+    frames.computing[:] = 200_000, 300_000, 200_000, 4_000_000, 200_000
+    times = frames.times(1000.0, 6, 1, np.zeros(3))
+    assert (times.missed, times.interrupted, times.camera_stalls, times.refused) == (5, 2, 6, 1)
+    assert times.rate == pytest.approx(1000.0)
+    assert times.latencies == pytest.approx([300.0] * 5)
+    assert times.computing == pytest.approx([200.0, 300.0, 200.0, 4000.0, 200.0])
 
 
 def test_regions_have_enough_rulers() -> None:
@@ -36,7 +66,7 @@ def test_regions_have_enough_rulers() -> None:
     ],
 )
 def test_loop_sustains_a_rate(slowest: float, missed: int, rate: float, reason: str | None) -> None:
-    times = servo.LoopTimes(np.full(100, slowest), missed, 0, np.zeros(3), rate)
+    times = loop_times(np.full(100, slowest), missed, 0, rate)
     assert times.failure(1000.0) == reason
 
 
@@ -80,6 +110,13 @@ def test_the_loop_reaches_its_target(device: Device) -> None:
     assert times.refused == 0
     assert (np.abs(times.error) < (5e-7, 5e-7, 1e-3)).all()
     assert (times.latencies > 0).all()
+
+
+@pytest.mark.slow
+def test_an_empty_loop_takes_the_frames(device: Device) -> None:
+    times = servo.run_loop(device, 128, rate=100.0, seconds=0.5, placement=servo.Placement(), is_empty=True)
+    assert len(times.latencies) == 50
+    assert np.median(times.computing) < 200.0
 
 
 @pytest.mark.slow

@@ -22,9 +22,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
+import math
+import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -90,6 +93,8 @@ class LoopTimes:
         Missed frames during which the loop was ready, but not on a core.
     camera_stalls : int
         Frames that the camera published a quarter of a period late or more. Not counted as missed.
+    stolen_ms : float
+        Time that the hypervisor took from all cores [ms], in steps of 10 ms; NaN if the system does not report it.
     refused : int
         Frames whose pose was refused.
     error : (3,)
@@ -103,6 +108,7 @@ class LoopTimes:
     missed: int
     interrupted: int
     camera_stalls: int
+    stolen_ms: float
     refused: int
     error: NDArray[np.float64]
     rate: float
@@ -132,6 +138,7 @@ class LoopTimes:
             "missed": self.missed,
             "interrupted": self.interrupted,
             "camera_stalls": self.camera_stalls,
+            "stolen_ms": self.stolen_ms,
             "refused": self.refused,
         }
 
@@ -141,6 +148,15 @@ def features_of(artwork: Artwork, size: int) -> FeatureSet:
     half = (size / 2 - _BORDER) * PIXEL
     imaging = Imaging(pixel=PIXEL, blur_px=1.0, shift=20e-6, angle=3e-3)
     return choose_features(artwork, (TARGET[:2] - half, TARGET[:2] + half), imaging, budget=RULERS)
+
+
+def _stolen_ms() -> float:
+    """Return the time that the hypervisor has taken from all cores since the start of the system [ms], or NaN."""
+    try:
+        steal = int(Path("/proc/stat").read_text().split(maxsplit=9)[8])  # proc(5): the 8th number of the first line
+    except (OSError, ValueError, IndexError):
+        return math.nan
+    return 1e3 * steal / os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True)
@@ -158,7 +174,7 @@ class _Frames:
         # Ones: the first write to a page would cost a page fault inside the loop.
         return _Frames(*(np.ones(count, np.int64) for _ in range(5)))
 
-    def times(self, rate: float, late: int, refused: int, error: NDArray[np.float64]) -> LoopTimes:
+    def times(self, rate: float, *, late: int, stolen_ms: float, refused: int, error: NDArray[np.float64]) -> LoopTimes:
         """Return the times of the loop at a wanted rate [1/s]."""
         skipped = np.diff(self.number) - 1
         was_interrupted = self.computing[:-1] < 1e9 / rate
@@ -169,6 +185,7 @@ class _Frames:
             missed=int(skipped.sum()),
             interrupted=int(skipped[was_interrupted].sum()),
             camera_stalls=late,
+            stolen_ms=stolen_ms,
             refused=refused,
             error=error,
             rate=float(self.number[-1] - self.number[0]) / duration,
@@ -194,7 +211,7 @@ class _Loop:
         count = round(rate * seconds)
         frames, refused, late = _Frames.empty(count), 0, 0
         gain, late_after = _GAIN * rate, 1.25e9 / rate
-        taken = camera.start(rate)
+        taken, stolen_before = camera.start(rate), _stolen_ms()
         for number in range(-settling, count):
             newest = camera.wait_after(taken)
             begun, busy = time.perf_counter_ns(), time.thread_time_ns()
@@ -209,7 +226,8 @@ class _Loop:
             refused += is_refused
             if number:
                 late += sum(after - before > late_after for before, after in itertools.pairwise(times))
-        return frames.times(rate, late, refused, camera.pose - TARGET)
+        stolen = _stolen_ms() - stolen_before
+        return frames.times(rate, late=late, stolen_ms=stolen, refused=refused, error=camera.pose - TARGET)
 
     def _command(self, number: int, published: int, gain: float) -> bool:
         """Measure a frame and command the velocity; return whether the pose was refused."""

@@ -179,7 +179,7 @@ class ServoLoop:
     """Loop that steers a plant to a target by measured poses.
 
     A run resets the controller. The loop refuses a measurement that was exposed after the begin of the frame: its times
-    belong to another clock.
+    belong to another clock. With a `WallClock`, run the loop inside `low_latency`.
 
     Parameters
     ----------

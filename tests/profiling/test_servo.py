@@ -13,7 +13,7 @@ from gpuvision.profiling import feature_pose, servo
 
 
 def loop_times(latencies: np.ndarray, missed: int, refused: int, rate: float) -> servo.LoopTimes:
-    return servo.LoopTimes(latencies, 0.5 * latencies, missed, 1, 4, refused, np.zeros(3), rate)
+    return servo.LoopTimes(latencies, 0.5 * latencies, missed, 1, 4, 20.0, refused, np.zeros(3), rate)
 
 
 def test_summary_has_percentiles_and_counts() -> None:
@@ -29,6 +29,7 @@ def test_summary_has_percentiles_and_counts() -> None:
         "missed": 3,
         "interrupted": 1,
         "camera_stalls": 4,
+        "stolen_ms": 20.0,
         "refused": 2,
     }
 
@@ -40,8 +41,9 @@ def test_missed_frames_are_counted_and_attributed() -> None:
     frames.published[:] = 1_000_000 * frames.number
     frames.commanded[:] = frames.published + 300_000
     frames.computing[:] = 200_000, 300_000, 200_000, 4_000_000, 200_000
-    times = frames.times(1000.0, 6, 1, np.zeros(3))
+    times = frames.times(1000.0, late=6, stolen_ms=30.0, refused=1, error=np.zeros(3))
     assert (times.missed, times.interrupted, times.camera_stalls, times.refused) == (5, 2, 6, 1)
+    assert times.stolen_ms == 30.0
     assert times.rate == pytest.approx(1000.0)
     assert times.latencies == pytest.approx([300.0] * 5)
     assert times.computing == pytest.approx([200.0, 300.0, 200.0, 4000.0, 200.0])

@@ -1,0 +1,86 @@
+"""Starting polynomials of the kernels' lens inversion, and its Newton steps: each step's error against exact points."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pytest
+
+from gpuvision.camera.camera import Camera
+from gpuvision.host import Device
+from gpuvision.host.program import options
+from gpuvision.operation import KERNEL_FOLDER
+from gpuvision.reference import camera as reference
+
+MATRIX = ((1700.0, 0.0, 640.0), (0.0, 1700.0, 512.0), (0.0, 0.0, 1.0))
+IDEAL = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+REGION = ((0.0, 1280.0), (0.0, 1024.0))
+RADIAL = (-0.28, 0.11, 0.0, 0.0, -0.02)
+# Decentring and prism terms of 5 times a good lens: each of their polynomials moves points by more than the errors.
+DECENTRED = (-0.12, 0.08, 5e-3, -8e-3, 0.01, 0.02, 0.03, 0.001, 5e-3, 1e-2, -5e-3, 1.5e-2)
+
+# The number of steps is an entry behind the camera's table.
+APPROACH = """
+#include "common/camera.h"
+kernel void approach(global const double *m, global double *back, constant double *camera) {
+    const size_t i = get_global_id(0);
+    double x, y;
+    camera_approach(m[2 * i], m[2 * i + 1], camera, &x, &y);
+    back[2 * i] = x;
+    back[2 * i + 1] = y;
+}
+"""
+
+
+def _camera(coefficients: tuple[float, ...], matrix: object = MATRIX) -> Camera:
+    return Camera(matrix=matrix, distortion=(*coefficients, *(0.0,) * (14 - len(coefficients))))
+
+
+def _points(rng: np.random.Generator, camera: Camera, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return distorted points within a radius, and their displacement back to the ideal points, both normalised."""
+    ideal = rng.uniform(-1.0, 1.0, (6000, 2)) * math.sqrt(2.0 * reach)
+    distorted = np.asarray(reference.distort_pixels(ideal, IDEAL, camera.distortion), np.float64)
+    within = np.sum(distorted**2, axis=-1) < reach
+    return distorted[within], (ideal - distorted)[within]
+
+
+def _largest_errors(device: Device, camera: Camera, points: np.ndarray, back: np.ndarray, steps: int) -> list[float]:
+    """Return the largest error of the kernel after 0, 1, ... steps."""
+    table = camera.packed(np.float64, "undistort")
+    defines = {**camera.defines(), "CAMERA_SURE": None, "REAL_IS_DOUBLE": None}
+    defines["CAMERA_STEPS"] = f"(int)camera[{len(table)}]"
+    program = cl.Program(device.context, APPROACH).build([*options(defines), "-I", str(KERNEL_FOLDER)])
+    approach, queue, found = program.approach, device.queue, []
+    m, moved = cl.array.to_device(queue, points), cl.array.zeros(device.queue, points.shape, np.float64)
+    for count in range(steps):
+        entries = cl.array.to_device(queue, np.append(table, float(count)))
+        approach(queue, (len(points),), None, m.data, moved.data, entries.data)
+        found.append(float(np.max(np.abs(moved.get() - back))))
+    return found
+
+
+@pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
+@pytest.mark.parametrize(("coefficients", "first"), [(RADIAL, 1e-10), (DECENTRED, 1e-3)], ids=["radial", "decentred"])
+def test_each_step_is_as_exact_as_the_host_says(
+    device: Device, coefficients: tuple[float, ...], first: float, rng: np.random.Generator
+) -> None:
+    """`sure_steps` returns a number of steps for tolerances from the largest error after these steps on."""
+    camera = _camera(coefficients)
+    start = camera.inverse_start(REGION)
+    reach = 1.0 / camera.packed(np.float64, "undistort")[31]
+    # Undistorted corners of the region, 1.1 times as far.
+    far = np.hypot(640.0, 512.0) / 1700.0
+    assert reach == pytest.approx((1.1 * far) ** 2, rel=1e-6)
+    errors = _largest_errors(device, camera, *_points(rng, camera, reach), steps=4)
+    assert errors[0] < first
+    for before, after in itertools.pairwise(errors):
+        assert after < max(1e-2 * before, 1e-15)
+    for count, error in enumerate(errors):
+        if error > 1e-14:
+            assert start.sure_steps(1.1 * error) <= count
+            assert start.sure_steps(0.9 * error) == count + 1
+    assert start.sure_steps(1e-18) is None

@@ -13,6 +13,7 @@ from gpuvision.host.reading import reason_of
 from gpuvision.schema import Section, read_preset, read_toml
 from gpuvision.servoing.axis import Axis, FineStage
 from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform
+from gpuvision.servoing.placement.control import CONTROLLERS, OBSERVERS, RULES, Control, Settling
 from gpuvision.servoing.placement.machine import Machine, PlacementCamera, ThermalDrift, Tolerance
 
 MACHINES = ("look_while_place",)
@@ -72,24 +73,27 @@ def _machine(top: Section, rate: float | None) -> Machine:
     axes = top.optional_section("axes")
     loop, delay = top.section("loop"), top.optional_section("delay")
     given_rate = loop.number("rate", "Hz", above=0.0)
-    gain = loop.number("gain", "", None, above=0.0)
-    loop.finish()
+    control, settling = _control(loop), top.optional_section("settling")
     transfer, landing, stages = (0.0, 0.0, {}) if delay is None else _delay(delay)
     tolerance, drift = _tolerance(top.section("tolerance")), top.optional_section("drift")
     machine_drift = ThermalDrift() if drift is None else _drift(drift)
+    release = Settling() if settling is None else _settling(settling)
+    machine_axes, swing = ((Axis(), Axis(), Axis()), (0.0, 0.0, 0.0)) if axes is None else _axes(axes)
     top.finish()
     with top.checking():
         return Machine(
             camera=camera,
             pipette_in_camera=calibration,
             tolerance=tolerance,
-            axes=(Axis(), Axis(), Axis()) if axes is None else _axes(axes),
+            axes=machine_axes,
             rate=given_rate if rate is None else rate,
             transfer=transfer,
             stages=stages,
             landing=landing,
-            gain=gain,
+            control=control,
+            settling=release,
             drift=machine_drift,
+            swing=swing,
         )
 
 
@@ -130,14 +134,62 @@ def _calibration(table: Section) -> Transform:
         return Transform.rigid(PIPETTE, CAMERA, pose, covariance)
 
 
-def _axes(table: Section) -> tuple[Axis, Axis, Axis]:
+def _control(table: Section) -> Control:
+    observer = table.choice("observer", OBSERVERS, "latest")
+    controller = table.choice("controller", CONTROLLERS, "p")
+    gain = table.number("gain", "", None, above=0.0)
+    integral = table.number("integral", "s", None, above=0.0)
+    derivative = table.number("derivative", "s", None, at_least=0.0)
+    motion_sigma = table.numbers("motion_sigma", "m, m, rad", (3,), None)
+    watchdog = table.number("watchdog", "frames", None, above=1.0)
+    table.finish()
+    with table.checking():
+        return Control(
+            observer=observer,
+            controller=controller,
+            gain=gain,
+            integral=integral,
+            derivative=derivative,
+            motion_sigma=_three(motion_sigma),
+            watchdog=math.inf if watchdog is None else watchdog,
+        )
+
+
+def _settling(table: Section) -> Settling:
+    rule = table.choice("rule", RULES)
+    wait = table.number("wait", "s", None, above=0.0)
+    frequency = table.numbers("frequency", "Hz", (3,), None)
+    damping = table.numbers("damping", "", (3,), None)
+    miss = table.number("miss_probability", "", 0.0027, above=0.0, at_most=1.0)
+    window = table.integer("window", 24, at_least=4)
+    lead = table.number("lead", "s", 0.0, at_least=0.0)
+    table.finish()
+    with table.checking():
+        return Settling(
+            rule=rule,
+            wait=wait,
+            frequency=_three(frequency),
+            damping=_three(damping),
+            miss_probability=miss,
+            window=window,
+            lead=lead,
+        )
+
+
+def _three(values: tuple[float, ...] | None) -> tuple[float, float, float] | None:
+    return None if values is None else (values[0], values[1], values[2])
+
+
+def _axes(table: Section) -> tuple[tuple[Axis, Axis, Axis], tuple[float, float, float]]:
+    """Return the axes and the largest amplitudes of their vibration after the long move."""
     sections = {name: table.optional_section(name) for name in _AXES}
     table.finish()
-    x, y, theta = (Axis() if section is None else _axis(section, _AXES[name]) for name, section in sections.items())
-    return x, y, theta
+    found = [(Axis(), 0.0) if each is None else _axis(each, _AXES[name]) for name, each in sections.items()]
+    (x, swing_x), (y, swing_y), (theta, swing_theta) = found
+    return (x, y, theta), (swing_x, swing_y, swing_theta)
 
 
-def _axis(table: Section, unit: str) -> Axis:
+def _axis(table: Section, unit: str) -> tuple[Axis, float]:
     fine = table.optional_section("fine")
     values = {
         "lag": table.number("lag", "s", 0.0, at_least=0.0),
@@ -149,10 +201,11 @@ def _axis(table: Section, unit: str) -> Axis:
         "damping": table.number("damping", "", 0.05, at_least=0.0, at_most=1.0),
         "encoder": table.number("encoder", unit, 0.0, at_least=0.0),
     }
+    swing = table.number("swing", unit, 0.0, at_least=0.0)
     stage = None if fine is None else _fine(fine, unit)
     table.finish()
     with table.checking():
-        return Axis(**values, fine=stage)
+        return Axis(**values, fine=stage), swing
 
 
 def _limit(table: Section, key: str, unit: str) -> float:

@@ -226,6 +226,11 @@ class SmithPredictor:
         self._latest.reset(time, numbers(pose, (3,), "pose"), numbers(covariance, (3, 3), "covariance"))
         self._commands.clear()
 
+    @property
+    def exposed(self) -> float:
+        """Time of the latest exposure [s]."""
+        return self._latest.exposed
+
     def command(self, time: float, velocity: Float64) -> None:
         """Take the velocity (3,) that the head is commanded from a time on."""
         self._commands.append((time, np.array(velocity)))

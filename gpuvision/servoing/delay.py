@@ -52,8 +52,61 @@ def delay_taps(delay: float) -> tuple[int, float]:
     return whole, delay - whole
 
 
+class LoopPolynomials(NamedTuple):
+    """Transfer function of a closed loop from the target to the position, and from an error of the pose, negated.
+
+    Attributes
+    ----------
+    numerator, denominator : numpy.ndarray
+        (n,) coefficients of the powers of 1/z, lowest power first.
+    """
+
+    numerator: Float64
+    denominator: Float64
+
+
+def closed_loop(delay: float, gain: float, *, integral: float = math.inf, derivative: float = 0.0) -> LoopPolynomials:
+    """Return the closed loop of controller, integrating plant with hold, and delay.
+
+    Parameters
+    ----------
+    delay : float
+        Delay [frames], 0 or more; fractions are exact.
+    gain : float
+        Fraction of the error that one frame corrects.
+    integral : float
+        Time constant of the integral part [frames]; infinite (default) for none.
+    derivative : float
+        Time constant of the derivative part [frames], default 0. It acts on the commanded velocity of the last frame:
+        the velocity that `SmithPredictor` and `PoseObserver` estimate.
+
+    Notes
+    -----
+    With q = 1/z, the delay D, and the controller B / A, the position is ``gain q B / ((1 - q) A + gain q B D)`` times
+    the target: ``B = 1, A = 1 + gain derivative q`` without integral part, and ``B = 1 + 1 / integral - q,
+    A = 1 - q + gain derivative q B`` with it.
+    """
+    whole, part = delay_taps(delay)
+    has_integral = math.isfinite(integral)
+    front = np.array([1.0 + 1.0 / integral, -1.0] if has_integral else [1.0])
+    back = np.array([1.0, -1.0] if has_integral else [1.0])
+    if derivative:
+        back = np.pad(back, (0, len(front) + 1 - len(back)))
+        back[1:] += gain * derivative * front
+    taps = np.zeros(whole + 2)  # gain q D
+    taps[-1] = gain * (1.0 - part)
+    if part:
+        taps = np.append(taps, gain * part)
+    loop, own = np.convolve(taps, front), np.convolve([1.0, -1.0], back)
+    numerator, denominator = np.zeros((2, max(len(loop), len(own))))
+    denominator[: len(own)] += own
+    denominator[: len(loop)] += loop
+    numerator[1 : len(front) + 1] = gain * front
+    return LoopPolynomials(numerator, denominator)
+
+
 def characteristic_polynomial(delay: float, gain: float) -> Float64:
-    """Return the characteristic polynomial of the loop, highest power first.
+    """Return the characteristic polynomial of the loop with a proportional controller, highest power first.
 
     Parameters
     ----------
@@ -67,12 +120,7 @@ def characteristic_polynomial(delay: float, gain: float) -> Float64:
     numpy.ndarray
         (n + 3,) coefficients for a delay of n + f frames, or (n + 2,) for f = 0.
     """
-    whole, part = delay_taps(delay)
-    polynomial = np.zeros(whole + 3)
-    polynomial[:2] = 1.0, -1.0
-    polynomial[-2] += gain * (1.0 - part)
-    polynomial[-1] += gain * part
-    return polynomial if part else polynomial[:-1]
+    return closed_loop(delay, gain).denominator
 
 
 def gain_limit(delay: float) -> float:

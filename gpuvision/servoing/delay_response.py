@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
-from gpuvision.servoing.delay import DelayBudget, characteristic_polynomial, delay_taps, gain_limit
+from gpuvision.servoing.delay import DelayBudget, characteristic_polynomial, closed_loop, delay_taps, gain_limit
 from gpuvision.validation import finite, integer
 
 Float64 = npt.NDArray[np.float64]
@@ -52,7 +52,9 @@ def root_locus(delay: float, gains: npt.ArrayLike) -> npt.NDArray[np.complex128]
     return np.array([each[np.argsort(-np.abs(each))] for each in found])
 
 
-def step_response(delay: float, gain: float, frames: int) -> Float64:
+def step_response(
+    delay: float, gain: float, frames: int, *, integral: float = math.inf, derivative: float = 0.0
+) -> Float64:
     """Return the error in each frame after a step of the target by 1.
 
     Parameters
@@ -63,6 +65,8 @@ def step_response(delay: float, gain: float, frames: int) -> Float64:
         Fraction of the error that one frame corrects.
     frames : int
         Number of frames, 1 or more.
+    integral, derivative : float
+        Time constants of a PI or PID controller [frames], as for `closed_loop`. Default: a proportional controller.
 
     Returns
     -------
@@ -72,13 +76,13 @@ def step_response(delay: float, gain: float, frames: int) -> Float64:
     """
     count = integer(frames, "frames", minimum=1)
     # The position x follows x[k+1] = x[k] + gain (1 - delayed x[k]) from x = 0.
-    denominator = characteristic_polynomial(delay, gain)
-    numerator = np.zeros(len(denominator))
-    numerator[1] = gain
+    numerator, denominator = closed_loop(delay, gain, integral=integral, derivative=derivative)
     return 1.0 - np.asarray(lfilter(numerator, denominator, np.ones(count)), np.float64)
 
 
-def settling_frames(delay: float, gain: float, tolerance: float) -> int:
+def settling_frames(
+    delay: float, gain: float, tolerance: float, *, integral: float = math.inf, derivative: float = 0.0
+) -> int:
     """Return the number of frames after which the error of a step of 1 stays within a tolerance.
 
     Parameters
@@ -87,6 +91,8 @@ def settling_frames(delay: float, gain: float, tolerance: float) -> int:
         As for `step_response`; the loop must be stable.
     tolerance : float
         Largest error as a fraction of the step, above 0 and below 1.
+    integral, derivative : float
+        As for `step_response`.
 
     Raises
     ------
@@ -94,14 +100,16 @@ def settling_frames(delay: float, gain: float, tolerance: float) -> int:
         The loop is not stable, the tolerance is out of range, or the search takes more than 3.6 million frames.
     """
     tolerance = finite(tolerance, "tolerance", above=0.0, maximum=1.0)
-    slowest = float(np.abs(root_locus(delay, gain)).max()) if gain > 0.0 else 1.0
+    poles = np.roots(closed_loop(delay, gain, integral=integral, derivative=derivative).denominator)
+    slowest = float(np.abs(poles).max(initial=0.0)) if gain > 0.0 else 1.0
     if slowest >= 1.0 - 1e-12:  # rounding of np.roots at double roots is below 1e-7 of the root's distance
         raise ValueError(f"the loop with delay {delay:g} frames and gain {gain:g} is not stable: no settling time")
     # A double root decays as k r^k: twice the frames of r^k and some for the delay cover it; then double until it fits.
     count = math.ceil(2.0 * math.log(tolerance) / math.log(slowest)) if slowest > 0.0 else 0
     count += 4 * (math.ceil(delay) + 2)
     while count <= _MAX_FRAMES:
-        outside = np.flatnonzero(np.abs(step_response(delay, gain, count)) > tolerance)
+        error = step_response(delay, gain, count, integral=integral, derivative=derivative)
+        outside = np.flatnonzero(np.abs(error) > tolerance)
         if outside.size == 0 or outside[-1] < count // 2:
             return int(outside[-1]) + 1 if outside.size else 0
         count *= 2

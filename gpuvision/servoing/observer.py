@@ -244,6 +244,12 @@ class PoseObserver:
         self._states[0], self._commands[0], self._covariances[0] = 0.0, 0.0, 0.0
         self._states[0, :3] = numbers(pose, (3,), "pose")
         self._covariances[0, :3, :3] = numbers(covariance, (3, 3), "covariance")
+        self._exposed = -math.inf
+
+    @property
+    def exposed(self) -> float:
+        """Time of the newest accepted exposure [s]; minus infinity before the first one."""
+        return self._exposed
 
     def command(self, time: float, velocity: Float64) -> None:
         """Take the velocity (3,) that the head is commanded from a time on.
@@ -288,6 +294,7 @@ class PoseObserver:
         self._states[node], self._covariances[node] = _correct(*predicted, innovation)
         for k in range(node + 1, self._end):
             self._propagate(k)
+        self._exposed = max(self._exposed, time)
         return Verdict.ACCEPTED
 
     def estimate(self, time: float) -> MotionEstimate:

@@ -29,6 +29,9 @@ class SimulatedPlant:
         Number of past commands for which `pose` still answers, 2 or more. Default 4096.
     watchdog : float
         Time after a command at which the axes are commanded to stand still [s]. Default: never.
+    swing : array_like
+        (3,): displacement of the payload against its axis at time 0 [m], [m], [rad]: the residual vibration of a move
+        before. An axis with a resonance swings with this amplitude; it must be 0 for the others. Default: zeros.
 
     Notes
     -----
@@ -43,6 +46,7 @@ class SimulatedPlant:
         start: npt.ArrayLike = (0, 0, 0),
         history: int = 4096,
         watchdog: float = math.inf,
+        swing: npt.ArrayLike = (0, 0, 0),
     ) -> None:
         if len(axes) != 3:
             raise ValueError(f"a plant has 3 axes (x, y, theta), got {len(axes)}")
@@ -52,6 +56,10 @@ class SimulatedPlant:
         self._steppers = [AxisStepper(each) for each in axes]
         position = numbers(start, (3,), "start")
         states = [each.start(where) for each, where in zip(axes, position, strict=True)]
+        for axis, state, away in zip(axes, states, numbers(swing, (3,), "swing"), strict=True):
+            if away and not axis.resonance:
+                raise ValueError("swing needs an axis with a resonance")
+            state[Q] += away
         self._segments: deque[tuple[int, list[Float64]]] = deque(
             [(0, states)], maxlen=integer(history, "history", minimum=2)
         )

@@ -7,7 +7,9 @@ References
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -17,12 +19,22 @@ import numpy.typing as npt
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.servoing.loop import SimulatedClock
-from gpuvision.servoing.placement.budget import ErrorBudget, predict_budget
+from gpuvision.servoing.placement.budget import ErrorBudget, model_tolerance, predict_budget
+from gpuvision.servoing.placement.control import Settling
 from gpuvision.servoing.placement.machine import Machine
-from gpuvision.servoing.placement.placing import Placement, place_part
+from gpuvision.servoing.placement.placing import (
+    REMAINDER,
+    Placement,
+    error_share,
+    place_part,
+    predicted_frames,
+    predicted_settling,
+    settled_frames,
+)
 from gpuvision.servoing.placement.plan import PlacementPlan, plan_placement
 from gpuvision.servoing.placement.vision import BoardPoseSensor, SimulatedCamera
 from gpuvision.servoing.plant import SimulatedPlant
+from gpuvision.servoing.settling import vibration_of_loop
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
 from gpuvision.validation import integer
 
@@ -32,6 +44,10 @@ Float64 = npt.NDArray[np.float64]
 _START = 0.9
 # The board is rendered this far beyond the landing zone [px] (chosen).
 _MARGIN_PX = 32
+# Time in which the vibration of the steered head is identified [periods of the slowest resonance] (chosen).
+_IDENTIFICATION = 12.0
+# True poses in the time after the contact, in which a swing must stay within the tolerance.
+_LATER = 33
 
 
 class PlacementResult(NamedTuple):
@@ -55,6 +71,9 @@ class PlacementResult(NamedTuple):
         the error at the release.
     sources : mapping of str to numpy.ndarray
         Parts of the error (n, 3): "calibration", "drift", and "vision and servo", which is the rest.
+    reach : numpy.ndarray
+        (n,): largest true error, less calibration and drift, in a period of the resonance after the contact, as a
+        fraction of the tolerance; NaN where the part was not released.
     """
 
     plan: PlacementPlan
@@ -64,6 +83,35 @@ class PlacementResult(NamedTuple):
     error: Float64
     motion: tuple[Float64, ...]
     sources: dict[str, Float64]
+    reach: Float64
+
+    @property
+    def _servo_motion(self) -> list[Float64]:
+        """True errors (frames, 3) of each run, less calibration and drift: the motion to the point of the camera."""
+        offset = self.sources["calibration"] + self.sources["drift"]
+        return [motion - away for motion, away in zip(self.motion, offset, strict=True)]
+
+    @property
+    def settling_band(self) -> Float64:
+        """Band (3,) of the settled error: the remainder of `ReleaseRule` and three sigmas of the source vision."""
+        tolerance = self.machine.tolerance
+        limit = np.array([tolerance.position] * 2 + [tolerance.angle])
+        return np.asarray(REMAINDER * limit + 3.0 * self.budget.sigmas["vision"])
+
+    @property
+    def settled(self) -> list[int | None]:
+        """Frame from which on the true error, less calibration and drift, stays within `settling_band`.
+
+        Measured apart from the release rule; None for an error that is larger at the end.
+        """
+        return [settled_frames(each, self.settling_band) for each in self._servo_motion]
+
+    @property
+    def predicted_settling(self) -> list[int]:
+        """Frames to `settling_band` by theory, from the true start errors, with those of the coarse registration."""
+        landing = 0 if self.plan.landing is None else math.ceil(self.machine.landing * self.machine.rate - 1e-9)
+        band = self.settling_band
+        return [landing + predicted_settling(self.machine, each[0], band) for each in self._servo_motion]
 
     @property
     def simulated_sigmas(self) -> Float64:
@@ -83,11 +131,25 @@ class PlacementResult(NamedTuple):
             measured = np.sqrt(np.mean(self.error[released] ** 2, axis=0))
             lines[0] += f", in {np.mean(frames):.1f} frames (the release waits for {np.mean(least):.1f})"
             lines += [
+                f"observer {self.machine.control.observer}, controller {self.machine.control.controller}, "
+                f"release by {self.machine.settling.rule}",
+                self._settling(),
                 _triple("error, root mean square", measured),
                 _triple("error, predicted", self.simulated_sigmas),
             ]
         lines += sorted({f"aborted: {each.reason}" for each in self.placements if not each.released})
         return "\n".join(lines)
+
+    def _settling(self) -> str:
+        """Return the frames to the settling band, measured from the true error and by theory."""
+        pairs = zip(self.settled, self.predicted_settling, strict=True)
+        counted = np.array([each for each in pairs if each[0] is not None], np.float64).reshape(-1, 2)
+        if not len(counted):
+            return "the true error did not settle before the release"
+        measured, predicted = counted.mean(axis=0)
+        text = f"true error settled in {measured:.1f} frames, predicted {predicted:.1f}"
+        missing = len(self.settled) - len(counted)
+        return text + (f"; not settled before the release: {missing}" if missing else "")
 
     def report(self) -> dict[str, Any]:
         """Return the content of ``report.json``: the keys name their SI units."""
@@ -95,6 +157,9 @@ class PlacementResult(NamedTuple):
         found = self.error[released]
         delay = self.machine.delay
         measured = {"total": found, **{name: each[released] for name, each in self.sources.items()}}
+        control, gains, settling = self.machine.control, self.machine.gains, self.machine.settling
+        noise = np.diag(self.budget.sources["vision"]) / np.diag(self.plan.vision)
+        tolerated = model_tolerance(self.machine, self.plan)
         return {
             "gpuvision": version("gpuvision"),
             "target": _pose(self.plan.target),
@@ -106,7 +171,18 @@ class PlacementResult(NamedTuple):
             "parts_s": delay.parts,
             "total_delay_s": delay.total,
             "delay_frames": delay.frames,
+            "settling_band": _pose(self.settling_band),
+            "observer": control.observer,
+            "controller": control.controller,
             "gain_per_frame": self.machine.loop_gain,
+            "integral_s": gains.integral if math.isfinite(gains.integral) else None,
+            "derivative_s": gains.derivative,
+            "vision_gain": _pose(noise),
+            "tolerated_plant_gain": None if tolerated is None else tolerated.plant_gain,
+            "tolerated_delay_s": None if tolerated is None else tolerated.longer_delay,
+            "settling": settling.rule,
+            "vibration_Hz": settling.frequency,
+            "vibration_damping": settling.damping,
             "predicted_sigma": {name: _pose(each) for name, each in self.budget.sigmas.items()},
             "predicted_sigma_simulated": _pose(self.simulated_sigmas),
             "measured_rms": {
@@ -119,9 +195,14 @@ class PlacementResult(NamedTuple):
                     "start_error": _pose(each.start_error),
                     "frames": each.frames,
                     "predicted_frames": each.predicted_frames + 1,
+                    "settled_frames": settled,
+                    "predicted_settled_frames": predicted,
                     "error": _pose(error) if each.released else None,
+                    "reach_of_tolerance": float(reach) if each.released else None,
                 }
-                for each, error in zip(self.placements, self.error, strict=True)
+                for each, error, settled, predicted, reach in zip(
+                    self.placements, self.error, self.settled, self.predicted_settling, self.reach, strict=True
+                )
             ],
         }
 
@@ -170,8 +251,10 @@ def simulate_placements(
     Notes
     -----
     Every placement draws its own error of the calibration and its own drift from their covariances, and a start error
-    that is evenly distributed in the landing zone. The board is rendered as it is drawn, without etch bias. The number
-    of frames checks the theory in one direction only: `ReleaseRule` waits for the predicted number of frames.
+    that is evenly distributed in the landing zone. The board is rendered as it is drawn, without etch bias. An axis
+    with a ``swing`` starts with a vibration, whose amplitude is evenly distributed. If the rule "vibration" has no
+    frequencies, a move without a release finds them first. `ReleaseRule` waits for the predicted number of frames;
+    ``settled`` counts the frames of the true error, apart from this rule.
     """
     integer(count, "count", minimum=1)
     device = Device.best() if device is None else device
@@ -179,23 +262,37 @@ def simulate_placements(
     plan = plan_placement(artwork, target, machine, budget=budget)
     rng = np.random.default_rng(seed)
     tolerance, calibrated = machine.tolerance, machine.pipette_in_camera.pose
-    zone = _START * np.array([tolerance.landing_zone] * 2 + [tolerance.landing_angle])
+    zone = _START * np.array([tolerance.landing_zone] * 2 + [tolerance.landing_angle]) - np.array(machine.swing)
+    if not np.all(zone > 0.0):
+        raise ValueError(f"swing is {machine.swing}, expected less than {_START} of the landing zone")
     draws = {
         "calibration": _normal(rng, machine.pipette_in_camera.pose_covariance, count),
         "drift": _normal(rng, machine.drift.covariance, count),
     }
     cell = _Cell(artwork, machine, plan, device, seed)
+    starts, swings = rng.uniform(-zone, zone, (count, 3)), rng.uniform(-1.0, 1.0, (count, 3)) * np.array(machine.swing)
+    if machine.settling.rule == "vibration" and machine.settling.frequency is None:
+        cell.identify(zone)
+    sources = {name: each @ plan.camera_to_board.T for name, each in draws.items()}
     runs = []
-    for number, start in enumerate(rng.uniform(-zone, zone, (count, 3))):
+    for number, (start, swing) in enumerate(zip(starts, swings, strict=True)):
         true = calibrated + draws["calibration"][number] + draws["drift"][number]
-        runs.append(cell.place(start, true))
+        runs.append(cell.place(start, swing, true, sources["calibration"][number] + sources["drift"][number]))
         if progress is not None:
             progress(number + 1, count)
-    placements, motions, errors = zip(*runs, strict=True)
-    error = np.array(errors)
-    sources = {name: each @ plan.camera_to_board.T for name, each in draws.items()}
+    placements, motions, reach = zip(*runs, strict=True)
+    released = [each.released for each in placements]
+    error = np.where(np.array(released)[:, None], np.array([each[-1] for each in motions]), np.nan)
     sources["vision and servo"] = error - sources["calibration"] - sources["drift"]
-    return PlacementResult(plan, machine, predict_budget(machine, plan), placements, error, motions, sources)
+    frames = [_counted(each) for each in placements if each.released] or None
+    predicted = predict_budget(cell.machine, plan, frames)
+    return PlacementResult(plan, cell.machine, predicted, placements, error, motions, sources, np.array(reach))
+
+
+def _counted(placement: Placement) -> int:
+    """Return the number of frames from the first measured pose to the release."""
+    first = min(each.arrived for each in placement.measurements)
+    return int(np.count_nonzero(placement.record.time > first))
 
 
 class _Cell:
@@ -209,22 +306,59 @@ class _Cell:
         board = ReflectanceMap.of(
             artwork, pixel=camera.pixel, region=(centre - half, centre + half), blur_px=camera.blur_px
         )
-        self._machine, self._plan = machine, plan
+        self.machine, self._plan = machine, plan
         rest = np.zeros(3)
         self._camera = SimulatedCamera(board, machine, lambda _: rest, rest, device=device, seed=seed)
         self._sensor = BoardPoseSensor(self._camera, machine, plan, self._camera.dtype, device=device)
 
-    def place(self, start: Float64, true: Float64) -> tuple[Placement, Float64, Float64]:
-        """Place a part from a start error (3,); return the run, the motion, and the error at the release."""
-        machine, target = self._machine, self._plan.target
-        plant = SimulatedPlant(machine.axes, start=target + start)
+    def place(self, start: Float64, swing: Float64, true: Float64, offset: Float64) -> tuple[Placement, Float64, float]:
+        """Place a part from a start error (3,) with a vibration (3,).
+
+        Returns
+        -------
+        tuple
+            Run, motion, and largest true error less the offset (3,) of calibration and drift after the contact, as a
+            fraction of the tolerance.
+        """
+        placement, plant = self._steer(self.machine, start, swing, true)
+        target, settling = self._plan.target, self.machine.settling
+        motion = plant.pose(placement.record.time) - target
+        if not placement.released:
+            return placement, motion, math.nan
+        periods = [2.0 * math.pi / axis.resonance for axis in self.machine.axes if axis.resonance]
+        later = placement.record.time[-1] + settling.lead + np.linspace(0.0, max(periods, default=0.0), _LATER)
+        reach = max(error_share(self.machine, each) for each in plant.pose(later) - target - offset)
+        return placement, motion, reach
+
+    def identify(self, start: Float64) -> None:
+        """Find the vibration of the steered head in a move from a start error (3,), and take it for the rule."""
+        machine = self.machine
+        slowest = min(axis.resonance for axis in machine.axes if axis.resonance)
+        response = predicted_frames(machine, start) * machine.period
+        wait = response + _IDENTIFICATION * 2.0 * math.pi / slowest
+        longest = replace(machine.tolerance, max_time=machine.tolerance.max_time + wait + machine.landing)
+        moved = replace(machine, settling=Settling(rule="fixed", wait=wait), tolerance=longest)
+        placement, _ = self._steer(moved, start, np.array(machine.swing), machine.pipette_in_camera.pose)
+        if not placement.released:
+            raise ValueError(f"the vibration of the head cannot be identified: {placement.reason}")
+        since = min(each.arrived for each in placement.measurements) + response
+        found = vibration_of_loop(placement.record, since)
+        frequency, damping = (tuple(map(float, each)) for each in found)
+        settling = replace(machine.settling, frequency=frequency, damping=damping)
+        self.machine = replace(machine, settling=settling)
+
+    def _steer(
+        self, machine: Machine, start: Float64, swing: Float64, true: Float64
+    ) -> tuple[Placement, SimulatedPlant]:
+        """Run the loop for a part and return the run and the plant."""
+        target = self._plan.target
+        plant = SimulatedPlant(
+            machine.axes, start=target + start, swing=swing, watchdog=machine.control.watchdog * machine.period
+        )
         self._camera.follow(plant.pose, true)
         self._sensor.reset()
         landing = 0.0 if self._plan.landing is None else machine.landing
-        placement = place_part(machine, target, plant, self._sensor, SimulatedClock(), landing=landing)
-        motion = plant.pose(placement.record.time) - target
-        error = motion[-1].copy() if placement.released else np.full(3, np.nan)
-        return placement, motion, error
+        return place_part(machine, target, plant, self._sensor, SimulatedClock(), landing=landing), plant
 
 
 def _normal(rng: np.random.Generator, covariance: Float64, count: int) -> Float64:

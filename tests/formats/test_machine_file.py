@@ -118,7 +118,8 @@ def test_the_page_lists_the_keys_of_the_reader(monkeypatch: pytest.MonkeyPatch, 
     path = _written(tmp_path, full)
     monkeypatch.setattr(Section, "_value", recorded)
     read_machine(path)
-    sections = {"camera", "calibration", "axes", "loop", "delay", "tolerance", "drift", "x", "y", "theta", "fine"}
+    sections = {"camera", "calibration", "axes", "loop", "delay", "tolerance", "drift", "settling"}
+    sections |= {"x", "y", "theta", "fine"}
     # The keys of the sensor are those of camera presets.
     sensor = {"array", "response", "noise", "readout"}
     keys = {(table, key) for table, key in asked if table not in sensor and key not in sections | sensor}

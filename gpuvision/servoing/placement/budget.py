@@ -5,19 +5,23 @@ References
 .. [1] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, sections 5.4.4 and
    8.7.
 .. [2] K. J. Astrom, *Introduction to Stochastic Control Theory*, Academic Press 1970, chapter 5, section 2.
+.. [3] Y. Bar-Shalom, X. R. Li and T. Kirubarajan, *Estimation with Applications to Tracking and Navigation*, Wiley
+   2001, section 5.2 (Kalman filter).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.servoing.delay import characteristic_polynomial
+from gpuvision.servoing.delay import closed_loop
+from gpuvision.servoing.margins import margins, observer_tolerance, predictor_tolerance
 from gpuvision.servoing.placement.machine import Machine
-from gpuvision.servoing.placement.placing import REMAINDER
+from gpuvision.servoing.placement.placing import REMAINDER, predicted_frames
 from gpuvision.servoing.placement.plan import PlacementPlan
 
 Float64 = npt.NDArray[np.float64]
@@ -45,7 +49,7 @@ class ErrorBudget(NamedTuple):
         return {name: np.sqrt(np.diag(covariance)) for name, covariance in each.items()}
 
 
-def noise_gain(delay: float, gain: float) -> float:
+def noise_gain(delay: float, gain: float, *, integral: float = math.inf, derivative: float = 0.0) -> float:
     """Return the variance of the position of a servo loop at rest over the variance of a measured position.
 
     Parameters
@@ -54,6 +58,8 @@ def noise_gain(delay: float, gain: float) -> float:
         Delay [frames], 0 or more.
     gain : float
         Fraction of the error that one frame corrects; the loop must be stable.
+    integral, derivative : float
+        Time constants of a PI or PID controller [frames], as for `closed_loop`. Default: a proportional controller.
 
     Notes
     -----
@@ -65,9 +71,7 @@ def noise_gain(delay: float, gain: float) -> float:
     ValueError
         The loop is not stable, or the gain is 0.
     """
-    poles = characteristic_polynomial(delay, gain)
-    zeros = np.zeros(len(poles))
-    zeros[1] = gain
+    zeros, poles = closed_loop(delay, gain, integral=integral, derivative=derivative)
     total = 0.0
     while len(poles) > 1:
         if abs(poles[-1]) >= poles[0]:
@@ -78,7 +82,89 @@ def noise_gain(delay: float, gain: float) -> float:
     return float(total + zeros[0] ** 2 / poles[0])
 
 
-def predict_budget(machine: Machine, plan: PlacementPlan) -> ErrorBudget:
+def noise_covariance(machine: Machine, reported: Float64, noise: Float64, frames: int) -> Float64:
+    """Return the covariance of the pose of the head by independent errors of the measured poses.
+
+    Parameters
+    ----------
+    machine : Machine
+        Observer and controller.
+    reported : numpy.ndarray
+        (3, 3): covariance of a measured pose as the observer gets it.
+    noise : numpy.ndarray
+        (3, 3): covariance of its part that is independent from frame to frame.
+    frames : int
+        Number of frames from the first measured pose to the release; used for the Kalman filter only.
+
+    Returns
+    -------
+    numpy.ndarray
+        (3, 3)
+
+    Notes
+    -----
+    The latest pose and the Smith predictor pass the error of a pose on to the controller: `noise_gain` times the noise,
+    the limit for many frames. The Kalman filter has the correction K_j in frame j: 1 in the first frame, then smaller
+    from frame to frame, by the recursion of the covariance. The error of its estimate,
+    ``e_k = (1 - K_k) e_(k-1) + K_k noise_k``, drives a loop without delay that has the impulse response h. The error at
+    the release in frame n is the sum of ``A_j K_j noise_j`` with ``A_j = h_(n-j) + A_(j+1) (1 - K_(j+1))``.
+    """
+    delay, constants = machine.control_delay, machine.time_constants
+    if machine.control.motion_sigma is None:
+        return noise_gain(delay, machine.loop_gain, **constants) * noise
+    corrections = _corrections(reported, np.diag(machine.control.motion_sigma) ** 2, frames)
+    response = -np.diff(machine.error_after(frames + 1))  # h_1 ... h_n
+    covariance, later, unit = np.zeros((3, 3)), np.zeros((3, 3)), np.eye(3)
+    for frame in range(frames - 1, -1, -1):
+        later = later + response[frames - 1 - frame] * unit
+        covariance += later @ corrections[frame] @ noise @ corrections[frame].T @ later.T
+        later = later @ (unit - corrections[frame])
+    return covariance
+
+
+def _corrections(reported: Float64, motion: Float64, frames: int) -> list[Float64]:
+    """Return the corrections (3, 3) of the Kalman filter in the frames from the first measured pose on."""
+    found, covariance = [np.eye(3)], reported
+    while len(found) < frames:
+        predicted = covariance + motion
+        found.append(predicted @ np.linalg.inv(predicted + reported))
+        covariance = predicted - found[-1] @ predicted
+    return found
+
+
+class ModelTolerance(NamedTuple):
+    """Errors of the model of the machine at which its loop becomes unstable.
+
+    Attributes
+    ----------
+    plant_gain : float
+        Motion of the head over the commanded motion.
+    longer_delay : float
+        Delay above the one in the machine file [s].
+    """
+
+    plant_gain: float
+    longer_delay: float
+
+
+def model_tolerance(machine: Machine, plan: PlacementPlan) -> ModelTolerance | None:
+    """Return the errors of the model at which the loop becomes unstable; None for a predictor with PI or PID."""
+    gain, delay, period = machine.loop_gain, machine.delay.frames, machine.period
+    observer = machine.control.observer
+    if observer == "latest":
+        found = margins(machine.gains, machine.response_frames * period, period)
+        return ModelTolerance(found.gain, found.delay)
+    if machine.control.controller != "p":
+        return None
+    if machine.control.motion_sigma is None:
+        predictor = predictor_tolerance(gain, machine.response_frames)
+        return ModelTolerance(predictor.plant_gain, predictor.longer * period)
+    ratio = np.array(machine.control.motion_sigma) / np.sqrt(np.diag(plan.vision))
+    each = [observer_tolerance(gain, delay, lag=machine.lag / period, noise_ratio=float(one)) for one in ratio]
+    return ModelTolerance(min(one.plant_gain for one in each), min(one.longer for one in each) * period)
+
+
+def predict_budget(machine: Machine, plan: PlacementPlan, frames: npt.ArrayLike | None = None) -> ErrorBudget:
     """Predict the error of a placement at the release.
 
     Parameters
@@ -87,22 +173,42 @@ def predict_budget(machine: Machine, plan: PlacementPlan) -> ErrorBudget:
         Machine; its calibration has a covariance.
     plan : PlacementPlan
         Plan of the placement.
+    frames : array_like, optional
+        (n,) numbers of frames from the first measured pose to the release, over which the noise is averaged; used for
+        the Kalman filter only. Default: the predicted number for a start at the edge of the landing zone.
 
     Notes
     -----
     Calibration, etch bias and drift are common to all frames of a placement. "vision" is the motion by the errors of
-    the measured poses, which the loop follows: it averages the noise from frame to frame (`noise_gain`), but not the
-    differences between the pixels, which are the same in all frames of a head at rest. "servo" is the rest of the step
-    response that `ReleaseRule` allows, evenly distributed, and the step of the encoder.
+    the measured poses, which the loop follows: it averages the noise from frame to frame (`noise_covariance`), but not
+    the differences between the pixels, which are the same in all frames of a head at rest. "servo" is the rest of the
+    step response that `ReleaseRule` allows, evenly distributed, and the step of the encoder. With the rule "vibration"
+    an axis that swings adds a swing of the tolerance at a random phase, the largest one that the rule allows. With the
+    rule "fixed" the rest is that of start errors in the landing zone after the fixed time; a vibration is not included.
     """
-    averaged, turn = noise_gain(machine.response_frames, machine.loop_gain), plan.camera_to_board
+    turn, tolerance = plan.camera_to_board, machine.tolerance
+    zone = np.array([tolerance.landing_zone] * 2 + [tolerance.landing_angle])
+    counts = [predicted_frames(machine, zone)] if frames is None else np.asarray(frames, np.int64).tolist()
+    temporal = (1.0 - plan.fixed_pattern) * plan.vision
+    moved = np.mean([noise_covariance(machine, plan.vision, temporal, each) for each in counts], axis=0)
     steps = np.array([axis.encoder for axis in machine.axes])
-    rest = REMAINDER * np.array([machine.tolerance.position] * 2 + [machine.tolerance.angle])
     sources = {
         "calibration": turn @ machine.pipette_in_camera.pose_covariance @ turn.T,
         "etch bias": plan.etch_bias,
         "drift": turn @ machine.drift.covariance @ turn.T,
-        "vision": (averaged * (1.0 - plan.fixed_pattern) + plan.fixed_pattern) * plan.vision,
-        "servo": np.diag(rest**2 / 3.0 + steps**2 / 12.0),
+        "vision": moved + plan.fixed_pattern * plan.vision,
+        "servo": np.diag(_servo_variance(machine) + steps**2 / 12.0),
     }
     return ErrorBudget(sources, np.sum(list(sources.values()), axis=0))
+
+
+def _servo_variance(machine: Machine) -> Float64:
+    """Return the variances (3,) of the rest of the motion at the release."""
+    tolerance, settling = machine.tolerance, machine.settling
+    limit = np.array([tolerance.position] * 2 + [tolerance.angle])
+    if settling.wait is not None:
+        zone = np.array([tolerance.landing_zone] * 2 + [tolerance.landing_angle])
+        left = machine.error_after(math.ceil(settling.wait * machine.rate) + 1)[-1]
+        return np.asarray((left * zone) ** 2 / 3.0)
+    swings = np.array(settling.frequency or (0.0, 0.0, 0.0)) > 0.0
+    return np.asarray((REMAINDER * limit) ** 2 / 3.0 + np.where(swings, 0.5 * limit**2, 0.0))

@@ -14,8 +14,11 @@ from gpuvision.camera.cmos_sensor import CmosSensor
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.matching.artwork.board_artwork import Side
 from gpuvision.servoing.axis import Axis
-from gpuvision.servoing.delay import DelayBudget, gain_limit, non_oscillating_gain
+from gpuvision.servoing.controllers import PidGains, simc_gains
+from gpuvision.servoing.delay import DelayBudget, closed_loop, gain_limit, non_oscillating_gain
+from gpuvision.servoing.delay_response import settling_frames, step_response
 from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform
+from gpuvision.servoing.placement.control import Control, Settling
 from gpuvision.validation import finite, integer
 
 Float64 = npt.NDArray[np.float64]
@@ -175,10 +178,16 @@ class Machine:
     landing : float
         Time of a coarse registration [s], 0 or more, default 0. It finds the pose of the first frame where rulers that
         cover the landing zone have no room; the head rests during this time.
-    gain : float, optional
-        Fraction of the error that one frame corrects, 1e-4 or more. Default: the largest one without oscillation.
+    control : Control
+        Observer, controller, gains and watchdog. Default: a proportional controller on the latest pose, with the
+        largest gain without oscillation.
+    settling : Settling
+        Rule that releases the part. Default: the number of frames of the step response.
     drift : ThermalDrift
         Default: none.
+    swing : (float, float, float)
+        Largest amplitudes of the vibration with which the head comes out of the long move [m], [m], [rad], 0 or more,
+        for the simulated machine; an axis with a resonance only. Default 0.
 
     Raises
     ------
@@ -194,8 +203,10 @@ class Machine:
     transfer: float = 0.0
     stages: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     landing: float = 0.0
-    gain: float | None = None
+    control: Control = field(default_factory=Control)
+    settling: Settling = field(default_factory=Settling)
     drift: ThermalDrift = field(default_factory=ThermalDrift)
+    swing: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         frames = (self.pipette_in_camera.source, self.pipette_in_camera.target, self.pipette_in_camera.kind)
@@ -210,15 +221,32 @@ class Machine:
                 f"a frame of {rows} x {columns} px takes {1e3 * timing.period:.3f} ms, more than 1/rate = "
                 f"{1e3 * self.period:.3f} ms; read a smaller window, expose shorter, or lower the rate"
             )
+        for axis, swing in zip(self.axes, self.swing, strict=True):
+            if finite(swing, "swing", minimum=0.0) and not axis.resonance:
+                raise ValueError("swing needs an axis with a resonance")
+        self._check_stability()
+
+    def _check_stability(self) -> None:
+        """Raise a `ValueError` for a gain that is unstable or too small."""
+        gain, delay = self.control.gain, self.control_delay
         # Below half a frame a delay raises the limit, a lag does not.
-        most = gain_limit(max(self.response_frames, 0.5) if self.lag else self.response_frames)
-        if self.gain is not None and not 0.0 < self.gain < most:
+        most = gain_limit(max(delay, 0.5) if self.lag else delay)
+        if gain is not None and not (gain > 0.0 and (gain < most or self.control.controller != "p")):
             raise ValueError(
-                f"gain is {self.gain}, expected above 0 and below {most:.4g}, the limit of stability for a delay of "
-                f"{self.response_frames:.2f} frames"
+                f"gain is {gain}, expected above 0 and below {most:.4g}, the limit of stability for a delay of "
+                f"{delay:.2f} frames"
             )
-        if self.gain is not None and self.gain < _MIN_GAIN:
-            raise ValueError(f"gain is {self.gain}, expected {_MIN_GAIN} or more: the loop would hardly move")
+        if gain is not None and gain < _MIN_GAIN:
+            raise ValueError(f"gain is {gain}, expected {_MIN_GAIN} or more: the loop would hardly move")
+        if self.control.controller == "p":
+            return
+        gains, loop = self.gains, closed_loop(delay, self.loop_gain, **self.time_constants)
+        if not np.all(np.abs(np.roots(loop.denominator)) < 1.0):
+            raise ValueError(
+                f"the controller {self.control.controller} with gain {self.loop_gain:.4g}, integral "
+                f"{gains.integral:.4g} s and derivative {gains.derivative:.4g} s is not stable with a delay of "
+                f"{delay:.2f} frames"
+            )
 
     @property
     def period(self) -> float:
@@ -254,11 +282,56 @@ class Machine:
         return self.delay.frames + self.lag / self.period
 
     @property
+    def control_delay(self) -> float:
+        """Delay in frames that the controller sees: the part of `response_frames` that the observer does not predict.
+
+        The Smith predictor counts the lag as a delay and predicts all of it. The Kalman filter predicts the delay by
+        the time stamps, and the lag remains.
+        """
+        if self.control.observer == "latest":
+            return self.response_frames
+        return self.lag / self.period if self.control.observer == "kalman" else 0.0
+
+    @property
     def loop_gain(self) -> float:
         """Fraction of the error that one frame corrects."""
-        if self.gain is not None:
-            return self.gain
-        return non_oscillating_gain(self.response_frames)
+        if self.control.gain is not None:
+            return self.control.gain
+        if self.control.controller == "p":
+            return non_oscillating_gain(self.control_delay)
+        return self._rule.proportional * self.period
+
+    @property
+    def gains(self) -> PidGains:
+        """Gains of the controller."""
+        control, proportional = self.control, self.loop_gain * self.rate
+        if control.controller == "p":
+            return PidGains(proportional=proportional)
+        derivative = self.lag if control.derivative is None else control.derivative
+        return PidGains(
+            proportional=proportional,
+            integral=self._rule.integral if control.integral is None else control.integral,
+            derivative=derivative if control.controller == "pid" else 0.0,
+        )
+
+    @property
+    def _rule(self) -> PidGains:
+        """Gains by the rule of Skogestad for the delay that the controller sees, with half a frame for the hold."""
+        return simc_gains((self.control_delay + 0.5) * self.period)
+
+    def error_after(self, frames: int) -> Float64:
+        """Return the error (frames,) in each frame after a start error of 1, by theory."""
+        return step_response(self.control_delay, self.loop_gain, frames, **self.time_constants)
+
+    def frames_to(self, fraction: float) -> int:
+        """Return the number of frames after which a start error of 1 stays within a fraction, by theory."""
+        return settling_frames(self.control_delay, self.loop_gain, fraction, **self.time_constants)
+
+    @property
+    def time_constants(self) -> dict[str, float]:
+        """Time constants ``integral`` and ``derivative`` of the controller [frames]: arguments of `closed_loop`."""
+        gains = self.gains
+        return {"integral": gains.integral / self.period, "derivative": gains.derivative / self.period}
 
     def for_side(self, side: Side) -> Machine:
         """Return the machine over a side of the board.

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.servoing.controllers import PidController, PidGains
-from gpuvision.servoing.delay_response import settling_frames
+from gpuvision.servoing.controllers import PidController, SmithPredictor
 from gpuvision.servoing.guard import LoopLimits, Outcome
 from gpuvision.servoing.loop import Clock, LoopRecord, Plant, PoseSensor, ServoLoop
-from gpuvision.servoing.observer import LatestPose, PoseMeasurement
+from gpuvision.servoing.observer import LatestPose, MotionModel, PoseMeasurement, PoseObserver
 from gpuvision.servoing.placement.machine import Machine
+from gpuvision.servoing.settling import VibrationSettling
 
 Float64 = npt.NDArray[np.float64]
 
@@ -27,28 +27,73 @@ REMAINDER = 0.2
 """Rest of the step response at the release as a fraction of the tolerance (chosen: a twenty-fifth of its variance)."""
 
 
-class ReleaseRule:
-    """Settling rule: release the part when the predicted number of frames has passed and the error is within tolerance.
+# Standard deviation of the pose before the first measurement, relative to the landing zone (chosen): the first measured
+# pose then counts alone, by 1 part in 1e6 or better.
+_PRIOR = 10.0
 
-    The first measured error and the gain of the loop give the number of frames after which the rest of the step
-    response is `REMAINDER` of the tolerance; from then on the first measured error within the tolerance releases. If an
-    axis has a lag, all new errors of a latency and a lag must be within the tolerance.
+PoseEstimator = LatestPose | SmithPredictor | PoseObserver
+
+
+def make_observer(machine: Machine, target: npt.ArrayLike, start: float) -> PoseEstimator:
+    """Return the observer of a machine, ready for the first measured pose.
 
     Parameters
     ----------
     machine : Machine
-        Delay, lag, gain and tolerance.
-    observer : LatestPose
+        Machine; `Control.observer` is the kind of the observer.
+    target : array_like
+        (3,): expected pose of the nozzle.
+    start : float
+        Time of the start of the loop [s].
+    """
+    zone = machine.tolerance
+    prior = np.diag(_PRIOR * np.array([zone.landing_zone, zone.landing_zone, zone.landing_angle])) ** 2
+    if machine.control.motion_sigma is not None:
+        x, y, theta = (each**2 * machine.rate for each in machine.control.motion_sigma)
+        lags = (machine.axes[0].lag, machine.axes[1].lag, machine.axes[2].lag)
+        history = 256 + 4 * math.ceil(machine.response_frames)
+        kalman = PoseObserver(MotionModel(lag=lags, position_noise=(x, y, theta)), history=history)
+        kalman.reset(start - machine.delay.latency - machine.period, target, prior)
+        return kalman
+    if machine.control.observer == "smith":
+        delay = machine.response_frames
+        observer = SmithPredictor(delay * machine.period, history=256 + math.ceil(delay))
+        observer.reset(-math.inf, target, prior)
+        return observer
+    latest = LatestPose()
+    latest.reset(-math.inf, target, prior)
+    return latest
+
+
+class ReleaseRule:
+    """Settling rule: release the part by the predicted number of frames, by the residual vibration, or after a time.
+
+    The rule "response" takes the first measured error and the step response of the loop, which give the number of
+    frames after which the rest of the error is `REMAINDER` of the tolerance; from then on the first measured error
+    within the tolerance releases. If an axis has a lag, all new errors of a latency and a lag must be within the
+    tolerance. The rule "vibration" hands the errors from then on to `VibrationSettling`. The rule "fixed" waits for a
+    fixed time from the first measured pose; see `Settling`.
+
+    Parameters
+    ----------
+    machine : Machine
+        Delay, lag, gains, tolerance and rule.
+    observer : LatestPose, SmithPredictor or PoseObserver
         Observer of the loop. An error releases only if its pose is new: not while poses are missing or refused.
+
+    Raises
+    ------
+    ValueError
+        The rule is "vibration", and the frequencies of the vibration are not known.
 
     Notes
     -----
     Implements `gpuvision.servoing.loop.SettlingRule`. A start near the target waits for fewer frames. The rule waits
-    for the predicted number of frames, so that agreement with this number is no check of the prediction. A placement
-    that takes many more frames shows that the machine settles more slowly than predicted.
+    for the predicted number of frames, so that agreement with this number is no check of the prediction:
+    `settled_frames` of the true error against `predicted_settling` is one.
     """
 
-    def __init__(self, machine: Machine, observer: LatestPose) -> None:
+    def __init__(self, machine: Machine, observer: PoseEstimator) -> None:
         self._machine, self._observer = machine, observer
         self._within = math.ceil(machine.response_frames) + 1 if machine.lag else 1
         self._row, self._exposed = 0, -math.inf
@@ -57,32 +102,83 @@ class ReleaseRule:
         self.frames = 0
         """Number of frames from the first measured pose to the release by theory."""
         self._first = math.inf
+        self._vibration = _vibration_rule(machine) if machine.settling.rule == "vibration" else None
 
     def __call__(self, time: float, error: Float64, covariance: Float64) -> bool:
         """Return whether to release the part at an error (3,) with a covariance (3, 3)."""
-        if self.start is None:
-            if not np.all(np.isfinite(covariance)):
-                return False  # no pose was measured yet
-            self.start, self._first = error.copy(), time
-            self.frames = predicted_frames(self._machine, error)
         if self._observer.exposed == self._exposed:
-            return False  # no new pose
+            return False  # no pose was measured yet, or no new pose
         self._exposed = self._observer.exposed
-        self._row = self._row + 1 if _share(self._machine, error) <= 1.0 else 0
-        waited = time - self._first >= (self.frames - 0.5) * self._machine.period
-        return waited and self._row >= self._within
+        machine = self._machine
+        if self.start is None:
+            self.start, self._first = error.copy(), time
+            self.frames = _frames_of_rule(machine, error)
+        self._row = self._row + 1 if error_share(machine, error) <= 1.0 else 0
+        if time - self._first < (self.frames - 0.5) * machine.period:
+            return False
+        if self._vibration is not None:
+            return self._vibration(time, error, covariance)
+        return machine.settling.rule == "fixed" or self._row >= self._within
+
+
+def _vibration_rule(machine: Machine) -> VibrationSettling:
+    settling, tolerance = machine.settling, machine.tolerance
+    if settling.frequency is None or settling.damping is None:
+        raise ValueError("settling.frequency and settling.damping are missing; find them by vibration_of_loop")
+    return VibrationSettling(
+        (tolerance.position, tolerance.position, tolerance.angle),
+        frequency=settling.frequency,
+        damping=settling.damping,
+        miss_probability=settling.miss_probability,
+        window=settling.window,
+        lead=settling.lead,
+        is_filtered=machine.control.observer == "kalman",
+    )
+
+
+def _frames_of_rule(machine: Machine, error: Float64) -> int:
+    """Return the least number of frames from the first measured error (3,) to the release."""
+    if machine.settling.wait is not None:
+        return math.ceil(machine.settling.wait * machine.rate - 1e-9)
+    return predicted_frames(machine, error)
 
 
 def predicted_frames(machine: Machine, error: npt.ArrayLike, fraction: float = REMAINDER) -> int:
     """Return the number of frames in which the loop reduces an error (3,) to a fraction of the tolerance, by theory."""
-    share = _share(machine, np.asarray(error, np.float64)) / fraction
-    return settling_frames(machine.response_frames, machine.loop_gain, 1.0 / share) if share > 1.0 else 0
+    share = error_share(machine, error) / fraction
+    return machine.frames_to(1.0 / share) if share > 1.0 else 0
 
 
-def _share(machine: Machine, error: Float64) -> float:
+def error_share(machine: Machine, error: npt.ArrayLike) -> float:
     """Return an error (3,) as a fraction of the tolerance: the larger one of distance and angle."""
-    x, y, theta = (float(each) for each in error)
+    x, y, theta = (float(each) for each in np.asarray(error))
     return max(math.hypot(x, y) / machine.tolerance.position, abs(theta) / machine.tolerance.angle)
+
+
+def settled_frames(motion: Float64, band: Float64) -> int | None:
+    """Return the frame from which on an error stays within a band.
+
+    Parameters
+    ----------
+    motion : numpy.ndarray
+        (frames, 3): error in each frame [m], [m], [rad], such as the true error of a simulation.
+    band : numpy.ndarray
+        (3,): largest errors [m], [m], [rad].
+
+    Returns
+    -------
+    int or None
+        Number of the frame from 0; None if the last error is larger.
+    """
+    outside = np.flatnonzero(np.any(np.abs(motion) > band, axis=1))
+    first = int(outside[-1]) + 1 if outside.size else 0
+    return first if first < len(motion) else None
+
+
+def predicted_settling(machine: Machine, start: Float64, band: Float64) -> int:
+    """Return the number of frames after which a start error (3,) stays within a band (3,), by theory."""
+    share = float(np.max(np.abs(start) / band))
+    return machine.frames_to(1.0 / share) if share > 1.0 else 0
 
 
 class Placement(NamedTuple):
@@ -99,7 +195,8 @@ class Placement(NamedTuple):
     start_error : numpy.ndarray
         (3,): first measured error [m], [m], [rad]; NaN if no pose was measured.
     predicted_frames : int
-        Frames from the first measured pose to the release by theory, and the frames of the coarse registration.
+        Least number of frames from the first measured pose to the release, and the frames of the coarse registration.
+        The step response gives it by theory, unless the rule is "fixed".
     """
 
     record: LoopRecord
@@ -147,17 +244,18 @@ def place_part(
     """
     x, y, theta = (axis.lag for axis in machine.axes)
     goal = np.asarray(target, np.float64)
-    observer = LatestPose()
-    observer.reset(-math.inf, goal, np.full((3, 3), math.inf))
+    observer = make_observer(machine, goal, clock.now())
     blind = landing + machine.delay.latency + machine.tolerance.max_refused * machine.period
     loop = ServoLoop(
         plant,
         sensor,
         observer,
-        PidController(PidGains(proportional=machine.loop_gain * machine.rate)),
+        PidController(machine.gains),
         clock,
         period=machine.period,
-        limits=LoopLimits(hold_after=blind, abort_after=blind, lag=(x, y, theta)),
+        limits=LoopLimits(
+            hold_after=blind, abort_after=blind, lag=(x, y, theta), watchdog=machine.control.watchdog * machine.period
+        ),
     )
     rule = ReleaseRule(machine, observer)
     record = loop.run(goal, machine.tolerance.max_time, settling=rule)

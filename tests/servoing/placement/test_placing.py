@@ -15,12 +15,13 @@ from gpuvision.servoing.frames import Transform
 from gpuvision.servoing.loop import SimulatedClock
 from gpuvision.servoing.observer import LatestPose, PoseMeasurement
 from gpuvision.servoing.placement.budget import noise_gain
+from gpuvision.servoing.placement.control import Control
 from gpuvision.servoing.placement.machine import Machine, PlacementCamera, ThermalDrift, Tolerance
 from gpuvision.servoing.placement.placing import REMAINDER, Placement, ReleaseRule, place_part, predicted_frames
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.servoing.simulated_sensor import Fault, SimulatedPoseSensor
 
-MACHINE = dataclasses.replace(read_machine("look_while_place"), gain=0.2)
+MACHINE = dataclasses.replace(read_machine("look_while_place"), control=Control(gain=0.2))
 TARGET = np.array([12e-3, 5e-3, 0.3])
 COVARIANCE = np.diag([0.2e-6, 0.2e-6, 1e-4]) ** 2
 
@@ -109,9 +110,9 @@ def test_predicted_frames_follow_the_worst_axis() -> None:
 def test_machines_that_cannot_work_are_refused() -> None:
     camera = MACHINE.camera
     with pytest.raises(ValueError, match=r"gain is 1.5, expected above 0 and below .* limit of stability"):
-        dataclasses.replace(MACHINE, gain=1.5)
+        dataclasses.replace(MACHINE, control=Control(gain=1.5))
     with pytest.raises(ValueError, match=r"gain is 1e-09, expected 0\.0001 or more"):
-        dataclasses.replace(MACHINE, gain=1e-9)
+        dataclasses.replace(MACHINE, control=Control(gain=1e-9))
     with pytest.raises(ValueError, match="more than 1/rate"):
         dataclasses.replace(MACHINE, rate=20_000.0)
     with pytest.raises(ValueError, match="expected a rigid transform from pipette to camera"):
@@ -129,7 +130,7 @@ def test_machines_that_cannot_work_are_refused() -> None:
 
 @pytest.mark.parametrize("lag", [0.3e-3, 1e-3, 3e-3, 10e-3])
 def test_an_axis_with_a_lag_rests_within_the_tolerance_after_the_release(lag: float) -> None:
-    machine = dataclasses.replace(MACHINE, axes=(Axis(lag=lag),) * 3, gain=None)
+    machine = dataclasses.replace(MACHINE, axes=(Axis(lag=lag),) * 3, control=Control())
     plant = SimulatedPlant(machine.axes, start=TARGET + np.array([80e-6, 0.0, 0.0]))
     sensor = SimulatedPoseSensor(
         plant.pose, period=machine.period, delay=machine.delay.latency, covariance=COVARIANCE, is_noisy=False
@@ -147,11 +148,11 @@ def test_an_axis_with_a_lag_rests_within_the_tolerance_after_the_release(lag: fl
 @pytest.mark.parametrize("lag", [0.2e-3, 1e-3, 5e-3])
 @pytest.mark.parametrize("transfer", [0.0, 1.7e-3])
 def test_the_largest_gain_is_stable_with_a_lag(lag: float, transfer: float) -> None:
-    slow = dataclasses.replace(MACHINE, axes=(Axis(lag=lag),) * 3, transfer=transfer, gain=None)
+    slow = dataclasses.replace(MACHINE, axes=(Axis(lag=lag),) * 3, transfer=transfer, control=Control())
     with pytest.raises(ValueError, match="limit of stability") as refused:
-        dataclasses.replace(slow, gain=10.0)
+        dataclasses.replace(slow, control=Control(gain=10.0))
     limit = float(str(refused.value).split("below ")[1].split(",")[0])
-    machine = dataclasses.replace(slow, gain=0.98 * limit)
+    machine = dataclasses.replace(slow, control=Control(gain=0.98 * limit))
     error = velocity = 0.0
     # Recursion of the axis in fine steps of the frame, apart from the code of the plant.
     steps, errors = 200, []
@@ -174,7 +175,7 @@ def test_the_delay_is_that_of_the_sensor() -> None:
         described = {"rows": 256, "columns": 256, "pitch": 1e-5, "quantum_efficiency": 0.5, "gain": 0.1}
         sensor = CmosSensor(**described, dark_noise=10.0, full_well=2e4, bits=10, readout=readout, **pixel)
         camera = dataclasses.replace(MACHINE.camera, sensor=sensor, window=(128, 128), exposure=0.2e-3)
-        machine = dataclasses.replace(MACHINE, camera=camera, rate=1000.0, transfer=0.0, stages={}, gain=None)
+        machine = dataclasses.replace(MACHINE, camera=camera, rate=1000.0, transfer=0.0, stages={}, control=Control())
         if not readout.buffers:
             assert machine.delay.latency == pytest.approx(sensor.timing((128, 128), 0.2e-3).delay, rel=1e-12)
         return machine.delay.latency

@@ -333,7 +333,7 @@ class _Cell:
     def identify(self, start: Float64) -> None:
         """Find the vibration of the steered head in a move from a start error (3,), and take it for the rule."""
         machine = self.machine
-        slowest = min(axis.resonance for axis in machine.axes if axis.resonance)
+        slowest = min((axis.resonance for axis in machine.axes if axis.resonance), default=math.inf)
         response = predicted_frames(machine, start) * machine.period
         wait = response + _IDENTIFICATION * 2.0 * math.pi / slowest
         longest = replace(machine.tolerance, max_time=machine.tolerance.max_time + wait + machine.landing)
@@ -343,8 +343,8 @@ class _Cell:
             raise ValueError(f"the vibration of the head cannot be identified: {placement.reason}")
         since = min(each.arrived for each in placement.measurements) + response
         found = vibration_of_loop(placement.record, since)
-        frequency, damping = (tuple(map(float, each)) for each in found)
-        settling = replace(machine.settling, frequency=frequency, damping=damping)
+        (fx, fy, ft), (dx, dy, dt) = (each.tolist() for each in found)
+        settling = replace(machine.settling, frequency=(fx, fy, ft), damping=(dx, dy, dt))
         self.machine = replace(machine, settling=settling)
 
     def _steer(

@@ -14,6 +14,7 @@ import tomli_w
 
 from gpuvision.formats.machine_file import MACHINES, read_machine
 from gpuvision.schema import DescriptionError, Section
+from gpuvision.servoing.placement.control import Control, Settling
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "machine_files.md"
 PRESET = tomllib.loads(
@@ -59,9 +60,29 @@ def test_all_keys_of_an_axis_are_read(tmp_path: Path) -> None:
     assert (machine.rate, machine.loop_gain) == (800.0, 0.1)
 
 
+def test_all_keys_of_loop_and_settling_are_read(tmp_path: Path) -> None:
+    loop = {"rate": 900.0, "observer": "kalman", "controller": "pid", "gain": 0.3, "integral": 0.02}
+    more = {"derivative": 1e-3, "motion_sigma": [1e-8, 2e-8, 1e-6], "watchdog": 2.5}
+    rule = {"rule": "vibration", "frequency": [80.0, 0.0, 0.0], "damping": [0.03, 0.02, 0.02]}
+    rule |= {"miss_probability": 0.01, "window": 30, "lead": 2e-3}
+    axes = {"x": {"resonance": 90.0, "swing": 2e-5}}
+    machine = read_machine(_written(tmp_path, PRESET | {"loop": loop | more, "settling": rule, "axes": axes}))
+    del loop["rate"]
+    assert machine.control == Control(**(loop | more | {"motion_sigma": (1e-8, 2e-8, 1e-6)}))
+    assert (machine.settling.rule, machine.settling.frequency) == ("vibration", (80.0, 0.0, 0.0))
+    assert (machine.settling.miss_probability, machine.settling.window, machine.settling.lead) == (0.01, 30, 2e-3)
+    assert machine.swing == (2e-5, 0.0, 0.0)
+    assert read_machine("look_while_place").control.watchdog == 1.5
+    fixed = read_machine(_written(tmp_path, PRESET | {"settling": {"rule": "fixed", "wait": 0.05}}))
+    assert fixed.settling == Settling(rule="fixed", wait=0.05)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"loop": {"rate": 1000.0, "observer": "kalmann"}}, "kalman"),
+        ({"loop": {"rate": 1000.0, "observer": "kalman"}}, "loop: motion_sigma belongs to the observer"),
+        ({"settling": {"rule": "fixed"}}, "settling: wait belongs to the rule"),
         ({"loop": {"rte": 1000.0}}, "the key 'loop.rate' is missing"),
         ({"loop": {"rate": 1000.0, "gian": 0.1}}, "did you mean 'loop.gain'"),
         ({"loop": {"rate": 1000.0, "gain": 1.9}}, "limit of stability"),

@@ -12,7 +12,7 @@ from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.controllers import PidController, PidGains
 from gpuvision.servoing.guard import Outcome
 from gpuvision.servoing.loop import LoopRecord, ServoLoop, SimulatedClock
-from gpuvision.servoing.observer import MotionModel, PoseMeasurement, PoseObserver
+from gpuvision.servoing.observer import MotionModel, PoseMeasurement, PoseObserver, Verdict
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.servoing.settling import VibrationSettling, fit_vibration, vibration_of_loop
 from gpuvision.servoing.simulated_sensor import SimulatedPoseSensor
@@ -167,6 +167,19 @@ def test_vibration_of_a_loop_is_that_of_its_payload() -> None:
     assert abs(found.frequency[0] / 90.0 - 1.0) > 0.05
     assert found.frequency[1:].tolist() == [0.0, 0.0]
     assert found.damping[1:].tolist() == [0.02, 0.02]
+
+
+def test_the_rest_of_the_step_response_is_no_vibration() -> None:
+    """An error that decays without a swing, with little noise: a fit of the largest damping follows it."""
+    times, rng = PERIOD * np.arange(100), np.random.default_rng(2)
+    errors = 5e-6 * np.exp(-times / 0.02)[:, None] * [1.0, 0.0, 0.0] + 5e-8 * rng.standard_normal((100, 3))
+    covariance = 1e-14 * np.eye(3)
+    seen = tuple(
+        (PoseMeasurement(time, time, -error, covariance, 0), Verdict.ACCEPTED)
+        for time, error in zip(times.tolist(), errors, strict=True)
+    )
+    record = swinging_loop()[0]._replace(target=np.zeros((1, 3)), measurements=seen)
+    assert vibration_of_loop(record, 0.0).frequency.tolist() == [0.0, 0.0, 0.0]
 
 
 def test_rule_from_a_loop_settles_as_soon_as_the_swing_allows() -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -24,14 +25,16 @@ from gpuvision.matching.features.feature_set import edge_clearance
 from gpuvision.matching.pose.motion import rotation
 from gpuvision.servoing.frames import Transform, compose_poses, invert_pose, move_covariance
 from gpuvision.servoing.loop import SimulatedClock
+from gpuvision.servoing.margins import margins
 from gpuvision.servoing.placement.budget import predict_budget
+from gpuvision.servoing.placement.control import Control, Settling
 from gpuvision.servoing.placement.machine import Machine, ThermalDrift
 from gpuvision.servoing.placement.placing import place_part
 from gpuvision.servoing.placement.plan import placement_imaging, plan_placement
 from gpuvision.servoing.placement.vision import BoardPoseSensor, Frame, SimulatedCamera
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
-from gpuvision.workflows.placing import simulate_placements
+from gpuvision.workflows.placing import PlacementResult, simulate_placements
 
 PRESET = tomllib.loads(
     resources.files("gpuvision").joinpath("presets", "machines", "look_while_place.toml").read_text(encoding="utf-8")
@@ -97,12 +100,70 @@ def test_parts_land_where_and_when_the_prediction_says(artwork: Artwork, machine
     # What calibration and drift do not explain is vision and servo, much less than the start errors of up to 90 um.
     assert np.all(np.abs(result.sources["vision and servo"][:, :2]) < 2e-6)
     assert max(np.abs(motion[0, :2]).max() for motion in result.motion) > 50e-6
+    # The true error settles when theory says; the release rule has no part in this count.
+    counted = [each for each in result.settled if each is not None]
+    assert len(counted) == 6
+    assert np.all(np.abs(np.subtract(counted, result.predicted_settling)) <= 2)
+    assert abs(np.mean(counted) - np.mean(result.predicted_settling)) <= 0.7
+    assert np.all(result.reach < 0.5)
     report = result.report()
+    assert [each["settled_frames"] for each in report["placements"]] == counted
+    assert (report["observer"], report["controller"], report["settling"]) == ("latest", "p", "response")
+    assert report["tolerated_plant_gain"] == pytest.approx(
+        margins(machine.gains, machine.delay.latency, machine.period).gain
+    )
+    assert f"true error settled in {np.mean(counted):.1f} frames" in result.summary()
     assert report["delay_frames"] == machine.delay.frames
     assert sum(report["parts_s"].values()) == pytest.approx(report["total_delay_s"])
     assert list(report["measured_rms"]["total"].values()) == pytest.approx(np.sqrt(np.mean(result.error**2, axis=0)))
     assert len(report["placements"]) == 6
     assert "6 of 6 parts placed" in result.summary()
+
+
+@pytest.mark.parametrize("observer", ["smith", pytest.param("kalman", marks=pytest.mark.slow)])
+def test_a_predictor_places_in_two_frames_with_the_same_error(
+    artwork: Artwork, machine: Machine, device: Device, observer: Literal["smith", "kalman"]
+) -> None:
+    """With the gain 1 the first measured pose moves the head to the target; calibration and drift limit the error."""
+    motion = (30e-9, 30e-9, 3e-6) if observer == "kalman" else None
+    predicting = dataclasses.replace(machine, control=Control(observer=observer, motion_sigma=motion))
+    result = simulate_placements(artwork, TARGET, predicting, count=6, device=device)
+    assert [each.frames for each in result.placements] == [2] * 6
+    assert result.settled == result.predicted_settling == [1] * 6
+    assert np.all(np.abs(result.error) <= 5.0 * result.simulated_sigmas)
+    plain = predict_budget(machine, plan_placement(artwork, TARGET, machine))
+    assert np.all(result.simulated_sigmas <= 1.15 * plain.sigmas["total"])
+
+
+@pytest.mark.slow
+def test_waiting_by_vibration_saves_30_percent_of_a_fixed_wait(
+    artwork: Artwork, machine: Machine, device: Device
+) -> None:
+    """Parts with tolerances of 5 and 20 um; the simulation finds the vibration of the steered head by itself."""
+    x = dataclasses.replace(machine.axes[0], resonance=2.0 * np.pi * 150.0, damping=0.03)
+    swinging = dataclasses.replace(
+        machine, axes=(x, *machine.axes[1:]), swing=(50e-6, 0.0, 0.0), control=Control(gain=0.07)
+    )
+
+    def placed(tolerance: float, rule: Settling) -> PlacementResult:
+        limits = dataclasses.replace(machine.tolerance, position=tolerance)
+        return simulate_placements(
+            artwork,
+            TARGET,
+            dataclasses.replace(swinging, settling=rule, tolerance=limits),
+            count=6,
+            device=device,
+        )
+
+    waits = []
+    for tolerance in (5e-6, 20e-6):
+        result = placed(tolerance, Settling(rule="vibration"))
+        assert result.machine.settling.frequency is not None
+        assert result.machine.settling.frequency[0] == pytest.approx(145.0, rel=0.02)
+        assert np.all(result.reach <= 1.0)
+        waits += [each.record.time[-1] for each in result.placements]
+    fixed = placed(5e-6, Settling(rule="fixed", wait=float(np.mean(waits)) / 0.7))
+    assert np.count_nonzero(fixed.reach > 1.0) >= 1
 
 
 def test_narrow_pads_are_landed_by_registration_and_tracked_by_short_rulers(tmp_path: Path, device: Device) -> None:

@@ -183,7 +183,7 @@ def predict_budget(machine: Machine, plan: PlacementPlan, frames: npt.ArrayLike 
     the measured poses, which the loop follows: it averages the noise from frame to frame (`noise_covariance`), but not
     the differences between the pixels, which are the same in all frames of a head at rest. "servo" is the rest of the
     step response that `ReleaseRule` allows, evenly distributed, and the step of the encoder. With the rule "vibration"
-    an axis that swings adds a swing of the tolerance at a random phase, the largest one that the rule allows. With the
+    an axis that swings adds a swing at a random phase, with the largest amplitude that the rule allows. With the
     rule "fixed" the rest is that of start errors in the landing zone after the fixed time; a vibration is not included.
     """
     turn, tolerance = plan.camera_to_board, machine.tolerance
@@ -211,4 +211,4 @@ def _servo_variance(machine: Machine) -> Float64:
         left = machine.error_after(math.ceil(settling.wait * machine.rate) + 1)[-1]
         return np.asarray((left * zone) ** 2 / 3.0)
     swings = np.array(settling.frequency or (0.0, 0.0, 0.0)) > 0.0
-    return np.asarray((REMAINDER * limit) ** 2 / 3.0 + np.where(swings, 0.5 * limit**2, 0.0))
+    return np.asarray((REMAINDER * limit) ** 2 / 3.0 + np.where(swings, limit**2 * [0.25, 0.25, 0.5], 0.0))

@@ -125,8 +125,10 @@ def _vibration_rule(machine: Machine) -> VibrationSettling:
     settling, tolerance = machine.settling, machine.tolerance
     if settling.frequency is None or settling.damping is None:
         raise ValueError("settling.frequency and settling.damping are missing; find them by vibration_of_loop")
+    # Where x and y swing, both at this limit are at the largest distance.
+    side = tolerance.position / math.sqrt(2.0 if min(settling.frequency[:2]) > 0.0 else 1.0)
     return VibrationSettling(
-        (tolerance.position, tolerance.position, tolerance.angle),
+        (side, side, tolerance.angle),
         frequency=settling.frequency,
         damping=settling.damping,
         miss_probability=settling.miss_probability,

@@ -286,7 +286,7 @@ def _run(
     if other is not None:
         with progress_bar(f"{description}, second sensor") as progress:
             done.append(run(other, out, progress=progress, **made))
-        pair = SensorPair.fuse(*done, SensorFusion(rule=rule.value))
+        pair = SensorPair.fuse(done[0], done[1], SensorFusion(rule=rule.value))
         pair.write(out, inputs=inputs, overwrite=overwrite)
         summary += f"\n{pair.summary()}"
         scale = pair.picture_scale

@@ -3,7 +3,7 @@
 The sheet of light and the sensor move together along the transport; methods take the transport L of a profile. The
 image of a point is found in two steps. The ray from the lens through the point meets the sheet of light at (G, H). The
 triangulation gives the position of the image of (G, H) on the sensor. This holds for every pinhole sensor, tilted or
-not, because the sheet and the sensor are planes.
+not, because the sheet and the sensor are planes. Of a bent sheet the mean plane is meant, as in the triangulation.
 """
 
 from __future__ import annotations
@@ -111,8 +111,6 @@ class SensorView:
     limits: ViewLimits = ViewLimits()
 
     def __post_init__(self) -> None:
-        if self.transport.bend is not None:
-            raise ValueError("SensorView.transport has a bent sheet; a simulation takes a flat one")
         object.__setattr__(self, "lens", numbers(self.lens, (3,), "SensorView.lens"))
         object.__setattr__(self, "u_edges", _edges(self.u_edges, "SensorView.u_edges"))
         object.__setattr__(self, "v_edges", _edges(self.v_edges, "SensorView.v_edges"))

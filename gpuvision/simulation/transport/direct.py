@@ -187,6 +187,8 @@ class DirectLight:
         check_materials(self.scene, self.materials)
         if self.sheet.transport != self.view.transport:
             raise ValueError("DirectLight: sheet and view have different transports, expected the same one")
+        if self.sheet.transport.bend is not None and any(each.mirror > 0.0 for each in self.materials):
+            raise ValueError("a mirror in a bent sheet of light is not simulated: give a flat sheet, or no mirror")
         object.__setattr__(self, "_slabs", read_sub_sheets(self.sub_sheets if self.sheet.sigma > 0.0 else 1))
         object.__setattr__(self, "_projector", LineProjector(self.view))
         reflection = SurfaceReflection(view=self.view, scene=self.scene, materials=self.materials, sheet=self.sheet)

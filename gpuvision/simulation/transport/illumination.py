@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.envelope import Pieces, upper_envelope
-from gpuvision.simulation.transport.sheet_cut import Cuts, SheetIndex, concatenated_ranges
+from gpuvision.simulation.transport.sheet_cut import Cuts, SheetIndex, bend_of, concatenated_ranges
 from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
@@ -101,7 +101,7 @@ class LitLine(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class LightSheet:
-    """Sheet of light in the plane of a `StraightTransport`. The light travels against the transport's ``h_axis``.
+    """Sheet of light of a `StraightTransport`, flat or bent. The light travels against the transport's ``h_axis``.
 
     Parameters
     ----------
@@ -128,6 +128,12 @@ class LightSheet:
     ------
     TypeError, ValueError
         A parameter has a wrong type or lies outside its range.
+
+    Notes
+    -----
+    In a bent sheet (``transport.bend``) light travels along the lines of constant G of the sheet, or from the source along
+    straight lines in (G, H). Lit points lie on their surface and within `sheet_cut.BEND_ERROR` (50 nm) of the sheet. The
+    direction of the light on a surface is that of the mean plane, which is wrong by the slope of the bend.
 
     References
     ----------
@@ -206,6 +212,8 @@ class LightSheet:
         sheet_ends, arriving, lit = self._split_evenly(lit, cuts, x, height)
         sheet, triangle = cuts.sheet[lit.segment], cuts.triangle[lit.segment]
         ends = self._to_scene(sheet_ends, transports[sheet])
+        if self.transport.bend is not None:
+            ends = _on_planes(ends, scene.corners[triangle])
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
         good = (length > 0.0) & (arriving > 0.0)
         sheet, triangle, ends = sheet[good], triangle[good], ends[good]
@@ -342,19 +350,37 @@ class LightSheet:
 
     def _to_scene(self, ends: Float64, transports: Float64) -> Float64:
         move = self.transport
-        flat = np.array(move.origin) + ends @ np.array([move.g_axis, move.h_axis])
-        return np.asarray(flat + transports[:, None, None] * np.array(move.direction))
+        points = np.array(move.origin) + ends @ np.array([move.g_axis, move.h_axis])
+        if move.bend is not None:
+            distance = bend_of(move.bend, ends[..., 0], ends[..., 1])
+            points = points + distance[..., None] * np.cross(move.g_axis, move.h_axis)
+        return np.asarray(points + transports[:, None, None] * np.array(move.direction))
 
     def _normals(self, scene: Scene, triangle: Integers, ends: Float64) -> Float64:
         """Return unit normals on the side of the light."""
-        corners = scene.corners[triangle]
-        one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        # One edge is scaled to 1, so that the cross product of very short edges does not underflow.
-        normal = np.cross(one, two / np.abs(two).max(axis=1, keepdims=True))
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = _unit_normals(scene.corners[triangle])
         towards = self.direction_to_light(0.5 * (ends[:, 0] + ends[:, 1]))
         side = np.sum(normal * towards, axis=1, keepdims=True)
         return np.where(side < 0.0, -normal, normal)
+
+
+def _unit_normals(corners: Float64) -> Float64:
+    """Return unit normals (n, 3) of triangles (n, 3, 3)."""
+    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    # One edge is scaled to 1, so that the cross product of very short edges does not underflow.
+    normal = np.cross(one, two / np.abs(two).max(axis=1, keepdims=True))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.asarray(normal)
+
+
+def _on_planes(ends: Float64, corners: Float64) -> Float64:
+    """Return the feet of the perpendiculars from points (n, 2, 3) to the planes of triangles (n, 3, 3).
+
+    The lit points of a bent sheet lie up to `BEND_ERROR` beside their triangle, which would occlude them.
+    """
+    normal = _unit_normals(corners)[:, None]
+    beside = np.sum((ends - corners[:, :1]) * normal, axis=-1, keepdims=True)
+    return np.asarray(ends - beside * normal)
 
 
 def _clip_below(cuts: Cuts, highest: float) -> Cuts:

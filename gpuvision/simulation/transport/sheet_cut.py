@@ -2,6 +2,9 @@
 
 A point of the scene is ``origin + G g_axis + H h_axis + L direction``. In these coordinates the sheet at a transport L
 is the plane of constant L, and a cut through a triangle is a segment in (G, H).
+
+A bent sheet is flat in other coordinates: ``origin + G g_axis + H h_axis + d(G, H) normal + L direction``. In these
+coordinates a triangle is curved; it is divided until a flat one deviates from it by less than `BEND_ERROR`.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet import BentSheet
 from gpuvision.simulation.scene.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
@@ -31,6 +35,15 @@ _MAX_EDGE_SLOPE = 1e-9
 # Cosine of the angle between two triangles below which their common edge is sharp. Chosen: 0.2 rad is more than between
 # the facets of a finely meshed curved surface. Only places where the integral over the sheet is divided depend on it.
 _MIN_SMOOTH_COSINE = math.cos(0.2)
+BEND_ERROR = 5e-8
+"""Largest distance of the simulated light of a bent sheet from the sheet [m]. Chosen: far below the noise of a reading."""
+# A quadratic surface with a second derivative c deviates from a triangle through three of its points, with edges of at
+# most s, by up to c s^2 / 6 (the triangle fits into a circle of radius s / sqrt(3)), and a curve in it from a chord by up
+# to c s^2 / 8; both together have this factor.
+_DEVIATION = 1.0 / 6.0 + 1.0 / 8.0
+# Fixed-point steps for the coordinates of a bent sheet; the error of the start value is multiplied each time by the
+# slope of the sheet, below 0.1, times the direction of its normal.
+_BEND_STEPS = 16
 _INDEX_CACHE: WeakKeyDictionary[Scene, dict[tuple[object, ...], SheetIndex]] = WeakKeyDictionary()
 
 
@@ -57,7 +70,8 @@ class SheetIndex:
     """Triangles of a scene in the transport's coordinates, sorted so that a sheet's cuts are found quickly.
 
     A triangle with a corner in the sheet is cut as if the sheet were just before the corner. A triangle that lies in
-    the sheet is not cut. Instances are compared by identity.
+    the sheet is not cut. Instances are compared by identity. For a bent sheet the triangles are parts of those of the
+    scene.
 
     Attributes
     ----------
@@ -86,7 +100,7 @@ class SheetIndex:
     def of(cls, scene: Scene, transport: StraightTransport) -> SheetIndex:
         """Return the index of a scene for a transport. It is built at the first use and kept as long as the scene."""
         mine = _INDEX_CACHE.setdefault(scene, {})
-        key = (transport.origin, transport.g_axis, transport.h_axis, transport.direction)
+        key = (transport.origin, transport.g_axis, transport.h_axis, transport.direction, transport.bend)
         if key not in mine:
             mine[key] = cls._build(scene, transport)
         return mine[key]
@@ -95,11 +109,12 @@ class SheetIndex:
     def _build(cls, scene: Scene, transport: StraightTransport) -> SheetIndex:
         good = np.ones(len(scene.corners), bool)
         good[[*scene.defects.not_finite, *scene.defects.degenerate]] = False
-        axes = np.linalg.inv(np.array([transport.g_axis, transport.h_axis, transport.direction]))
-        x, y, z = np.moveaxis(np.where(good[:, None, None], scene.corners, 0.0) - transport.origin, -1, 0)
-        # Not a matrix product: its rounding can depend on the position in the array, and shared corners must stay
-        # equal.
-        corners = np.stack([x * a + y * b + z * c for a, b, c in axes.T], axis=-1)
+        triangle, corners = np.arange(len(good)), np.where(good[:, None, None], scene.corners, 0.0)
+        if transport.bend is not None:
+            longest_edge = math.sqrt(BEND_ERROR / (_DEVIATION * max(_curvature(transport.bend), 1e-300)))
+            corners, triangle = _divided_triangles(corners, longest_edge)
+            good = good[triangle]
+        corners = _sheet_coordinates(corners, transport)
         start, end = corners[..., 2].min(axis=1), corners[..., 2].max(axis=1)
         length = end - start
         chosen = np.flatnonzero(good & (length > 0.0))
@@ -110,8 +125,8 @@ class SheetIndex:
         bounds = np.searchsorted(level, np.arange(_MAX_LEVELS + 1))
         longest_of = [float(length[chosen[a:b]].max(initial=0.0)) for a, b in itertools.pairwise(bounds)]
         assert scene.material is not None  # set by Scene itself
-        material = scene.material[chosen]
-        return cls(chosen, corners[chosen], start[chosen], bounds, np.array(longest_of), material)
+        material = scene.material[triangle[chosen]]
+        return cls(triangle[chosen], corners[chosen], start[chosen], bounds, np.array(longest_of), material)
 
     @functools.cached_property
     def parallel_edges(self) -> tuple[Float64, Float64]:
@@ -192,6 +207,58 @@ class SheetIndex:
         begin, count = np.array(first).T.ravel(), (np.array(last) - np.array(first)).T.ravel()
         sheet = np.repeat(np.arange(len(transports)), _MAX_LEVELS)
         return concatenated_ranges(begin, count), np.repeat(sheet, count)
+
+
+def bend_of(sheet: BentSheet, G: Float64, H: Float64) -> Float64:
+    """Return the distance of a bent sheet from its mean plane at (G, H) [m], along the normal ``g_axis x h_axis``."""
+    gg, gh, hh = sheet.terms
+    return np.asarray(gg * G * G + gh * G * H + hh * H * H)
+
+
+def _curvature(sheet: BentSheet) -> float:
+    """Return the largest second derivative of the sheet's surface [1/m]."""
+    gg, gh, hh = sheet.terms
+    return abs(gg + hh) + math.hypot(gg - hh, gh)
+
+
+def _divided_triangles(corners: Float64, longest_edge: float) -> tuple[Float64, Integers]:
+    """Divide triangles (n, 3, 3) until no edge is longer; return the parts and the index of each part's triangle.
+
+    The longest edge of a triangle is halved each time. Whether an edge is halved depends on its ends alone, so that the
+    parts of two triangles meet at bit-equal points of a common edge.
+    """
+    number = np.arange(len(corners))
+    done, of = [], []
+    while len(corners):
+        edges = np.roll(corners, -1, axis=1) - corners
+        length = np.sqrt(edges[..., 0] ** 2 + edges[..., 1] ** 2 + edges[..., 2] ** 2)
+        short = ~(length > longest_edge).any(axis=1)
+        done.append(corners[short])
+        of.append(number[short])
+        corners, number, first = corners[~short], number[~short], np.argmax(length[~short], axis=1)
+        each = np.arange(len(corners))
+        a, b, c = (corners[each, (first + n) % 3] for n in range(3))
+        middle = 0.5 * (a + b)
+        corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        number = np.concatenate([number, number])
+    return np.concatenate([*done, corners]), np.concatenate([*of, number])
+
+
+def _sheet_coordinates(points: Float64, transport: StraightTransport) -> Float64:
+    """Return the coordinates (G, H, L) of points (..., 3) of the scene, in which the sheet is a plane of constant L."""
+    axes = np.linalg.inv(np.array([transport.g_axis, transport.h_axis, transport.direction]))
+    x, y, z = np.moveaxis(points - transport.origin, -1, 0)
+    # Not a matrix product: its rounding can depend on the position in the array, and shared corners must stay equal.
+    G, H, L = (x * a + y * b + z * c for a, b, c in axes.T)
+    if transport.bend is not None:
+        # The normal has components along all three axes: G and H of the sheet follow by a fixed point.
+        normal = np.cross(transport.g_axis, transport.h_axis) @ axes
+        flat = G, H
+        for _ in range(_BEND_STEPS):
+            distance = bend_of(transport.bend, G, H)
+            G, H = flat[0] - normal[0] * distance, flat[1] - normal[1] * distance
+        L = L - normal[2] * bend_of(transport.bend, G, H)
+    return np.stack([G, H, L], axis=-1)
 
 
 def concatenated_ranges(begin: Integers, count: Integers) -> Integers:

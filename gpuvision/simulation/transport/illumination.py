@@ -131,9 +131,9 @@ class LightSheet:
 
     Notes
     -----
-    In a bent sheet (``transport.bend``) light travels along the lines of constant G of the sheet, or from the source along
-    straight lines in (G, H). Lit points lie on their surface and within `sheet_cut.BEND_ERROR` (50 nm) of the sheet. The
-    direction of the light on a surface is that of the mean plane, which is wrong by the slope of the bend.
+    In a bent sheet (``transport.bend``) light travels along the lines of constant G of the sheet, or from the source
+    along straight lines in (G, H). Lit points lie on their surface and within `sheet_cut.BEND_ERROR` (50 nm) of the
+    sheet. The direction of the light on a surface is that of the mean plane, which is wrong by the slope of the bend.
 
     References
     ----------

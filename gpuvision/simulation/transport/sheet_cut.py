@@ -36,10 +36,10 @@ _MAX_EDGE_SLOPE = 1e-9
 # the facets of a finely meshed curved surface. Only places where the integral over the sheet is divided depend on it.
 _MIN_SMOOTH_COSINE = math.cos(0.2)
 BEND_ERROR = 5e-8
-"""Largest distance of the simulated light of a bent sheet from the sheet [m]. Chosen: far below the noise of a reading."""
+"""Largest distance of the simulated light of a bent sheet from the sheet [m]. Chosen: far below noise."""
 # A quadratic surface with a second derivative c deviates from a triangle through three of its points, with edges of at
-# most s, by up to c s^2 / 6 (the triangle fits into a circle of radius s / sqrt(3)), and a curve in it from a chord by up
-# to c s^2 / 8; both together have this factor.
+# most s, by up to c s^2 / 6 (the triangle fits into a circle of radius s / sqrt(3)), and a curve in it from a chord by
+# up to c s^2 / 8; both together have this factor.
 _DEVIATION = 1.0 / 6.0 + 1.0 / 8.0
 # Fixed-point steps for the coordinates of a bent sheet; the error of the start value is multiplied each time by the
 # slope of the sheet, below 0.1, times the direction of its normal.

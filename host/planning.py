@@ -205,7 +205,7 @@ def plan_stream(
     inline : bool, optional
         Whether kernels run in the stream's thread instead of the worker threads of the device. Default: inline where
         this keeps up, a batch takes at most ``limits.max_inline_seconds``, and the processor time per frame is at most
-        ``limits.max_inline_cost`` times that of the worker threads; inline, too, where only this keeps up.
+        ``limits.max_inline_cost`` times the time of the worker threads; inline, too, where only this keeps up.
     device, zero_copy
         As for `Pipeline`.
     batches : sequence of int

@@ -5,7 +5,7 @@ mean of 8 sub-poses. All candidates sample the same map, which holds the blur an
 
 Numba does the same work: bilinear samples, a normal number by Philox2x32-10 and the method of Box and Muller, rounding.
 OpenCV resamples with ``warpAffine`` (its coordinates are rounded to 1/32 node), draws the noise with ``randn`` (a
-stateful generator without a counter) and rounds with ``convertTo``. The error is that of a noise-free reflectance.
+stateful generator without a counter) and rounds with ``convertTo``. The error refers to a noise-free reflectance.
 """
 
 from __future__ import annotations

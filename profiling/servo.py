@@ -202,7 +202,7 @@ class _Loop:
         )
 
     def run(self, rate: float, seconds: float, *, settling: int = 0) -> LoopTimes:
-        """Run at a rate [1/s] for some seconds and return the times, without those of the first settling frames."""
+        """Run at a rate [1/s] for some seconds and return the times, without the times of the first settling frames."""
         camera = self.camera
         # A random walk with the largest step of a frame, 3 um and 0.3 mrad: missed frames do not spoil the prediction.
         model = MotionModel(lag=(0.0, 0.0, 0.0), position_noise=(9e-12 * rate, 9e-12 * rate, 9e-8 * rate))

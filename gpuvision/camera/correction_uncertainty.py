@@ -73,8 +73,8 @@ def correction_covariance(fit: LensFit | CameraFit, points: npt.ArrayLike, measu
 
     Notes
     -----
-    The covariance of the parameters is that of the fit, with its error model. It does not contain an error of the model
-    where no point was measured.
+    The covariance of the parameters is the result of the fit, with its error model. It does not contain an error of the
+    model where no point was measured.
     """
     places = np.asarray(points, dtype=np.float64)
     model = fit.lens if isinstance(fit, LensFit) else fit.camera

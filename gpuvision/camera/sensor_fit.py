@@ -16,7 +16,7 @@ from gpuvision.validation import finite
 
 _QUANTISATION = 1.0 / 12.0  # variance of rounding to whole grey levels
 _PART_OF_RANGE = 0.7  # of the grey levels to saturation, for the fits: EMVA 1288, release 4.0, section 6.6
-_SIGNIFICANT = 4.0  # standard deviations by which the variance falls beyond saturation
+_SIGNIFICANT = 4.0  # least fall of the variance beyond saturation [standard deviations]
 
 
 class Estimate(NamedTuple):
@@ -54,7 +54,7 @@ class SensorFit:
     saturation : float
         Electrons at which the temporal variance is largest; infinite if it does not fall in the frames.
     mean, variance : (steps,)
-        Mean grey level and temporal variance of the flat frames, less those of their dark frames.
+        Mean grey level and temporal variance of the flat frames, minus mean and variance of their dark frames.
     used : (steps,) bool
         Steps of the fits: up to 0.7 of the saturation.
     reduced_chi_square : float
@@ -327,7 +327,7 @@ def _reduced_chi_square(left: Float64, weights: Float64, parameters: int) -> flo
 
 
 def _root(squared: float, variance: float, pixels: float) -> Estimate:
-    """Return the root of a spatial variance: its own error, and that of a finite number of pixels.
+    """Return the root of a spatial variance, with the errors of the variance and of a finite number of pixels.
 
     Where the variance is not above its error, the value has the error of the root at the error.
     """

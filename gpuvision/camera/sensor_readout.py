@@ -25,7 +25,7 @@ class FrameTiming(NamedTuple):
     period
         Least time from frame to frame.
     skew
-        Time from the exposure of the first row to that of the last row; 0 with a global shutter or a flash.
+        Time from the exposure of the first row to the exposure of the last row; 0 with a global shutter or a flash.
     delay
         Time from the middle of the exposure, averaged over the rows, to the last pixel of the frame in the computer, at
         the highest frame rate. At a lower rate each frame buffer adds the period of that rate.

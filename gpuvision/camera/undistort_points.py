@@ -62,7 +62,7 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
     matrix : 3 x 3, optional
         Camera matrix of the ideal pixels, for a `Camera`. Default: the matrix of ``model``.
     precision : {"single", "double"}, optional
-        Precision of the arithmetic and the outputs. Default: that of the input.
+        Precision of the arithmetic and the outputs. Default: the precision of the input.
     variant : {"auto", "vector", "work_item"}
         Kernel variant: 16-wide vectors for CPU runtimes, a work-item per point for GPUs, or by the device (default).
 

@@ -55,7 +55,7 @@ Stages = Annotated[
 ]
 Jitter = Annotated[
     str | None,
-    typer.Option(metavar="TIME", help="Standard deviation of the delay. Default: that of the recording, or 0."),
+    typer.Option(metavar="TIME", help="Standard deviation of the delay. Default: the jitter of the recording, or 0."),
 ]
 Recording = Annotated[
     Path | None,

@@ -136,7 +136,7 @@ def scan(
     out: Results,
     device: DeviceLabel = None,
     precision: Annotated[
-        Precision | None, typer.Option(help="Floating-point precision. Default: that of the recording.")
+        Precision | None, typer.Option(help="Floating-point precision. Default: the precision of the recording.")
     ] = None,
     rate: Rate = None,
     policy: RoomPolicy = None,

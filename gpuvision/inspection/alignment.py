@@ -180,7 +180,7 @@ def _correlate(
     initial: BoardPlacement,
     search_range: tuple[float, float],
 ) -> tuple[BoardPlacement, float, float]:
-    """Return the place with the best correlation, this correlation, and that of the second best place."""
+    """Return the place with the best correlation, its correlation, and the correlation of the second best place."""
     shift, turn = search_range
     reach = max(float(np.max(np.abs(np.concatenate([each.bounds for each in apertures]) - middle))), grid.cell_x)
     step = max(grid.cell_x, grid.cell_y) / reach

@@ -274,5 +274,5 @@ def _noise(parts: Sequence[tuple[Float64, npt.NDArray[np.bool_], slice, slice]])
     values = np.concatenate(found) if found else np.empty(0)
     if not values.size:
         return math.nan
-    # The variance of a third difference is (1 + 9 + 9 + 1) times that of a height; the median ignores edges.
+    # The variance of a third difference is (1 + 9 + 9 + 1) times the variance of a height; the median ignores edges.
     return MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values)))) / math.sqrt(20)

@@ -40,7 +40,7 @@ class DepositSums(NamedTuple):
     height_mean, height_mean_sigma
         Mean height of the cells above the threshold [m]; NaN without such a cell.
     offset, offset_sigma : (n, 2)
-        Centroid of the volume less that of the aperture [m], in the coordinates of the board.
+        Centroid of the volume minus centroid of the aperture [m], in the coordinates of the board.
     valid
         Fraction of the cells with a height; always known.
     status : uint8
@@ -98,7 +98,7 @@ class MeasureDeposits(VisionOperation[DepositSums]):
 
     Notes
     -----
-    Formulas and error model are those of `gpuvision.inspection.paste.measure_deposits`. Single precision: heights are
+    Formulas and error model: `gpuvision.inspection.paste.measure_deposits`. Single precision: heights are
     rounded to 6e-8 of their distance from 0 (0.1 nm at 2 mm), sums to about 1e-6. A cell whose height is within the
     rounding of the threshold may count or not.
 

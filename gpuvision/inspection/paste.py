@@ -114,7 +114,7 @@ class Deposits(NamedTuple):
     height_max, height_max_sigma
         Height of the highest patch [m].
     offset : (n, 2)
-        Centroid of the volume less that of the aperture [m], in the coordinates of the board's files.
+        Centroid of the volume minus centroid of the aperture [m], in the coordinates of the board's files.
     offset_sigma : (n, 2)
         Standard deviations of the offset [m].
     valid

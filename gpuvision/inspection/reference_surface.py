@@ -78,7 +78,7 @@ def fit_reference(x: Float64, y: Float64, z: Float64, order: int) -> ReferenceSu
     Notes
     -----
     Up to about a third of the cells may lie on another level (a trace, a component, smeared paste). The covariance is
-    that of an M-estimator (Huber, *Robust Statistics*, 1981, section 7.6): it holds for independent residuals.
+    the one of an M-estimator (Huber, *Robust Statistics*, 1981, section 7.6): it holds for independent residuals.
     """
     if not len(x):
         return None

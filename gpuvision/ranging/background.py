@@ -77,8 +77,8 @@ class ImageSubtracted(_Subtracted):
     Notes
     -----
     A pixel darker than the background becomes 0. A saturated pixel keeps its value, so that the readout flags it; where
-    the background is saturated too, the pixel becomes 0. The noise of the background adds to that of the frame: the
-    standard deviation of a pixel is ``sqrt(frame variance + background variance)``.
+    the background is saturated too, the pixel becomes 0. The noise of the background adds to the noise of the frame:
+    the standard deviation of a pixel is ``sqrt(frame variance + background variance)``.
     """
 
     def __init__(self, source: Source, background: HostArray, *, saturation: float | None = None) -> None:
@@ -108,7 +108,8 @@ class PreviousSubtracted(_Subtracted):
     Notes
     -----
     The first frame has no previous frame: it becomes 0. Where the line overlaps its previous place the position is
-    biased. The standard deviation of a pixel is ``sqrt(2)`` times that of a frame.
+    biased. The standard deviation of a pixel is ``sqrt(2)`` times its standard
+    deviation in a frame.
     """
 
     def __init__(self, source: Source, *, saturation: float | None = None) -> None:
@@ -152,7 +153,8 @@ class PairsSubtracted(_Subtracted):
     Notes
     -----
     Two frames become one, so that ``length`` and ``rate`` are halved. The standard deviation of a pixel is ``sqrt(2)``
-    times that of a frame. A part that moves between the two frames of a pair leaves edges of its texture.
+    times its standard deviation in a frame. A part that moves between the two frames of a pair leaves edges of its
+    texture.
     """
 
     def __init__(self, source: Source, *, light_first: bool = True, saturation: float | None = None) -> None:

@@ -29,7 +29,7 @@ class EncoderStatistics:
         Mean, standard deviation and extremes of the distance from a profile to the next one, with the sign of the
         motion; NaN for one profile.
     jitter : float
-        Standard deviation of the error of a position, if the motion is smooth: that of the second differences,
+        Standard deviation of the error of a position, if the motion is smooth, from the second differences:
         ``sqrt(mean((p[k-1] - 2 p[k] + p[k+1])^2) / 6)``. A changing speed adds nothing in first order; the rounding to
         counts does. NaN for fewer than three profiles.
     """

@@ -156,8 +156,8 @@ class FocusStack:
         Image of the optical axis [px]; default: the middle of the frame.
     read_noise : float, optional
         Standard deviation of a pixel without quantisation [grey levels], above 0; requests the standard deviations of
-        the heights. Only with the measure ``"intensity"``: that of the Laplacian depends on the texture. Default: not
-        known.
+        the heights. Only with the measure ``"intensity"``: the noise of the Laplacian depends on the texture.
+        Default: not known.
 
     Raises
     ------

@@ -168,8 +168,8 @@ class StraightTransport:
         then be orthonormal. Default: a flat sheet.
     covariance : (3, 3) array_like, optional
         Covariance of the displacement in the scene per metre of transport, symmetric: along ``direction`` the squared
-        relative error of the step, across it that of the direction [rad^2]. Part of the predicted systematic errors,
-        which are 0 at L = 0. Default: not known.
+        relative error of the step, across it the variance of the direction [rad^2]. Part of the predicted systematic
+        errors, which are 0 at L = 0. Default: not known.
 
     Raises
     ------

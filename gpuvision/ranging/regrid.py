@@ -181,9 +181,9 @@ class Regrid:
     Notes
     -----
     Error: linear interpolation of a surface with curvature k between samples at a distance d has an error of at most
-    k d^2 / 8. ``sigma`` is that of the interpolation of samples with independent errors of z: between two samples it is
-    below that of a sample. Errors of x and y, which move the height on a slope, are not part of it. In single precision
-    the place of a cell has an error of 6e-8 of its distance from the origin.
+    k d^2 / 8. ``sigma`` holds for the interpolation of samples with independent errors of z: between two samples it is
+    below the sigma of a sample. Errors of x and y, which move the height on a slope, are not part of it. In single
+    precision the place of a cell has an error of 6e-8 of its distance from the origin.
     """
 
     grid: Grid

@@ -2,7 +2,7 @@
 
 The points lie in the sheet of light and are known in the frame of the fixture. Their image points give the pose of this
 frame (`gpuvision.camera.views.pose_response.fit_pose`), and the plane of the points is the sheet. The error of the
-sheet is that of the pose.
+sheet follows from the error of the pose.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """Delay of a servo loop, measured from commanded and measured positions of the loop's own data.
 
-The measured position y at the time t is that of the command c some time ago,
+The measured position y at the time t follows the command c with a delay,
 
     y = scale c(t - delay - jitter) + offset + noise,
 
 with a normal jitter that is independent from frame to frame. `measure_delay` starts from the correlation of the
-velocities and maximises the likelihood of all samples. Noise and jitter are told apart by the speed: jitter shows in
-motion, noise shows at rest, too. `excitation` makes motions with both.
+velocities and maximises the likelihood of all samples. The speed separates jitter from noise: jitter shows in motion
+only, noise shows at rest, too. `excitation` makes motions with both.
 
 References
 ----------

@@ -170,7 +170,7 @@ def normal_delays(mean: float, sigma: float) -> tuple[Float64, Float64]:
 
 
 def mean_square_growth(moments: JitterMoments, gain: float) -> float:
-    """Return the factor by which the mean square of the error changes from one frame to the next, after a long time.
+    """Return the ratio of the mean squares of the error in successive frames, after a long time.
 
     Below 1 the loop is mean-square stable. With x the vector of the last n positions and A its random matrix, the
     second moment follows E[x x'] -> E[A x x' A']; the factor is the spectral radius of this

@@ -50,7 +50,7 @@ class LoopLimits:
         Number of measurements in a row beyond the gate after which the loop gives up. Default 10 (chosen): a valid
         measurement is beyond the gate once in 1000.
     margin_sigmas : float
-        Number of standard deviations of a measured pose by which the travel may exceed the error of this pose.
+        Largest travel beyond the error of a measured pose [standard deviations of this pose].
         Default 3.
     lag : tuple of float
         Time constants with which the axes follow the commanded velocity [s]. The travel includes the motion that
@@ -99,7 +99,7 @@ class TravelGuard:
     Parameters
     ----------
     margin_sigmas : float
-        Number of standard deviations of the measured pose by which the motion may exceed the error.
+        Largest motion beyond the error of the measured pose [standard deviations of this pose].
     lag : array_like
         (3,) time constants with which the axes follow the commanded velocity [s]. Default 0.
 

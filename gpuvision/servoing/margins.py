@@ -142,7 +142,7 @@ def predictor_polynomial(gain: float, delay: float, model_delay: float, plant_ga
     delay, model_delay : float
         Delay of the plant and of the predictor [frames]; fractions are exact.
     plant_gain : float
-        Motion of the plant over that of the model. Default 1.
+        Motion of the plant over motion of the model. Default 1.
 
     Returns
     -------
@@ -164,10 +164,10 @@ class PredictorTolerance(NamedTuple):
     Attributes
     ----------
     shorter, longer : float
-        Delay of the plant below and above that of the model [frames]; ``shorter`` is the model's delay where every
+        Delay of the plant below and above the delay of the model [frames]; ``shorter`` is the model's delay where every
         shorter delay is stable.
     plant_gain : float
-        Largest motion of the plant over that of the model.
+        Largest motion of the plant over motion of the model.
     """
 
     shorter: float
@@ -224,23 +224,24 @@ def observer_matrix(
     lag : float
         Time constant of the velocity in the `MotionModel` of the observer [frames]. Default 0.
     noise_ratio : float
-        Standard deviation of the random motion of the model during a frame, over that of a measurement. Default 1.
+        Standard deviation of the random motion of the model during a frame, over the standard deviation of a
+        measurement. Default 1.
     plant_delay, plant_lag : float, optional
-        Delay and time constant of the plant [frames]. Default: those of the model.
+        Delay and time constant of the plant [frames]. Default: the values of the model.
     plant_gain : float
-        Motion of the plant over that of the model. Default 1.
+        Motion of the plant over motion of the model. Default 1.
 
     Returns
     -------
     numpy.ndarray
-        Square matrix that maps the state of a frame to that of the next frame: position and velocity of the plant and
-        of the observer at their times of the exposure, and the last commands, newest first. The loop is stable if all
-        eigenvalues lie within the unit circle.
+        Square matrix that maps the state of a frame to the state of the next frame: position and velocity of the plant
+        and of the observer at their times of the exposure, and the last commands, newest first. The loop is stable if
+        all eigenvalues lie within the unit circle.
 
     Notes
     -----
     `PoseObserver` has this response in its steady state: the constant gain of the correction follows from the discrete
-    algebraic Riccati equation. The prediction from the exposure to the command is that of the model.
+    algebraic Riccati equation. The model predicts from the exposure to the command.
     """
     model = MotionModel(lag=(lag,) * 3, position_noise=(finite(noise_ratio, "noise_ratio", above=0.0) ** 2,) * 3)
     plant = model if plant_lag is None else MotionModel(lag=(plant_lag,) * 3)
@@ -291,12 +292,12 @@ class ObserverTolerance(NamedTuple):
     Attributes
     ----------
     shorter, longer : float
-        Delay of the plant below and above that of the time stamps [frames]; ``shorter`` is the whole delay where every
-        shorter delay is stable, and 10 is the longest that is searched.
+        Delay of the plant below and above the delay of the time stamps [frames]; ``shorter`` is the whole delay where
+        every shorter delay is stable, and 10 is the longest that is searched.
     lag : float
-        Time constant of the plant above that of the model [frames]; at most 20 are searched.
+        Time constant of the plant above the time constant of the model [frames]; at most 20 are searched.
     plant_gain : float
-        Largest motion of the plant over that of the model; at most 10 is searched.
+        Largest motion of the plant over motion of the model; at most 10 is searched.
     """
 
     shorter: float

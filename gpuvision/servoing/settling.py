@@ -158,9 +158,9 @@ def vibration_of_loop(record: LoopRecord, since: float) -> ResidualVibration:
     -----
     `fit_vibration` fits each axis. An axis swings if an F test of the fit against a constant is significant at 0.001,
     divided by the number of independent frequencies (Bonferroni), and if its damping is below the largest one that the
-    fit looks for. The vibration is that of the steered head: a stop of
-    the loop ends the last command, which excites the free axis again. The rule sees the swing in the estimate of the
-    observer. A model without the resonance makes it smaller there, by 10 to 15 % at 83 Hz and 1 kHz in
+    fit looks for. The fit sees the vibration of the steered head: a stop of the loop ends the last command, which
+    excites the free axis again. The rule sees the swing in the estimate of the observer. A model without the resonance
+    makes it smaller there, by 10 to 15 % at 83 Hz and 1 kHz in
     ``tests/servoing/test_settling.py``: give the rule a smaller tolerance by this part.
     """
     taken = [each for each, verdict in record.measurements if verdict is Verdict.ACCEPTED and each.exposed >= since]
@@ -206,7 +206,7 @@ class VibrationSettling:
         Time from the decision to the contact of the part with the board [s]. Default 0.
     is_filtered : bool
         Whether the errors are estimates of a filter, such as `PoseObserver`, whose noise is correlated from one frame
-        to the next. False for independent measurements, such as those of `LatestPose` with a new pose in each frame.
+        to the next. False for independent measurements, such as from `LatestPose` with a new pose in each frame.
         Default True.
 
     Notes
@@ -216,7 +216,8 @@ class VibrationSettling:
     it once for each frame; it implements `gpuvision.servoing.loop.SettlingRule`.
 
     The correlation of filtered errors is not known to the rule. It then takes the largest standard deviation that any
-    correlation gives: the sum of those of the errors, each by the absolute value of its weight in the fit.
+    correlation gives: the sum of the standard deviations of the errors, each times the absolute value of its weight in
+    the fit.
     """
 
     def __init__(

@@ -176,7 +176,7 @@ class DelayAnalysis:
         }
 
     def _shorter(self, found: PredictorTolerance | ObserverTolerance) -> float | None:
-        """Return the time [s] by which a shorter delay makes the loop unstable; None if every shorter one is stable."""
+        """Return the least reduction of the delay [s] that makes the loop unstable; None if no reduction does."""
         return found.shorter * self.budget.period if found.shorter < self.frames else None
 
     def _predictor(self, gain: float) -> dict[str, float | None]:
@@ -258,9 +258,9 @@ def analyse_delay(
     budget : DelayBudget, optional
         Parts of the delay. Default: the recording alone.
     recording : LoopRecording, optional
-        Recording of an excited axis; its delay is measured and used instead of that of the budget.
+        Recording of an excited axis; its delay is measured and used instead of the delay of the budget.
     jitter : float, optional
-        Standard deviation of the delay [s]. Default: that of the recording, or 0.
+        Standard deviation of the delay [s]. Default: the jitter of the recording, or 0.
 
     Raises
     ------

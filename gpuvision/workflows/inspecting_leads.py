@@ -159,7 +159,7 @@ def inspect_leads(
     placement : BoardPlacement, optional
         Place of the regions in the height map. Default: they are in the coordinates of the height map.
     sigma : float, optional
-        Random standard deviation of all heights [m]. Default: that of the height map, or else estimated.
+        Random standard deviation of all heights [m]. Default: from the height map, or else estimated.
     correlation_area : float
         Number of cells whose noise is common, 1 or more. Default 1.
     centre : tuple of float, optional

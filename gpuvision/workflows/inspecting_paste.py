@@ -316,7 +316,7 @@ def inspect_paste(
     search_range : tuple of float
         Largest shift [m] and rotation [rad] of the search. Default 2 mm and 3 degrees.
     sigma : float, optional
-        Random standard deviation of all heights [m]. Default: that of the height map, or else estimated; see
+        Random standard deviation of all heights [m]. Default: from the height map, or else estimated; see
         `measure_deposits`.
     correlation_area : float, optional
         Number of cells whose noise is common. Default: estimated; see `measure_deposits`.

@@ -63,7 +63,7 @@ def scan(
     device : Device, optional
         Device of the computation; default `Device.best`.
     precision : {"single", "double"}, optional
-        Precision of the arithmetic; default: that of the recording.
+        Precision of the arithmetic; default: the precision of the recording.
     rate : float, optional
         Replay the recording at this rate [frames/s]; batch and ring size of the stream are planned for it. Default:
         read as fast as the device processes.
@@ -370,7 +370,7 @@ def resample_heights(
     max_cells : int
         Largest number of cells of the grid, default 2^26.
     sigma : numpy.ndarray, optional
-        Random standard deviation of z [m], (profiles, samples); requests that of the heights.
+        Random standard deviation of z [m], (profiles, samples); requests the standard deviation of the heights.
 
     Returns
     -------

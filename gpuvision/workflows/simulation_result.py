@@ -171,7 +171,7 @@ class Simulation:
         overwrite : bool
             Whether files may be replaced that no earlier simulation wrote. Default False.
         scale : PictureScale, optional
-            Scale of the pictures of errors and causes. Default: that of this simulation alone.
+            Scale of the pictures of errors and causes. Default: the scale for this simulation alone.
 
         Raises
         ------

@@ -6,7 +6,7 @@
 //     v = (y - origin_y) per_cell + grow (sin(theta) m dx - cos(theta) dy)       grow: pixel / cell; m: -1 mirrored
 //
 // The map already holds the blur of the lens and the area of a pixel, so that bilinear interpolation of four nodes is
-// the reflectance of the pixel; the mean over the sub-poses is that of the exposure. Then, with a sensor:
+// the reflectance of the pixel; the mean over the sub-poses is the reflectance over the exposure. Then, with a sensor:
 //
 //     e     = electrons (reflectance + glare) gain[pixel] + dark          [e-]
 //     n     = min(e + sqrt(e + dark_noise^2) z, full_well)                z: standard normal (normal_numbers.h)
@@ -72,7 +72,7 @@ static inline Placed placed(global const POSE *pose, constant POSE *placing, flo
 }
 
 #ifdef VECTOR_VARIANT
-// Two neighbouring nodes are loaded as one number; its address is that of a node.
+// Two neighbouring nodes are loaded as one number; it has the address of the first node.
 typedef uint pair_at __attribute__((aligned(2)));
 #define PAIR(lane) *(global const pair_at *)(map + at.lane)
 INLINE uints load_pairs(global const ushort *map, ints at) { return (uints)EACH(PAIR); }

@@ -35,7 +35,7 @@ class LensFitLimits:
     significance : float
         p-value below which an F test rejects the smaller model.
     max_rms_ratio : float
-        Ratio of the rms of an alternative to that of the chosen model, up to which the warnings treat it as equally
+        Ratio of the rms of an alternative to the rms of the chosen model, up to which the warnings treat it as equally
         good.
     max_centre_sigmas : float
         Distance of the centre of an equally good alternative [standard deviations] above which a warning names it.
@@ -81,7 +81,7 @@ class LensAlternative:
         vanishing points if both this one and the chosen one have them. If the residuals of the largest model are
         correlated, the further coefficients are tested against their covariance for correlated errors (Wald's test).
     aic : float
-        Akaike information criterion minus that of the chosen model; negative favours this one.
+        Akaike information criterion minus the criterion of the chosen model; negative favours this one.
     centre : (float, float) or None
         Column and row of the distortion centre [px]; None for "none".
     centre_distance_px : float

@@ -120,7 +120,7 @@ def fit_lens(
         need ``lines="vanishing"``, a model with k1 and the squared loss.
     error_model : {"auto", "independent"}
         "auto" (default): test the residuals for lack of fit, and include a smooth field in the covariance if they have
-        one. "independent": no test; the covariance is that of independent errors, which is too small for a lens that
+        one. "independent": no test; the covariance holds for independent errors. It is too small for a lens that
         the model does not describe. It takes a fifth of the time for 10 000 points.
     limits : LensFitLimits
         Thresholds of the model choice and of the warnings.

@@ -198,7 +198,7 @@ def covariances(
     `names` are the names of the camera parameters in OpenCV's order; the poses are in the lens' frame. The covariances
     are valid to first order; under a robust loss they are Huber's, for points of equal noise. Parameters that the data
     do not determine have a very large, finite variance. f is the virtual camera's focal length: the data can determine
-    it even if they do not determine tilt, centre and f'. With ``correlated`` the camera's covariance is that of
+    it even if they do not determine tilt, centre and f'. With ``correlated`` the covariance of the camera holds for
     correlated errors; the errors of the points within a view count as independent for the pose of the view.
     """
     system = linearise(views, free_parameters, state, loss, stiffness=True)

@@ -46,7 +46,7 @@ class CalibrationLimits:
     max_outside_share : float
         Largest share of points outside the image; a larger one indicates a wrong ``image_size``.
     sufficient_noise_ratio : float
-        Ratio of the residual to that of free homographies, up to which no other start is tried.
+        Ratio of the residual to the residual of free homographies, up to which no other start is tried.
     lack_of_fit_significance : float
         p-value of the smooth field, or of the test between views, below which the residuals count as correlated.
         Chosen: with two tests, one of 500 calibrations with independent errors.

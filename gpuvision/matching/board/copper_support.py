@@ -79,7 +79,7 @@ def find_other_pose(
 
     Notes
     -----
-    The heading is that of the found pose. Each drawing is fitted to the image by its contrast, and to first order by a
+    The heading of the found pose is kept. Each drawing is fitted to the image by its contrast, and to first order by a
     shift, a rotation and an etch bias. The preference is the sum over tiles of 16 x 16 px of the difference of the
     squared residuals, divided by the root of the sum of its squares.
     """

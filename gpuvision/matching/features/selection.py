@@ -142,7 +142,7 @@ class TwoRowUpdate(NamedTuple):
     one, two, mixed : (n,)
         Diagonal and off-diagonal element of ``I + w R C R'``, with R the two rows.
     determinant : (n,)
-        Determinant of ``I + w R C R'``: the factor by which the determinant of the covariance shrinks.
+        Determinant of ``I + w R C R'``: determinant of the covariance before, over the one after the feature is added.
     """
 
     first: Float64

@@ -60,8 +60,8 @@ class BoardPose(NamedTuple):
         Measured position of the placement point [m].
     covariance : float, (..., f, f)
         Covariance of the placement point's x, y [m], of theta [rad], and of the free deformation parameters. Without a
-        given ``scale`` it is that of the sigmas times ``residual_scale`` squared: 0 for exact rows, and that of the
-        sigmas alone where ``residual_scale`` is NaN.
+        given ``scale`` it is the covariance for the given sigmas times ``residual_scale`` squared: 0 for exact rows.
+        The factor is 1 where ``residual_scale`` is NaN.
     residuals : float, (..., rows)
         Residuals along the normal in the artwork's frame [m]; NaN for missing rows.
     weights : float, (..., rows)
@@ -173,7 +173,7 @@ def fitted_line_rows(normal: Any, point: Any, centre: Any, covariance: Any, angl
     centre, covariance : array_like, (..., 2) and (..., 2, 2)
         Results of the fit, in metres in the frame of the measurement.
     angle : array_like, (...,)
-        Angle of the fitted line minus that of the artwork's line [rad], small.
+        Angle of the fitted line minus angle of the artwork's line [rad], small.
 
     Returns
     -------

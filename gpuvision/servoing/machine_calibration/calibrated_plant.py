@@ -17,7 +17,7 @@ _TURN = np.array([[0.0, -1.0], [1.0, 0.0]])  # derivative of a rotation by its a
 class CalibratedPlant:
     """Plant that takes velocities of the camera over the board and moves the axes of a machine accordingly.
 
-    The poses that a camera measures, the observer, the controller and the guards then share one frame, that of the
+    The poses that a camera measures, the observer, the controller and the guards then share the frame of the
     board; the axes behind it may have wrong scales, a skew, and another direction.
 
     Parameters

@@ -119,9 +119,9 @@ def fit_motion_frame(commands: npt.ArrayLike, seen: npt.ArrayLike, covariance: n
 
     Notes
     -----
-    Without turns of the head the offset of the camera cannot be told from the place of the board: it is NaN and named
-    in ``unobservable``. The translation of ``transform`` then holds at ``head_angle`` alone; everything else does not
-    depend on the offset.
+    Without turns of the head the data do not separate the offset of the camera from the place of the board: it is NaN
+    and named in ``unobservable``. The translation of ``transform`` then holds at ``head_angle`` alone; everything else
+    does not depend on the offset.
     """
     given, poses = np.asarray(commands, np.float64), np.asarray(seen, np.float64)
     for name, values in (("commands", given), ("seen", poses)):

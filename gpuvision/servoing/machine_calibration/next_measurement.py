@@ -25,7 +25,7 @@ class NextMeasurement(NamedTuple):
     chosen : int
         Number of the candidate.
     volume_factor : numpy.ndarray
-        (n,): factor by which each candidate shrinks the volume of the confidence ellipsoid of all parameters, at
+        (n,): volume of the confidence ellipsoid of all parameters before, over the volume after each candidate, at
         least 1. The factor of ``chosen`` is the largest.
     covariance : numpy.ndarray
         (p, p): predicted covariance of the parameters after the measurement of ``chosen``.

@@ -230,7 +230,7 @@ def place_part(
     target : array_like
         (3,): pose of the nozzle on the board at the release, x, y [m], theta [rad].
     plant : Plant
-        Axes of the machine, or their simulation. Their frame is that of the board.
+        Axes of the machine, or their simulation. They move in the frame of the board.
     sensor : PoseSensor
         Poses of the nozzle on the board, such as `BoardPoseSensor`.
     clock : Clock

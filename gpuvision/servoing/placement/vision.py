@@ -148,8 +148,8 @@ class BoardPoseSensor:
     -----
     The rulers of a frame are placed at the pose of the last frame that was measured, at first at the target. A plan
     with a ``landing`` registers the first frame instead: frames that arrive within `Machine.landing` after it are not
-    measured, and a refused registration is repeated. The covariance of a measurement is that of the vision; the error
-    of the calibration is common to all frames.
+    measured, and a refused registration is repeated. The covariance of a measurement contains the error of the vision
+    alone; the error of the calibration is common to all frames.
     """
 
     def __init__(

@@ -38,8 +38,8 @@ class MirrorLimits:
     crease
         Angle between neighbouring triangles above which their edge is sharp [rad], of `smooth_normals`; chosen.
     min_height
-        Least height of the lens above a mirror's plane, and of a point relative to that of the lens; in parts of the
-        lens' distance. Lower ones count as in the plane; derived: some thousand roundings of double.
+        Least height of the lens above a mirror's plane, and of a point relative to the height of the lens; in parts of
+        the lens' distance. Lower ones count as in the plane; derived: some thousand roundings of double.
     """
 
     flat_angle: float = 1e-6

@@ -7,14 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
-from gpuvision.host.files import atomic_write
 from gpuvision.host.outputs import Outputs
+from gpuvision.plots.figure import new_figure, write_png
 from gpuvision.profiling.harness import Row
 
-_SIZE, _DPI = (8.0, 3.6), 150
+_SIZE = (8.0, 3.6)  # [in]
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _GROWTH = re.compile(r"^growth/(?:(\w+)-)?x(\d+)$")
 
@@ -49,15 +46,13 @@ def draw_plots(folder: str | Path, rows: Sequence[Row], *, overwrite: bool = Fal
 
 def _draw(path: Path, draw: Callable[[Any, Sequence[Row]], None], rows: Sequence[Row]) -> None:
     devices = list(dict.fromkeys(row.device for row in rows))
-    figure = Figure(figsize=_SIZE, dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(*_SIZE)
     for axes, device in zip(figure.subplots(1, len(devices), squeeze=False, sharey=True)[0], devices, strict=True):
         axes.set_title(device, fontsize=9, loc="left")
         draw(axes, [row for row in rows if row.device == device])
         axes.grid(which="both", alpha=0.2)
         axes.legend(fontsize=6.5, frameon=False)
-    with atomic_write(path) as file:
-        figure.savefig(file, format="png")
+    write_png(figure, path)
 
 
 def _growth(axes: Any, rows: Sequence[Row]) -> None:

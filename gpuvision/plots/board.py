@@ -7,23 +7,20 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from matplotlib.path import Path as Outline
 
 from gpuvision.camera.orthographic import BoardView
-from gpuvision.host.files import atomic_write
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.artwork.shapes import Shape, area, capsule
 from gpuvision.matching.board.located_board import LocatedBoard
 from gpuvision.matching.features.feature_set import FeatureSet
+from gpuvision.plots.figure import new_figure, write_png
 
 Float64 = npt.NDArray[np.float64]
 
-_DPI = 150
 _LAMINATE, _COPPER, _OPEN, _SILK, _HOLE = "#1f3d2b", "#4f8a5b", "#d9b75f", "#f4f4f0", "#111111"
 # The colours also differ in lightness, for colour-blind readers.
 _USED, _REJECTED, _MISSING, _ARTWORK = "#00e5ff", "#ff9f1c", "#ff3366", "#ffe14d"
@@ -67,7 +64,8 @@ def draw_features(
     border = 0.04 * (window[1] - window[0]).max()
     window = window + border * np.array([[-1.0], [1.0]])
     wide, high = window[1] - window[0]
-    figure, axes = _page((9.0, min(max(9.0 * high / wide, 3.0), 12.0) + 0.9))
+    figure = new_figure(9.0, min(max(9.0 * high / wide, 3.0), 12.0) + 0.9)
+    axes = figure.add_subplot()
     draw_artwork(axes, artwork, window)
     axes.add_patch(Polygon(_MM * corners, fill=False, edgecolor="white", linestyle="--"))
     ends = features.normal * features.length[:, None] / 2
@@ -89,7 +87,7 @@ def draw_features(
         axes.plot(*(_MM * np.asarray(target, np.float64)), marker="x", color=_MISSING, markersize=12, markeredgewidth=2)
         handles.append(Line2D([], [], color=_MISSING, marker="x", linestyle="", label="target"))
     figure.legend(handles=handles, loc="outside lower left", ncols=4, fontsize=8, frameon=False)
-    _write(figure, path, overwrite)
+    write_png(figure, path, overwrite=overwrite)
 
 
 def _image_corners(view: BoardView) -> Float64:
@@ -148,7 +146,8 @@ def draw_located_board(
         Whether an existing file may be replaced. Default False.
     """
     rows, columns = located.view.shape
-    figure, axes = _page((10.0, min(max(10.0 * rows / columns, 3.0), 14.0) + 0.8))
+    figure = new_figure(10.0, min(max(10.0 * rows / columns, 3.0), 14.0) + 0.8)
+    axes = figure.add_subplot()
     _show(axes, image)
     _draw_outlines(axes, artwork, located.view)
     rulers, view = located.rulers, located.view
@@ -173,7 +172,7 @@ def draw_located_board(
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="column [px]", ylabel="row [px]")
     axes.set_title(located.summary(), fontsize=8, loc="left")
     figure.legend(handles=handles, loc="outside lower left", ncols=4, fontsize=8, frameon=False)
-    _write(figure, path, overwrite)
+    write_png(figure, path, overwrite=overwrite)
 
 
 def _draw_fiducials(axes: Any, located: LocatedBoard) -> list[Line2D]:
@@ -230,14 +229,3 @@ def _show(axes: Any, image: npt.NDArray[Any]) -> None:
     grey = grey if grey.ndim == 2 else grey.mean(axis=2)
     low, high = np.nanpercentile(grey, [0.5, 99.5])
     axes.imshow(grey, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="nearest")
-
-
-def _page(size: tuple[float, float]) -> tuple[Figure, Any]:
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.add_subplot()
-
-
-def _write(figure: Figure, path: str | Path, overwrite: bool) -> None:
-    with atomic_write(path, overwrite=overwrite) as file:
-        figure.savefig(file, format="png")

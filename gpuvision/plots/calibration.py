@@ -7,14 +7,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 
 from gpuvision.camera.calibration import Calibration
-from gpuvision.host.files import atomic_write
+from gpuvision.plots.figure import new_figure, write_png
 
-_DPI = 150
 # Length of the arrow of a 98th percentile residual, as a fraction of the image's width.
 _ARROW_LENGTH = 0.02
 # Distortion arrows along an image side.
@@ -37,8 +34,7 @@ def draw_calibration(path: str | Path, calibration: Calibration, *, overwrite: b
     overwrite : bool
         Whether an existing file may be replaced. Default False.
     """
-    figure = Figure(figsize=(19.0, 5.6), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(19.0, 5.6)
     panels = figure.subplots(1, 3)
     _draw_residuals(panels[0], calibration)
     _draw_distortion(panels[1], calibration)
@@ -48,8 +44,7 @@ def draw_calibration(path: str | Path, calibration: Calibration, *, overwrite: b
         axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), aspect="equal")
         axes.set(xlabel="column [px]", ylabel="row [px]")
     figure.suptitle(calibration.summary(), fontsize=9, x=0.01, ha="left")
-    with atomic_write(path, overwrite=overwrite) as file:
-        figure.savefig(file, format="png")
+    write_png(figure, path, overwrite=overwrite)
 
 
 def _draw_residuals(axes: Axes, calibration: Calibration) -> None:

@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from gpuvision.host.files import atomic_write
 from gpuvision.matching.field.distance_map import Field
 from gpuvision.matching.field.located_robot import LocatedRobot
 from gpuvision.matching.field.robot_filter import RobotState
+from gpuvision.plots.figure import new_figure, write_png
 from gpuvision.status import Status
 
 Float64 = npt.NDArray[np.float64]
@@ -45,14 +43,12 @@ def draw_located_robot(
     overwrite : bool
         Whether an existing file may be replaced. Default False.
     """
-    figure = Figure(figsize=(13.0, 5.8), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(13.0, 5.8, dpi=_DPI)
     left, right = figure.subplots(1, 2)
     _draw_view(left, located, image)
     _draw_field(right, located)
     figure.suptitle(located.summary(), fontsize=8, x=0.01, ha="left")
-    with atomic_write(path, overwrite=overwrite) as file:
-        figure.savefig(file, format="png")
+    write_png(figure, path, overwrite=overwrite)
 
 
 def draw_robot_track(path: str | Path, field: Field, states: Sequence[RobotState], *, overwrite: bool = False) -> None:
@@ -69,8 +65,7 @@ def draw_robot_track(path: str | Path, field: Field, states: Sequence[RobotState
     overwrite : bool
         Whether an existing file may be replaced. Default False.
     """
-    figure = Figure(figsize=(9.0, 6.5), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9.0, 6.5, dpi=_DPI)
     axes = figure.subplots()
     axes.set_facecolor(_CARPET)
     axes.add_collection(LineCollection(field_lines(field), colors=_LINE, linewidths=1.5))
@@ -92,8 +87,7 @@ def draw_robot_track(path: str | Path, field: Field, states: Sequence[RobotState
     )
     axes.set_title("track of the robot, 3 sigma ellipses at every tenth frame and at the last", fontsize=9, loc="left")
     axes.legend(loc="lower left", fontsize=7)
-    with atomic_write(path, overwrite=overwrite) as file:
-        figure.savefig(file, format="png")
+    write_png(figure, path, overwrite=overwrite)
 
 
 def _draw_view(axes: Axes, located: LocatedRobot, image: npt.NDArray[Any] | None) -> None:

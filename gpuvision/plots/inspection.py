@@ -8,17 +8,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 
-from gpuvision.host.files import atomic_write
 from gpuvision.inspection.apertures import Aperture
+from gpuvision.plots.figure import new_figure, write_png
 from gpuvision.plots.range_image import height_span, length_unit
 from gpuvision.ranging.regrid import Grid
 
-_DPI = 150
 _MM = 1e3
 _MOST_PIXELS = 2000  # along a side of the drawn height map; larger maps are thinned out
 _MOST_NAMES = 60  # regions with a name in the picture
@@ -65,8 +62,7 @@ def draw_regions(
         Whether an existing file may be replaced. Default False.
     """
     wide, high = grid.columns * grid.cell_x, grid.rows * grid.cell_y
-    figure = Figure(figsize=(10.0, min(max(8.5 * high / wide, 3.0), 14.0) + 0.8), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(10.0, min(max(8.5 * high / wide, 3.0), 14.0) + 0.8)
     axes = figure.add_subplot()
     step = max(-(-max(grid.shape) // _MOST_PIXELS), 1)
     low, top = height_span(np.asarray(z, np.float64))
@@ -95,5 +91,4 @@ def draw_regions(
     unit, name = length_unit(max(abs(low), abs(top)))
     axes.set(xlabel="x [mm]", ylabel="y [mm]", xlim=edges[:2], ylim=edges[2:], aspect="equal")
     axes.set_title(f"{title}\ngrey: heights {low / unit:.3g} to {top / unit:.3g} {name}", fontsize=8, loc="left")
-    with atomic_write(path, overwrite=overwrite) as file:
-        figure.savefig(file, format="png")
+    write_png(figure, path, overwrite=overwrite)

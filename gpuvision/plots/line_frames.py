@@ -11,11 +11,9 @@ from typing import Any, Literal
 import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from gpuvision.host.files import atomic_write
+from gpuvision.plots.figure import new_figure, write_png
 from gpuvision.status import Status
 
 Array = npt.NDArray[Any]
@@ -89,8 +87,7 @@ def draw_line_frames(
     across = min(max(round(math.sqrt(_WIDTH_TO_HEIGHT * len(frames) * rows / columns)), 1), len(frames))
     down = math.ceil(len(frames) / across)
     height = max(_PAGE_INCHES / across * rows / columns, 0.3) + _TITLE_INCHES
-    figure = Figure(figsize=(_PAGE_INCHES, down * height + 1.0), layout="constrained", dpi=_DPI)
-    FigureCanvasAgg(figure)
+    figure = new_figure(_PAGE_INCHES, down * height + 1.0, dpi=_DPI)
     figure.suptitle(title)
     low, high = _grey_scale(frames)
     for number, frame in enumerate(frames):
@@ -105,8 +102,7 @@ def draw_line_frames(
     marks = [(colour, meaning) for _, colour, meaning in _MARKS[::-1]] + [(_LOST, "no line: mark at the border")]
     handles = [Line2D([], [], color=colour, marker="o", linestyle="", label=meaning) for colour, meaning in marks]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8)
-    with atomic_write(path, overwrite=overwrite) as file:
-        figure.savefig(file, format="png")
+    write_png(figure, path, overwrite=overwrite)
 
 
 def _grey_scale(frames: Sequence[LineFrame]) -> tuple[float, float]:

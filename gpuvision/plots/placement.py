@@ -9,11 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from gpuvision.host.files import atomic_write
+from gpuvision.plots.figure import new_figure, write_png
 
 Float64 = npt.NDArray[np.float64]
 
@@ -50,16 +48,14 @@ def draw_placements(
     tolerance : (float, float)
         Tolerances of position [m] and angle [rad].
     """
-    figure = Figure(figsize=(15.0, 9.2), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(15.0, 9.2, dpi=_DPI)
     panels = figure.subplot_mosaic([["motion x, y", "error x, y", "delay"], ["motion theta", "error theta", "delay"]])
     for quantity, limit in zip((_POSITION, _ANGLE), tolerance, strict=True):
         coordinates = ", ".join(quantity.names)
         _draw_motion(panels[f"motion {coordinates}"], period, motion, limit, quantity)
         _draw_errors(panels[f"error {coordinates}"], error, sigmas, quantity)
     _draw_delay(panels["delay"], delay)
-    with atomic_write(path) as file:
-        figure.savefig(file, format="png")
+    write_png(figure, path)
 
 
 class _Quantity(NamedTuple):

@@ -16,14 +16,12 @@ import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colorbar import ColorbarBase
 from matplotlib.colors import ListedColormap, Normalize, to_rgb
-from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from gpuvision.host import to_numpy
-from gpuvision.host.files import atomic_write
+from gpuvision.plots.figure import DPI, new_figure, write_png
 from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.status import Status
 
@@ -33,7 +31,6 @@ Array = npt.NDArray[Any]
 _STYLES = ("colour", "shaded")
 # Viridis without its darkest 14 %, where the shading is not visible.
 _COLOURS = ListedColormap(mpl.colormaps["viridis"](np.linspace(0.14, 1.0, 256)))
-_DPI = 150
 _PICTURE_PX = 1100  # longer side of the map
 _INK, _PAPER, _FAINT = "#22262b", "#ffffff", "#6b7280"
 # Unit vector (right, up, out of the picture) towards the lamp: from the upper left, 50 degrees above the plane.
@@ -247,7 +244,7 @@ def draw_height_map(
     width, height = grid.columns * grid.cell_x, grid.rows * grid.cell_y
     page = _Page(picture, width / height, legend, title, subtitle, span if style == "colour" else None)
     page.length_bar(width)
-    page.write(path, overwrite)
+    write_png(page.figure, path, overwrite=overwrite)
 
 
 def draw_scan(
@@ -291,7 +288,8 @@ def draw_scan(
     labels = ("sample", "profile")
     if samples == "down":
         picture, labels = picture.transpose(1, 0, 2), ("profile", "sample")
-    _Page(picture, aspect, legend, title, subtitle, span, labels=labels).write(path, overwrite)
+    page = _Page(picture, aspect, legend, title, subtitle, span, labels=labels)
+    write_png(page.figure, path, overwrite=overwrite)
 
 
 def height_span(z: Array) -> tuple[float, float]:
@@ -356,7 +354,7 @@ class _Page:
         *,
         labels: tuple[str, str] | None = None,
     ) -> None:
-        longer = _PICTURE_PX / _DPI
+        longer = _PICTURE_PX / DPI
         self.width, self.height = (longer, longer / aspect) if aspect >= 1 else (longer * aspect, longer)
         self.left = self._LEFT + (self._AXES if labels else 0.0)
         right = self._RIGHT + (self._HEIGHT_BAR if span else 0.0)
@@ -365,11 +363,11 @@ class _Page:
         self.below = self._BOTTOM + self._LINE * len(legend)
         self.bottom = self.below + (self._LABELS if labels else self._LENGTH_BAR)
         self.page = (page_width, self.bottom + self.height + self._TOP)
-        self.figure = Figure(figsize=self.page, dpi=_DPI, facecolor=_PAPER)
-        FigureCanvasAgg(self.figure)
+        self.figure = new_figure(*self.page, layout=None)
+        self.figure.set_facecolor(_PAPER)
         axes = self.axes(self.left, self.bottom, self.width, self.height)
         # Enlarged cells keep sharp edges: interpolated colours would show heights that were not measured.
-        enlarged = picture.shape[0] < self.height * _DPI or picture.shape[1] < self.width * _DPI
+        enlarged = picture.shape[0] < self.height * DPI or picture.shape[1] < self.width * DPI
         axes.imshow(picture, aspect="auto", interpolation="nearest" if enlarged else "antialiased")
         self._frame(axes, labels)
         self._write_titles(title, subtitle)
@@ -436,8 +434,3 @@ class _Page:
         bar.outline.set(linewidth=0.6, edgecolor=_FAINT)
         axes.tick_params(labelsize=8, colors=_INK, width=0.6, length=2.5)
         axes.set_ylabel(f"height z  [{name}]", fontsize=9, color=_INK, labelpad=6)
-
-    def write(self, path: str | os.PathLike[str], overwrite: bool) -> None:
-        """Write the page as PNG."""
-        with atomic_write(path, overwrite=overwrite) as file:
-            self.figure.savefig(file, format="png", dpi=_DPI, facecolor=_PAPER)

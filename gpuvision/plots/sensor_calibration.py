@@ -8,15 +8,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from gpuvision.host.files import atomic_write
 from gpuvision.host.recordings import read_frame
+from gpuvision.plots.figure import new_figure, write_png
 
 Float64 = npt.NDArray[np.float64]
 
-_DPI = 150
 # Above this count, every n-th residual is drawn.
 _MAX_POINTS = 20_000
 # Range of the residuals' axis [standard deviations of a reading].
@@ -69,16 +66,14 @@ def draw_sensor_calibration(path: str | Path, picture: SensorPicture, *, overwri
     overwrite : bool
         Whether an existing file may be replaced. Default False.
     """
-    figure = Figure(figsize=(13.0, 8.0), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(13.0, 8.0)
     (left, right), (below, beside) = figure.subplots(2, 2, height_ratios=(3, 2))
     _draw_image(left, picture)
     _draw_lines(right, picture)
     _draw_residuals(below, picture)
     _draw_sheet(beside, picture)
     figure.suptitle(picture.title, fontsize=9, x=0.01, ha="left")
-    with atomic_write(path, overwrite=overwrite) as file:
-        figure.savefig(file, format="png")
+    write_png(figure, path, overwrite=overwrite)
 
 
 def _draw_image(axes: Axes, picture: SensorPicture) -> None:

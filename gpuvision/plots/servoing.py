@@ -9,16 +9,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from gpuvision.host.files import atomic_write
+from gpuvision.plots.figure import new_figure, write_png
 from gpuvision.servoing.delay_measurement import MeasuredDelay
 from gpuvision.servoing.delay_response import FrameTimeCurve
 
 Float64 = npt.NDArray[np.float64]
 
-_DPI = 150
 _MS = 1e3
 
 
@@ -65,14 +62,14 @@ def draw_delay(path: str | Path, picture: DelayPicture, *, overwrite: bool = Fal
     overwrite : bool
         Whether an existing file may be replaced. Default False.
     """
-    figure = _figure((12.0, 8.5))
+    figure = new_figure(12.0, 8.5)
     (budget, step), (locus, curve) = figure.subplots(2, 2)
     _draw_budget(budget, picture)
     _draw_steps(step, picture)
     _draw_locus(locus, picture)
     _draw_curve(curve, picture)
     figure.suptitle(picture.title, fontsize=9, x=0.01, ha="left")
-    _save(figure, path, overwrite)
+    write_png(figure, path, overwrite=overwrite)
 
 
 def draw_measured_delay(
@@ -97,7 +94,7 @@ def draw_measured_delay(
     overwrite : bool
         Whether an existing file may be replaced. Default False.
     """
-    figure = _figure((12.0, 4.5))
+    figure = new_figure(12.0, 4.5)
     # Without jitter all samples have the same delay: no histogram.
     differ = delay.delays.size > 0
     left, *right = figure.subplots(1, 2 if differ else 1, width_ratios=(2, 1) if differ else (1,), squeeze=False)[0]
@@ -118,18 +115,7 @@ def draw_measured_delay(
         x=0.01,
         ha="left",
     )
-    _save(figure, path, overwrite)
-
-
-def _figure(size: tuple[float, float]) -> Figure:
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Figure, path: str | Path, overwrite: bool) -> None:
-    with atomic_write(path, overwrite=overwrite) as file:
-        figure.savefig(file, format="png")
+    write_png(figure, path, overwrite=overwrite)
 
 
 def _draw_budget(axes: Axes, picture: DelayPicture) -> None:

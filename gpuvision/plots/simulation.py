@@ -14,18 +14,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from gpuvision.host.files import atomic_write
+from gpuvision.plots.figure import new_figure, write_png
 from gpuvision.plots.range_image import length_unit, round_length
 from gpuvision.simulation.errors.error_attribution import CAUSES, ErrorAttribution
 
 Array = npt.NDArray[Any]
 
-_SIZE, _DPI = (8.0, 5.5), 150
+_SIZE = (8.0, 5.5)  # [in]
 _NO_READING, _GOOD = "#4b5563", "#e5e7eb"
 # Okabe and Ito's palette: distinguishable with colour vision deficiencies, and by lightness. Then, for causes by path,
 # colours of Tol's muted palette.
@@ -105,7 +104,7 @@ def draw_errors(
     axes.set_facecolor(_NO_READING)
     _orient(axes, attribution, backward)
     figure.colorbar(shown, label=f"height read minus true height [{name}]; dark: no reading", extend="both")
-    _write(figure, path, overwrite)
+    write_png(figure, path, overwrite=overwrite)
 
 
 def draw_causes(
@@ -150,7 +149,7 @@ def draw_causes(
         if part > 0.0
     ]
     figure.legend(handles=handles, loc="outside lower left", ncols=3, fontsize=8, frameon=False)
-    _write(figure, path, overwrite)
+    write_png(figure, path, overwrite=overwrite)
 
 
 def _colours_of(causes: Sequence[str]) -> list[str]:
@@ -172,14 +171,8 @@ def _orient(axes: Axes, attribution: ErrorAttribution, backward: bool) -> None:
 
 
 def _page(title: str) -> tuple[Figure, Any]:
-    figure = Figure(figsize=_SIZE, dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(*_SIZE)
     axes = figure.add_subplot()
     axes.set(xlabel="sample", ylabel="profile")
     axes.set_title(title, fontsize=9, loc="left")
     return figure, axes
-
-
-def _write(figure: Figure, path: Path, overwrite: bool) -> None:
-    with atomic_write(path, overwrite=overwrite) as file:
-        figure.savefig(file, format="png")

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 
 from gpuvision import Status
 from gpuvision.plots import range_image as picture
@@ -179,7 +180,7 @@ def test_a_failure_leaves_nothing(tmp_path, heights, monkeypatch):
     def stuck(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(picture.Figure, "savefig", stuck)
+    monkeypatch.setattr(Figure, "savefig", stuck)
     with pytest.raises(OSError, match="No space left"):
         picture.draw_height_map(tmp_path / "map.png", heights, GRID)
     assert list(tmp_path.iterdir()) == []

@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 import cv2
+from matplotlib.figure import Figure
 
-from gpuvision.profiling import plots
 from gpuvision.profiling.harness import Row
 from gpuvision.profiling.plots import draw_plots
 
@@ -25,7 +25,7 @@ def test_what_grows_and_what_accuracy_costs_is_drawn(tmp_path):
 
 def test_growth_begins_at_its_base(tmp_path, monkeypatch):
     drawn = {}
-    monkeypatch.setattr(plots.Figure, "savefig", lambda self, *_, **__: drawn.update(lines=self.axes[0].lines))
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: drawn.update(lines=self.axes[0].lines))
     rows = [row("board/1", 1e-3), row("growth/triangles-x4", 2e-3, base="board/1"), row("board/2", 5e-3)]
     assert draw_plots(tmp_path, rows) == ["growth.png"]
     (line,) = (each for each in drawn["lines"] if each.get_label() == "triangles")

@@ -246,7 +246,7 @@ def simulate_placements(
     Raises
     ------
     ValueError
-        The camera sees too few edges at the target, or ``count`` is below 1.
+        `plan_placement` refuses the target, or ``count`` is below 1.
 
     Notes
     -----
@@ -259,7 +259,7 @@ def simulate_placements(
     integer(count, "count", minimum=1)
     device = Device.best() if device is None else device
     machine = machine.for_side(artwork.side)
-    plan = plan_placement(artwork, target, machine, budget=budget)
+    plan = plan_placement(artwork, target, machine, budget=budget, device=device)
     rng = np.random.default_rng(seed)
     tolerance, calibrated = machine.tolerance, machine.pipette_in_camera.pose
     zone = _START * np.array([tolerance.landing_zone] * 2 + [tolerance.landing_angle]) - np.array(machine.swing)

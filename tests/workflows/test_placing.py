@@ -65,9 +65,9 @@ def artwork(folder: Path, machine: Machine) -> Artwork:
     return read_artwork(folder, layers=LAYERS, clearance=edge_clearance(placement_imaging(machine)))
 
 
-def narrow_pads(folder: Path) -> Path:
-    """Write a board with twelve pads of 0.34 mm."""
-    pads = [(8.6 + 0.5 * column, 7.5 + row) for column in range(6) for row in range(2)]
+def narrow_pads(folder: Path, *, rows: int = 2, pitch: float = 1.0) -> Path:
+    """Write a board with rows of six pads of 0.34 mm."""
+    pads = [(8.6 + 0.5 * column, 7.5 + pitch * row) for column in range(6) for row in range(rows)]
     head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
     flashes = "".join(f"X{round(1e6 * x)}Y{round(1e6 * y)}D03*\n" for x, y in pads)
     (folder / "copper.gbr").write_text(f"{head}%ADD10R,0.34X0.34*%\nD10*\n{flashes}M02*\n")
@@ -185,6 +185,23 @@ def test_narrow_pads_are_landed_by_registration_and_tracked_by_short_rulers(tmp_
         assert min(each.arrived for each in placement.measurements) == pytest.approx(20e-3)
     assert np.all(np.abs(result.sources["vision and servo"][:, :2]) < 2e-6)
     assert result.report()["landing_s"] == 20e-3
+
+
+def test_a_pattern_that_repeats_within_the_landing_zone_is_refused_by_the_plan(tmp_path: Path, device: Device) -> None:
+    """Pads at a pitch of 0.5 mm: from a corner of a zone of 0.3 mm the registration also fits the next pads."""
+    preset = read_machine("look_while_place")
+    narrow_pads(tmp_path, rows=6, pitch=0.5)
+    layers = {name: LAYERS[name] for name in ("copper.gbr", "outline.gbr")}
+    target = (9.85e-3 + 1.0e-3, 8.75e-3 + 0.5e-3, 0.0)
+    machine = dataclasses.replace(
+        preset,
+        camera=dataclasses.replace(preset.camera, window=(128, 128)),
+        tolerance=dataclasses.replace(preset.tolerance, landing_zone=0.3e-3),
+        control=Control(gain=0.1),
+    )
+    board = read_artwork(tmp_path, layers=layers, clearance=edge_clearance(placement_imaging(machine)))
+    with pytest.raises(ValueError, match=r"registration refuses [1-5] of 5 starts .*AMBIGUOUS.*repeats"):
+        plan_placement(board, target, machine, device=device)
 
 
 def test_a_refused_target_names_where_the_camera_looks_and_a_target_that_works(

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.orthographic import BoardView
+from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.artwork.board_reflectance import BoardReflectance
 from gpuvision.matching.board.view_features import select_features_in_view
@@ -24,6 +25,7 @@ from gpuvision.matching.pose.motion import rotation
 from gpuvision.matching.pose.pose import SolvePose
 from gpuvision.matching.pose.registration import CoarseRegistration, prepare_board_registration
 from gpuvision.servoing.frames import compose_poses, invert_pose, move_covariance
+from gpuvision.servoing.placement.landing import refused_starts
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.refusal import explain_refusal
 from gpuvision.validation import numbers
@@ -87,6 +89,7 @@ def plan_placement(
     *,
     budget: float = 60,
     reflectance: BoardReflectance | None = None,
+    device: Device | None = None,
 ) -> PlacementPlan:
     """Select the features of the artwork that guide a placement.
 
@@ -103,6 +106,8 @@ def plan_placement(
         Number of rulers, default 60; fiducials in view are used in addition.
     reflectance : BoardReflectance, optional
         Reflectances of the board, for contrast and thresholds. Default: `BoardReflectance`.
+    device : Device, optional
+        Where to check the coarse registration, if one is needed; None: `Device.best`.
 
     Returns
     -------
@@ -111,14 +116,16 @@ def plan_placement(
     Raises
     ------
     ValueError
-        The machine is over the other side, or the camera sees too few edges at the target. The message names the
-        nearest targets and the window that work, where there are any.
+        The machine is over the other side, the camera sees too few edges at the target, or the coarse registration is
+        ambiguous. The message names the nearest targets and the window that work, where there are any.
 
     Notes
     -----
     Rulers whose search range is the landing zone need no landing stage. Where they have no room, or give a pose that
     is worse than the tolerance (3 standard deviations of a frame), a coarse registration finds the pose of the first
-    frame and rulers with a search range of `tracking_imaging` follow it.
+    frame and rulers with a search range of `tracking_imaging` follow it. The registration is tried on ideal images from
+    the target and from four corners of the landing zone, see `refused_starts`: a repeated pattern, such as equal traces
+    at a pitch below twice the landing zone, makes it ambiguous.
     """
     if machine.camera.mirrored != (artwork.side == "bottom"):
         raise ValueError(f"the artwork shows the {artwork.side} side; use machine.for_side({artwork.side!r})")
@@ -129,12 +136,12 @@ def plan_placement(
     white = machine.camera.white_electrons
     step = abs(board.copper_masked - board.laminate_masked) * white * sensor.gain
     guidance = _Guidance(
-        artwork=artwork, machine=machine, reflectance=board, budget=budget, threshold=_THRESHOLD * step
+        artwork=artwork, machine=machine, reflectance=board, budget=budget, threshold=_THRESHOLD * step, device=device
     )
     try:
         features, landing = guidance.at(camera_pose)
     except ValueError as error:
-        raise ValueError(explain_refusal(str(error), artwork, place, camera_pose, machine, guidance.works)) from error
+        raise ValueError(explain_refusal(str(error), artwork, place, camera_pose, machine, guidance)) from error
     noise, etch_bias = _split_covariance(features)
     bright = max(board.copper_masked, board.laminate_masked) * white
     total, temporal = (float(sensor.noise(bright, machine.camera.exposure, spatial=each)) for each in (True, False))
@@ -194,6 +201,7 @@ class _Guidance:
     reflectance: BoardReflectance
     budget: float
     threshold: float
+    device: Device | None
 
     def at(self, camera_pose: Float64) -> tuple[FeatureSet, CoarseRegistration | None]:
         """Return the features at a pose (3,) of the camera at the release, and the search for the first pose."""
@@ -205,15 +213,18 @@ class _Guidance:
         if wide is not None and _is_precise(wide, camera_pose, machine):
             return wide, None
         try:
-            return self._near(view)
+            near = self._near(camera_pose)
+            self._check(camera_pose, near[1])
+            return near
         except ValueError:
             if wide is None:
                 raise
             return wide, None
 
-    def _near(self, view: BoardView) -> tuple[FeatureSet, CoarseRegistration]:
+    def _near(self, camera_pose: Float64) -> tuple[FeatureSet, CoarseRegistration]:
         """Return features that follow the head from frame to frame, and the search for the first pose."""
         machine = self.machine
+        view = machine.camera.view(camera_pose)
         features = self._select(view, tracking_imaging(machine, self.reflectance))
         landing = prepare_board_registration(
             self.artwork,
@@ -229,10 +240,31 @@ class _Guidance:
             raise ValueError(f"{len(landing.rulers.point)} places on edges have room for the coarse registration")
         return features, landing
 
+    def _check(self, camera_pose: Float64, landing: CoarseRegistration) -> None:
+        """Raise a `ValueError` where the registration refuses a start in the landing zone."""
+        refused = refused_starts(
+            self.artwork, camera_pose, self.machine, landing, reflectance=self.reflectance, device=self.device
+        )
+        if refused:
+            flags = " and ".join(sorted({str(each.name) for each in refused}))
+            raise ValueError(
+                f"the coarse registration refuses {len(refused)} of 5 starts in the landing zone ({flags}), such as a "
+                "pattern that repeats within the search range"
+            )
+
     def works(self, camera_pose: Float64, machine: Machine) -> bool:
-        """Return whether features guide a machine at a pose (3,) of its camera."""
+        """Return whether features guide a machine at a pose (3,) of its camera, if the registration is not refused."""
         try:
-            replace(self, machine=machine)._near(machine.camera.view(camera_pose))
+            replace(self, machine=machine)._near(camera_pose)
+        except ValueError:
+            return False
+        return True
+
+    def lands(self, camera_pose: Float64, machine: Machine) -> bool:
+        """Return whether the registration takes all starts at a pose (3,) of the camera that `works`."""
+        moved = replace(self, machine=machine)
+        try:
+            moved._check(camera_pose, moved._near(camera_pose)[1])
         except ValueError:
             return False
         return True

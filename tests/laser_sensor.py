@@ -267,12 +267,15 @@ def scene_axes(truth: LaserSensor) -> Float64:
     return np.stack([np.cross(y, z), y, z])
 
 
-def sensor_table(truth: LaserSensor, window: tuple[int, int], frame: tuple[int, int]) -> dict[str, Any]:
+def sensor_table(
+    truth: LaserSensor, window: tuple[int, int], frame: tuple[int, int], *, turned: bool = False
+) -> dict[str, Any]:
     """Return a sensor file with a light for a simulation: a window of the image at (column, row), (columns, rows).
 
     The camera is in the file ``camera.toml`` beside it, see `camera_table`. The scene's origin is that of the sheet.
+    A turned sensor looks from the other side of the sheet, at y > 0.
     """
-    to_scene = scene_axes(truth)
+    to_scene = scene_axes(truth) * (np.array([[-1.0], [-1.0], [1.0]]) if turned else 1.0)
     flat = not any(truth.bend)
     return {
         "kind": "camera",

@@ -18,6 +18,7 @@ from gpuvision.formats.range_image import read_npz
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.simulated_recording import recording_sensor
 from gpuvision.workflows.simulating import load_part, prepare_simulation
+from mesh_heights import mesh_heights
 from scanning import Ran, check_refused
 
 Float64 = npt.NDArray[np.float64]
@@ -66,11 +67,7 @@ class Commands:
         """Return height errors of the valid points over their predicted sigma; the truth by vertical rays."""
         valid = np.isfinite(scanned["z"])
         x, y, z, sigma = (np.float64(scanned[name][valid]) for name in ("x", "y", "z", "sigma_z"))
-        above = np.stack([x, y, np.full_like(x, 1.0)], axis=1)
-        down = np.broadcast_to([0.0, 0.0, -1.0], above.shape)
-        places, ray, _ = self.mesh.ray.intersects_location(above, down, multiple_hits=False)
-        true = np.full(len(x), np.nan)
-        true[ray] = places[:, 2]
+        true = mesh_heights(self.mesh, x, y)
         return np.where(np.isfinite(true), (z - true) / sigma, np.inf)
 
 
@@ -118,6 +115,34 @@ def test_a_scan_of_the_files_finds_the_part(commands: Commands) -> None:
     assert np.mean(np.abs(found) < 3.0) > 0.95
     # The predicted sigma is not too large either.
     assert 0.8 < 1.4826 * np.median(np.abs(found)) < 1.25
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("degrees", "bend"), [(10.0, 0.0), (25.0, 0.06), (40.0, -0.06)])
+def test_heights_are_within_their_sigma(
+    degrees: float,
+    bend: float,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    truth = tilted(degrees, (bend, -0.3 * bend, 0.5 * bend))
+    commands = Commands(tmp_path, capsys, monkeypatch, truth, (120, 132), (240, 96))
+    for seed in range(7):
+        assert commands.simulate("--profiles", 16, "--seed", seed).code == 0
+        scanned = commands.scan(tmp_path / "sim")
+        found = commands.deviations(scanned)
+        assert len(found) > 0.95 * scanned["z"].size
+        assert np.mean(np.abs(found) < 3.0) > 0.95
+        assert 0.8 < 1.4826 * np.median(np.abs(found)) < 1.25
+        print(
+            degrees,
+            bend,
+            seed,
+            np.mean(np.abs(found) < 3.0),
+            1.4826 * np.median(np.abs(found)),
+            len(found) / scanned["z"].size,
+        )
 
 
 def test_the_sensor_file_of_a_recording(commands: Commands) -> None:

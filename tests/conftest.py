@@ -11,6 +11,14 @@ from __future__ import annotations
 
 import gc
 import os
+
+# Before NumPy loads BLAS: its threads poll, so that small matrices take five times the processor time, and the workers
+# of pytest-xdist and the subprocesses slow each other down.
+os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+# Collected tests are a million objects, which stay. The garbage collector starts in `pytest_collection_finish`.
+gc.disable()
+
+# ruff: noqa: E402
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -31,8 +39,6 @@ ROOT = Path(__file__).resolve().parents[1]
 # warm and nothing is written in the home. Each of these folders is read when it is first needed, after this line.
 CACHE = ROOT / "build" / "cache"
 os.environ |= {"XDG_CACHE_HOME": str(CACHE), "MPLCONFIGDIR": str(CACHE / "matplotlib")}
-# For workers of pytest-xdist and subprocesses: two workers with two polling threads each would slow each other down.
-os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 hypothesis.configuration.set_hypothesis_home_dir(CACHE / "hypothesis")
 
 LEFT_COUNTS = pytest.StashKey[dict[str, int]]()
@@ -84,9 +90,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Exempt the modules and collected tests from the garbage collector: a collection is 100 times faster then."""
+    """Start the garbage collector, without the modules and the collected tests: it is 100 times faster then."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 def _set_examples(items: list[pytest.Item], factor: float) -> None:

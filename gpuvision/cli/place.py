@@ -24,7 +24,7 @@ from gpuvision.cli.arguments import (
 from gpuvision.cli.select import Side
 
 _LARGEST_BOARD = 1.0  # largest coordinate on a board [m] (chosen: panels are smaller)
-_FILES = ("report.json", "placements.png", "features.png")
+_FILES = ("report.json", "placements.png", "features.png", "repeatability.png")
 
 Gerbers = Annotated[
     Path,
@@ -44,7 +44,9 @@ Rate = Annotated[
 Results = Annotated[
     Path,
     typer.Option(
-        metavar="DIR", parser=named_path, help="Folder for report.json and the pictures placements.png, features.png."
+        metavar="DIR",
+        parser=named_path,
+        help="Folder for report.json and the pictures placements.png, features.png, repeatability.png.",
     ),
 ]
 
@@ -78,8 +80,9 @@ def place(
     from gpuvision.matching.artwork.artwork import read_artwork
     from gpuvision.matching.features.feature_set import edge_clearance
     from gpuvision.plots.board import draw_features
-    from gpuvision.plots.placement import draw_placements
+    from gpuvision.plots.placement import draw_placements, draw_repeatability
     from gpuvision.servoing.placement.plan import placement_imaging
+    from gpuvision.workflows.placement_cell import measure_repeatability
     from gpuvision.workflows.placing import simulate_placements
 
     target = quantities(at, "--at", "m,m,rad")
@@ -93,6 +96,7 @@ def place(
     artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=clearance)
     for each in artwork.warnings:
         echo(f"warning: {each}", err=True)
+    chosen = None if device is None else Device.named(device)
     with progress_bar("placing") as progress:
         result = simulate_placements(
             artwork,
@@ -101,10 +105,11 @@ def place(
             count=count,
             budget=budget,
             seed=seed,
-            device=None if device is None else Device.named(device),
+            device=chosen,
             progress=progress,
         )
-    report = result.report()
+    resting = measure_repeatability(artwork, result.machine, result.plan, seed=seed, device=chosen)
+    report = result.report() | {"repeatability": resting.report()}
     write_report(as_json, report, outputs)
     with outputs.folder(out) as inside:
         write_text_atomic(inside / "report.json", json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n")
@@ -121,4 +126,6 @@ def place(
             delay=described.delay.parts,
             tolerance=(described.tolerance.position, described.tolerance.angle),
         )
+        if len(resting.error):
+            draw_repeatability(inside / "repeatability.png", **resting._asdict(), period=described.period)
     echo(f"{result.summary()}\nlook at {out / 'placements.png'} and {out / 'report.json'}", err=prints_report(as_json))

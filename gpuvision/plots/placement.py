@@ -1,4 +1,4 @@
-"""Plots of placements: error over time, final error against prediction, and the delay budget."""
+"""Plots of placements: error over time, final error, delay budget, and repeatability of the measured pose."""
 
 from __future__ import annotations
 
@@ -55,6 +55,48 @@ def draw_placements(
         _draw_motion(panels[f"motion {coordinates}"], period, motion, limit, quantity)
         _draw_errors(panels[f"error {coordinates}"], error, sigmas, quantity)
     _draw_delay(panels["delay"], delay)
+    write_png(figure, path)
+
+
+def draw_repeatability(
+    path: str | Path, *, error: Float64, frame_sigma: Float64, pixel_sigma: Float64, period: float
+) -> None:
+    """Draw the measured pose of a head at rest over time, with a histogram and the prediction, as PNG.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    error : numpy.ndarray
+        (n, 3): measured pose less the true one [m], [m], [rad].
+    frame_sigma : numpy.ndarray
+        (3,): predicted standard deviation from frame to frame.
+    pixel_sigma : numpy.ndarray
+        (3,): predicted standard deviation of the mean error.
+    period : float
+        Time between two frames [s].
+    """
+    figure = new_figure(13.0, 9.2, dpi=_DPI)
+    panels = figure.subplots(3, 2, width_ratios=(3.0, 1.0), sharey="row", squeeze=False)
+    units = (("x", 1e6, "µm"), ("y", 1e6, "µm"), ("theta", 1e3, "mrad"))
+    for row, (name, factor, unit) in enumerate(units):
+        values, sigma, common = (factor * each for each in (error[:, row], frame_sigma[row], pixel_sigma[row]))
+        mean, measured = float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+        time, histogram = panels[row]
+        time.plot(1e3 * period * np.arange(len(values)), values, ".", markersize=3)
+        time.axhspan(mean - 3.0 * sigma, mean + 3.0 * sigma, color="0.92", zorder=0, label="3 predicted sigmas")
+        time.axhline(mean, color="0.4", linewidth=0.8, label=f"mean {mean:.3f} {unit}, predicted sigma {common:.3f}")
+        title = f"{name}: sigma {measured:.3f} {unit}, predicted {sigma:.3f} {unit}"
+        time.set(ylabel=f"error of {name} [{unit}]", title=title)
+        time.legend(fontsize=8, loc="upper right")
+        edges = np.linspace(mean - 4.0 * sigma, mean + 4.0 * sigma, _BINS)
+        histogram.hist(values, edges.tolist(), orientation="horizontal", histtype="step")
+        places = np.linspace(edges[0], edges[-1], 201)
+        density = np.exp(-0.5 * ((places - mean) / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi))
+        histogram.plot(len(values) * (edges[1] - edges[0]) * density, places, linestyle="--", label="predicted")
+        histogram.legend(fontsize=8)
+    panels[2, 0].set_xlabel("time [ms]")
+    panels[2, 1].set_xlabel("number of frames")
     write_png(figure, path)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -18,36 +17,22 @@ import numpy.typing as npt
 
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork
-from gpuvision.servoing.loop import SimulatedClock
 from gpuvision.servoing.placement.budget import ErrorBudget, model_tolerance, predict_budget
-from gpuvision.servoing.placement.control import Settling
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.placing import (
     REMAINDER,
     Placement,
-    error_share,
-    place_part,
-    predicted_frames,
     predicted_settling,
     settled_frames,
 )
 from gpuvision.servoing.placement.plan import PlacementPlan, plan_placement
-from gpuvision.servoing.placement.vision import BoardPoseSensor, SimulatedCamera
-from gpuvision.servoing.plant import SimulatedPlant
-from gpuvision.servoing.settling import vibration_of_loop
-from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
 from gpuvision.validation import integer
+from gpuvision.workflows.placement_cell import PlacementCell
 
 Float64 = npt.NDArray[np.float64]
 
 # Start errors fill this part of the landing zone: the first pose has an error, too (chosen).
 _START = 0.9
-# The board is rendered this far beyond the landing zone [px] (chosen).
-_MARGIN_PX = 32
-# Time in which the vibration of the steered head is identified [periods of the slowest resonance] (chosen).
-_IDENTIFICATION = 12.0
-# True poses in the time after the contact, in which a swing must stay within the tolerance.
-_LATER = 33
 
 
 class PlacementResult(NamedTuple):
@@ -269,7 +254,7 @@ def simulate_placements(
         "calibration": _normal(rng, machine.pipette_in_camera.pose_covariance, count),
         "drift": _normal(rng, machine.drift.covariance, count),
     }
-    cell = _Cell(artwork, machine, plan, device, seed)
+    cell = PlacementCell(artwork, machine, plan, device, seed)
     starts, swings = rng.uniform(-zone, zone, (count, 3)), rng.uniform(-1.0, 1.0, (count, 3)) * np.array(machine.swing)
     if machine.settling.rule == "vibration" and machine.settling.frequency is None:
         cell.identify(zone)
@@ -293,72 +278,6 @@ def _counted(placement: Placement) -> int:
     """Return the number of frames from the first measured pose to the release."""
     first = min(each.arrived for each in placement.measurements)
     return int(np.count_nonzero(placement.record.time > first))
-
-
-class _Cell:
-    """Simulated machine over a rendered board."""
-
-    def __init__(self, artwork: Artwork, machine: Machine, plan: PlacementPlan, device: Device, seed: int) -> None:
-        camera, tolerance = machine.camera, machine.tolerance
-        diagonal = float(np.hypot(*camera.window)) / 2.0 * (1.0 + tolerance.landing_angle) + _MARGIN_PX
-        half = diagonal * camera.pixel + 2.0 * tolerance.landing_zone
-        centre = plan.camera_pose[:2]
-        board = ReflectanceMap.of(
-            artwork, pixel=camera.pixel, region=(centre - half, centre + half), blur_px=camera.blur_px
-        )
-        self.machine, self._plan = machine, plan
-        rest = np.zeros(3)
-        self._camera = SimulatedCamera(board, machine, lambda _: rest, rest, device=device, seed=seed)
-        self._sensor = BoardPoseSensor(self._camera, machine, plan, self._camera.dtype, device=device)
-
-    def place(self, start: Float64, swing: Float64, true: Float64, offset: Float64) -> tuple[Placement, Float64, float]:
-        """Place a part from a start error (3,) with a vibration (3,).
-
-        Returns
-        -------
-        tuple
-            Run, motion, and largest true error less the offset (3,) of calibration and drift after the contact, as a
-            fraction of the tolerance.
-        """
-        placement, plant = self._steer(self.machine, start, swing, true)
-        target, settling = self._plan.target, self.machine.settling
-        motion = plant.pose(placement.record.time) - target
-        if not placement.released:
-            return placement, motion, math.nan
-        periods = [2.0 * math.pi / axis.resonance for axis in self.machine.axes if axis.resonance]
-        later = placement.record.time[-1] + settling.lead + np.linspace(0.0, max(periods, default=0.0), _LATER)
-        reach = max(error_share(self.machine, each) for each in plant.pose(later) - target - offset)
-        return placement, motion, reach
-
-    def identify(self, start: Float64) -> None:
-        """Find the vibration of the steered head in a move from a start error (3,), and take it for the rule."""
-        machine = self.machine
-        slowest = min((axis.resonance for axis in machine.axes if axis.resonance), default=math.inf)
-        response = predicted_frames(machine, start) * machine.period
-        wait = response + _IDENTIFICATION * 2.0 * math.pi / slowest
-        longest = replace(machine.tolerance, max_time=machine.tolerance.max_time + wait + machine.landing)
-        moved = replace(machine, settling=Settling(rule="fixed", wait=wait), tolerance=longest)
-        placement, _ = self._steer(moved, start, np.array(machine.swing), machine.pipette_in_camera.pose)
-        if not placement.released:
-            raise ValueError(f"the vibration of the head cannot be identified: {placement.reason}")
-        since = min(each.arrived for each in placement.measurements) + response
-        found = vibration_of_loop(placement.record, since)
-        (fx, fy, ft), (dx, dy, dt) = (each.tolist() for each in found)
-        settling = replace(machine.settling, frequency=(fx, fy, ft), damping=(dx, dy, dt))
-        self.machine = replace(machine, settling=settling)
-
-    def _steer(
-        self, machine: Machine, start: Float64, swing: Float64, true: Float64
-    ) -> tuple[Placement, SimulatedPlant]:
-        """Run the loop for a part and return the run and the plant."""
-        target = self._plan.target
-        plant = SimulatedPlant(
-            machine.axes, start=target + start, swing=swing, watchdog=machine.control.watchdog * machine.period
-        )
-        self._camera.follow(plant.pose, true)
-        self._sensor.reset()
-        landing = 0.0 if self._plan.landing is None else machine.landing
-        return place_part(machine, target, plant, self._sensor, SimulatedClock(), landing=landing), plant
 
 
 def _normal(rng: np.random.Generator, covariance: Float64, count: int) -> Float64:

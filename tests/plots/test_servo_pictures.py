@@ -13,7 +13,7 @@ from matplotlib.patches import Polygon
 
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.plots.board import draw_features
-from gpuvision.plots.placement import draw_placements
+from gpuvision.plots.placement import draw_placements, draw_repeatability
 from gpuvision.plots.servoing import draw_measured_delay
 from gpuvision.servoing.delay_measurement import MeasuredDelay
 
@@ -52,6 +52,20 @@ def test_errors_of_position_and_angle_are_drawn_as_outlines(drawn: list[Figure],
         assert max(each.get_xy()[:, 1].max() for each in outlines) in (1.0, 2.0)
         ticks = panel.get_yticks()
         np.testing.assert_array_equal(ticks, np.round(ticks))
+
+
+def test_repeatability_is_drawn_with_its_prediction(drawn: list[Figure], tmp_path: Path) -> None:
+    error = np.array([[1e-6, 0.0, 0.1e-3], [3e-6, 1e-6, 0.2e-3], [2e-6, -1e-6, 0.3e-3]])
+    sigma = np.array([1e-6, 2e-6, 1e-4])
+    draw_repeatability(
+        tmp_path / "repeatability.png", error=error, frame_sigma=sigma, pixel_sigma=0.5 * sigma, period=1e-3
+    )
+    panels = {each.get_ylabel(): each for each in drawn[0].axes}
+    points, mean = panels["error of x [µm]"].lines
+    np.testing.assert_allclose(points.get_ydata(), [1.0, 3.0, 2.0])
+    assert mean.get_ydata()[0] == pytest.approx(2.0)
+    assert panels["error of theta [mrad]"].get_title() == "theta: sigma 0.100 mrad, predicted 0.100 mrad"
+    assert panels["error of y [µm]"].get_legend().get_texts()[1].get_text().endswith("predicted sigma 1.000")
 
 
 def test_a_delay_without_jitter_has_no_empty_panel(drawn: list[Figure], tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from gpuvision.servoing.placement.plan import placement_imaging, plan_placement
 from gpuvision.servoing.placement.vision import BoardPoseSensor, Frame, SimulatedCamera
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
+from gpuvision.workflows.placement_cell import measure_repeatability
 from gpuvision.workflows.placing import PlacementResult, simulate_placements
 
 PRESET = tomllib.loads(
@@ -118,6 +119,21 @@ def test_parts_land_where_and_when_the_prediction_says(artwork: Artwork, machine
     assert list(report["measured_rms"]["total"].values()) == pytest.approx(np.sqrt(np.mean(result.error**2, axis=0)))
     assert len(report["placements"]) == 6
     assert "6 of 6 parts placed" in result.summary()
+
+
+def test_the_measured_pose_of_a_head_at_rest_scatters_as_predicted(
+    artwork: Artwork, machine: Machine, device: Device
+) -> None:
+    plan = plan_placement(artwork, TARGET, machine)
+    resting = measure_repeatability(artwork, machine, plan, frames=60, device=device)
+    assert resting.error.shape == (60, 3)
+    ratio = np.std(resting.error, axis=0, ddof=1) / resting.frame_sigma
+    # 60 frames: a standard error of 9 %. The selection counts the chance of a wrong edge, and predicts somewhat more.
+    assert np.all((ratio > 0.5) & (ratio < 1.25)), ratio
+    assert np.all(np.abs(np.mean(resting.error, axis=0)) < 4.0 * resting.pixel_sigma)
+    # Frames are independent: their differences have twice the variance.
+    steps = np.std(np.diff(resting.error, axis=0), axis=0, ddof=1) / np.std(resting.error, axis=0, ddof=1)
+    np.testing.assert_allclose(steps, np.sqrt(2.0), rtol=0.25)
 
 
 @pytest.mark.parametrize("observer", ["smith", pytest.param("kalman", marks=pytest.mark.slow)])
@@ -227,7 +243,12 @@ def test_the_command_writes_report_and_pictures(
     assert [each["released"] for each in report["placements"]] == [True, True]
     assert report["target"] == pytest.approx(dict(zip(("x_m", "y_m", "theta_rad"), TARGET, strict=True)))
     assert report["gpuvision"] == version("gpuvision")
-    assert {each.name for each in (tmp_path / "out").glob("*.png")} == {"placements.png", "features.png"}
+    assert {each.name for each in (tmp_path / "out").glob("*.png")} == {
+        "placements.png",
+        "features.png",
+        "repeatability.png",
+    }
+    assert report["repeatability"]["frames"] == 100
     printed = capsys.readouterr().out
     assert "2 of 2 parts placed" in printed
     far = [*words, "--at", "1mm,1mm,0deg", "--out", tmp_path / "none"]

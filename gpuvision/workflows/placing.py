@@ -26,6 +26,7 @@ from gpuvision.servoing.placement.placing import (
     settled_frames,
 )
 from gpuvision.servoing.placement.plan import PlacementPlan, plan_placement
+from gpuvision.servoing.placement.rehearsal import check_resonances
 from gpuvision.validation import integer
 from gpuvision.workflows.placement_cell import PlacementCell
 
@@ -231,7 +232,8 @@ def simulate_placements(
     Raises
     ------
     ValueError
-        `plan_placement` refuses the target, or ``count`` is below 1.
+        `plan_placement` refuses the target, the loop does not settle with the resonances of the axes, or ``count`` is
+        below 1.
 
     Notes
     -----
@@ -244,6 +246,7 @@ def simulate_placements(
     integer(count, "count", minimum=1)
     device = Device.best() if device is None else device
     machine = machine.for_side(artwork.side)
+    check_resonances(machine)
     plan = plan_placement(artwork, target, machine, budget=budget, device=device)
     rng = np.random.default_rng(seed)
     tolerance, calibrated = machine.tolerance, machine.pipette_in_camera.pose

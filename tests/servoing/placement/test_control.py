@@ -24,6 +24,7 @@ from gpuvision.servoing.placement.placing import (
     predicted_settling,
     settled_frames,
 )
+from gpuvision.servoing.placement.rehearsal import check_resonances
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.servoing.settling import vibration_of_loop
 from gpuvision.servoing.simulated_sensor import SimulatedPoseSensor
@@ -54,9 +55,17 @@ def _sensor(plant: SimulatedPlant, machine: Machine, *, is_noisy: bool, seed: in
     )
 
 
-def _free_run(machine: Machine, start: np.ndarray, frames: int, *, is_noisy: bool = False, seed: int = 0) -> np.ndarray:
+def _free_run(
+    machine: Machine,
+    start: np.ndarray,
+    frames: int,
+    *,
+    is_noisy: bool = False,
+    seed: int = 0,
+    axes: tuple[Axis, Axis, Axis] = (Axis(), Axis(), Axis()),
+) -> np.ndarray:
     """Return the true errors (frames, 3) of a loop without guards."""
-    plant = SimulatedPlant(start=start)
+    plant = SimulatedPlant(axes, start=start)
     loop = ServoLoop(
         plant,
         _sensor(plant, machine, is_noisy=is_noisy, seed=seed),
@@ -189,6 +198,23 @@ def test_waiting_by_vibration_saves_30_percent_of_a_fixed_wait_with_as_many_misp
     ]
     assert not missed[-1]
     assert np.mean(waits) <= 0.7 * times[np.flatnonzero(missed)[-1] + 1]
+
+
+@pytest.mark.parametrize(("frequency", "control"), [(80.0, Control(gain=0.1)), (120.0, CONTROLS[2])])
+def test_a_loop_that_makes_a_resonance_swing_up_is_refused_with_a_gain_that_settles(
+    frequency: float, control: Control
+) -> None:
+    x = Axis(resonance=2.0 * math.pi * frequency, damping=0.04)
+    machine = dataclasses.replace(PRESET, control=control, axes=(x, Axis(), Axis()), swing=(5e-6, 0.0, 0.0))
+    with pytest.raises(ValueError, match=r"does not settle .* swings up; it settles with the gain") as refused:
+        check_resonances(machine)
+    settles = dataclasses.replace(control, gain=float(str(refused.value).split("the gain ")[1]))
+    # The amplitude after half a second, without the guards that bound the motion.
+    for each, is_stable in ((control, False), (settles, True)):
+        moved = dataclasses.replace(machine, control=each)
+        error = _free_run(moved, np.array([5e-6, 0.0, 0.0]), 500, axes=machine.axes)[:, 0]
+        assert (np.abs(error[-50:]).max() < 1e-6) == is_stable
+    check_resonances(PRESET)
 
 
 def test_a_fixed_wait_releases_after_its_time() -> None:

@@ -250,6 +250,16 @@ def test_the_watchdog_stops_the_head_while_the_computer_hangs(watchdog: float) -
     assert (lowest > -1e-6) == (watchdog == 1.5)
 
 
+def test_the_predictor_knows_that_the_watchdog_stopped_the_head() -> None:
+    """The command before the hang of 8 ms lasted for 1.5 ms: at the late frame the predicted motion is 0."""
+    machine = dataclasses.replace(PRESET, control=Control(observer="smith", gain=0.3, watchdog=1.5))
+    plant = SimulatedPlant(start=(80e-6, 0.0, 0.0), watchdog=1.5 * machine.period)
+    sensor = _sensor(plant, machine, is_noisy=False)
+    record = place_part(machine, np.zeros(3), plant, sensor, _HangingClock()).record
+    assert record.time[2] == pytest.approx(10e-3)
+    np.testing.assert_allclose(record.pose[2:], plant.pose(record.time[2:]), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

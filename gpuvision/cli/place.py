@@ -121,6 +121,7 @@ def place(
             inside / "placements.png",
             period=described.period,
             motion=result.motion,
+            response=result.response,
             error=result.error,
             sigmas=result.simulated_sigmas,
             delay=described.delay.parts,

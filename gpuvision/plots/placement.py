@@ -24,6 +24,7 @@ def draw_placements(
     *,
     period: float,
     motion: Sequence[Float64],
+    response: Float64,
     error: Float64,
     sigmas: Float64,
     delay: Mapping[str, float],
@@ -39,6 +40,8 @@ def draw_placements(
         Time between two frames [s].
     motion : sequence of numpy.ndarray
         Distance from the target in each frame, (frames, 3) for each placement [m], [m], [rad].
+    response : numpy.ndarray
+        (frames,): error in each frame by theory, as a fraction of the start error; drawn for the first placement.
     error : numpy.ndarray
         (n, 3): error at the release; NaN where the part was not released.
     sigmas : numpy.ndarray
@@ -52,7 +55,7 @@ def draw_placements(
     panels = figure.subplot_mosaic([["motion x, y", "error x, y", "delay"], ["motion theta", "error theta", "delay"]])
     for quantity, limit in zip((_POSITION, _ANGLE), tolerance, strict=True):
         coordinates = ", ".join(quantity.names)
-        _draw_motion(panels[f"motion {coordinates}"], period, motion, limit, quantity)
+        _draw_motion(panels[f"motion {coordinates}"], period, motion, response, limit, quantity)
         _draw_errors(panels[f"error {coordinates}"], error, sigmas, quantity)
     _draw_delay(panels["delay"], delay)
     write_png(figure, path)
@@ -114,12 +117,17 @@ _POSITION = _Quantity(("x", "y"), slice(0, 2), 1e6, "µm", "distance from the ta
 _ANGLE = _Quantity(("theta",), slice(2, 3), 1e3, "mrad", "angle from the target")
 
 
-def _draw_motion(axes: Axes, period: float, motion: Sequence[Float64], tolerance: float, quantity: _Quantity) -> None:
+def _draw_motion(
+    axes: Axes, period: float, motion: Sequence[Float64], response: Float64, tolerance: float, quantity: _Quantity
+) -> None:
     for each in motion:
         distance = np.linalg.norm(each[:, quantity.columns], axis=1)
         axes.semilogy(
             1e3 * period * np.arange(len(each)), quantity.factor * distance, color="C0", alpha=0.5, linewidth=0.8
         )
+    first = quantity.factor * float(np.linalg.norm(motion[0][0, quantity.columns]))
+    theory = first * np.abs(response[: len(motion[0])])
+    axes.semilogy(1e3 * period * np.arange(len(theory)), theory, color="C1", linestyle=":", label="theory, placement 1")
     axes.axhline(quantity.factor * tolerance, color="0.4", linestyle="--", linewidth=0.8, label="tolerance")
     axes.legend(fontsize=8)
     axes.set(xlabel="time [ms]", ylabel=f"{quantity.title} [{quantity.unit}]", title="error over time")

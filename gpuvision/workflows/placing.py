@@ -93,10 +93,21 @@ class PlacementResult(NamedTuple):
         return [settled_frames(each, self.settling_band) for each in self._servo_motion]
 
     @property
+    def _landing_frames(self) -> int:
+        """Frames of the coarse registration, during which the head rests."""
+        return 0 if self.plan.landing is None else math.ceil(self.machine.landing * self.machine.rate - 1e-9)
+
+    @property
+    def response(self) -> Float64:
+        """Error (frames,) in each frame of the longest run by theory, as a fraction of the start error."""
+        landing = self._landing_frames
+        frames = max(len(each) for each in self.motion) - landing
+        return np.concatenate([np.ones(landing), self.machine.error_after(max(frames, 1))])
+
+    @property
     def predicted_settling(self) -> list[int]:
         """Frames to `settling_band` by theory, from the true start errors, with those of the coarse registration."""
-        landing = 0 if self.plan.landing is None else math.ceil(self.machine.landing * self.machine.rate - 1e-9)
-        band = self.settling_band
+        landing, band = self._landing_frames, self.settling_band
         return [landing + predicted_settling(self.machine, each[0], band) for each in self._servo_motion]
 
     @property

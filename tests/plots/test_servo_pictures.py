@@ -33,15 +33,17 @@ def test_errors_of_position_and_angle_are_drawn_as_outlines(drawn: list[Figure],
         tmp_path / "placements.png",
         period=1e-3,
         motion=motion,
+        response=np.array([1.0, 0.2, 0.04]),
         error=error,
         sigmas=np.array([1e-6, 1e-6, 1e-4]),
         delay={"exposure": 1e-3},
         tolerance=(5e-6, 2e-3),
     )
     panels: dict[str, Any] = {each.get_xlabel() + each.get_ylabel(): each for each in drawn[0].axes}
-    (distance, position_limit) = panels["time [ms]distance from the target [µm]"].lines
-    (angle, angle_limit) = panels["time [ms]angle from the target [mrad]"].lines
+    (distance, theory, position_limit) = panels["time [ms]distance from the target [µm]"].lines
+    (angle, _, angle_limit) = panels["time [ms]angle from the target [mrad]"].lines
     np.testing.assert_allclose(distance.get_ydata(), [50.0, 5.0])
+    np.testing.assert_allclose(theory.get_ydata(), [50.0, 10.0])
     np.testing.assert_allclose(angle.get_ydata(), [5.0, 1.0])
     assert (position_limit.get_ydata()[0], angle_limit.get_ydata()[0]) == pytest.approx((5.0, 2.0))
     for unit, coordinates in (("µm", 2), ("mrad", 1)):

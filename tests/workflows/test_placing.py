@@ -370,3 +370,7 @@ def test_three_sigma_on_real_boards_are_below_half_a_pixel(
     assert np.all(3.0 * np.sqrt(np.mean(result.error[:, :2] ** 2, axis=0)) <= 5e-6)
     waited = [each.frames - each.predicted_frames - 1 for each in result.placements]
     assert np.mean(waited) <= 1.0
+    # The frames in which the true error settles, against theory.
+    counted = np.array([each for each in result.settled if each is not None])
+    assert len(counted) == 10
+    assert abs(np.mean(counted - result.predicted_settling)) <= 0.6

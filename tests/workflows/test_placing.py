@@ -203,8 +203,12 @@ def test_narrow_pads_are_landed_by_registration_and_tracked_by_short_rulers(tmp_
     assert result.report()["landing_s"] == 20e-3
 
 
-def test_a_pattern_that_repeats_within_the_landing_zone_is_refused_by_the_plan(tmp_path: Path, device: Device) -> None:
+def test_a_pattern_that_repeats_within_the_landing_zone_is_refused_by_the_plan(
+    tmp_path: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Pads at a pitch of 0.5 mm: from a corner of a zone of 0.3 mm the registration also fits the next pads."""
+    # The search for another target takes a second; the test of a refused target has it.
+    monkeypatch.setattr("gpuvision.servoing.placement.plan.explain_refusal", lambda reason, *_: reason)
     preset = read_machine("look_while_place")
     narrow_pads(tmp_path, rows=6, pitch=0.5)
     layers = {name: LAYERS[name] for name in ("copper.gbr", "outline.gbr")}

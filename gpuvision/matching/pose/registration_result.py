@@ -53,14 +53,16 @@ class Registration(NamedTuple):
     pose : (3,)
         x, y, theta [rad]: a known point p appears at R(theta) (I + D) p + (x, y). Where the pose is refused, NaN like
         ``deformation``, ``placement`` and ``covariance``.
+        With a shear, theta is the direction of the known x axis; of a rigid pose it is the angle of the nearest
+        rotation, which differs by half the shear.
     deformation : (3,)
         Scales along the known axes less 1, and shear: I + D = ((1 + kx, shear), (0, 1 + ky)); 0 for a rigid transform.
     placement : (2,)
         Measured position of the placement point.
     covariance : (f, f)
         Covariance of the placement point's x, y, of theta, and of the free deformation parameters, from the residuals
-        of the edges. It includes errors that neighbouring edges share (jackknife over blocks of the image) and, with a
-        ``misfit``, the change of the pose by the larger transform.
+        of the edges. It includes errors that neighbouring edges share (jackknife over overlapping blocks of the image)
+        and, with a ``misfit``, the change of the pose by the larger transform.
     score : float
         Share of the rulers in the image whose edge lies within the tolerance of the pose, 0 to 1; of the best pose
         where it is refused.

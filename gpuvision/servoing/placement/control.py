@@ -41,7 +41,7 @@ class Control:
         Parts of the controller; default "p". The head integrates the commanded velocity, so "p" leaves no steady error.
     gain : float, optional
         Fraction of the error that one frame corrects. Default: for "p" the largest gain without oscillation, for "pi"
-        and "pid" the rule of Skogestad [1]_.
+        and "pid" the rule of Skogestad (2003).
     integral : float, optional
         Time constant of the integral part of "pi" and "pid" [s], above 0. Default: by the rule of Skogestad.
     derivative : float, optional

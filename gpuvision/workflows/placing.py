@@ -107,8 +107,8 @@ class PlacementResult(NamedTuple):
     @property
     def predicted_settling(self) -> list[int]:
         """Frames to `settling_band` by theory, from the true start errors, with those of the coarse registration."""
-        landing, band = self._landing_frames, self.settling_band
-        return [landing + predicted_settling(self.machine, each[0], band) for each in self._servo_motion]
+        counts = [predicted_settling(self.machine, each[0], self.settling_band) for each in self._servo_motion]
+        return [self._landing_frames + each if each else 0 for each in counts]
 
     @property
     def simulated_sigmas(self) -> Float64:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from gpuvision.camera.smooth_field import not_below
-from gpuvision.jackknife import cluster_jackknife
+from gpuvision.jackknife import overlapping_jackknife
 from gpuvision.matching.pose.pose import TRANSFORM_PARAMETERS, Transform
 
 Float64 = npt.NDArray[np.float64]
@@ -22,12 +22,12 @@ Float64 = npt.NDArray[np.float64]
 # Blocks along each side of the edges' bounding box, for the test of the transform. Chosen: 36 blocks give variances of
 # 35 degrees of freedom, and blocks of 100 px in an image of 640 px, wider than the defects of a board.
 _BLOCKS = 6
-# Blocks along each side for the covariance, and shifts of their grid [blocks]. Edges along one trace err together over
+# Blocks along each side for the covariance, and number of shifts of their grid. Edges along one trace err together over
 # more than 100 px in binary images, which draw a nearly vertical edge in steps of whole pixels: 4 blocks are wider. The
 # mean over shifted grids makes up for the smaller number of blocks: its variance is 0.70 along each side of that of
 # one grid (derived). Measured with 2505 pairs: 12 are off by more than 3 standard deviations; with 6 x 6 separate
 # blocks 19 are.
-_WIDE_BLOCKS, _SHIFTS = 4, (0.0, 1.0 / 3.0, 2.0 / 3.0)
+_WIDE_BLOCKS, _SHIFTS = 4, 3
 # Probability of a misfit of a transform that is right (chosen).
 _SIGNIFICANCE = 1e-3
 
@@ -96,8 +96,6 @@ def registration_errors(edges: FittedEdges, transform: Transform) -> Registratio
     ----------
     .. [1] A. C. Cameron and D. L. Miller, "A practitioner's guide to cluster-robust inference", J. Human Resources 50
        (2015) 317.
-    .. [2] M. S. Meketon and B. Schmeiser, "Overlapping batch means: something for nothing?", Winter Simulation
-       Conference (1984) 227.
     """
     good = np.isfinite(edges.residual) & (edges.weight > 0.0)
     edges = edges._replace(
@@ -105,11 +103,11 @@ def registration_errors(edges: FittedEdges, transform: Transform) -> Registratio
     )
     count = TRANSFORM_PARAMETERS[transform]
     columns, larger = _columns(edges, transform), _columns(edges, transform, with_next=True)
-    fit = _fit(edges, columns)
+    fit = _fit(edges, columns, _WIDE_BLOCKS, _SHIFTS)
     covariance = fit.covariance[:count, :count]
     if len(edges.residual) <= 2 * len(larger):
         return RegistrationErrors(covariance, 0.0)
-    next_fit = _fit(edges, larger)
+    next_fit = _fit(edges, larger, _BLOCKS)
     further = slice(count, count + len(larger) - len(columns))
     if not _is_significant(next_fit, further):
         return RegistrationErrors(covariance, 0.0)
@@ -121,15 +119,11 @@ def registration_errors(edges: FittedEdges, transform: Transform) -> Registratio
 
 
 class _Fit(NamedTuple):
-    """Parameters of a linear fit of the residuals and their covariance.
-
-    ``separate`` is the covariance from one grid of a number of separate ``blocks``, for the test of parameters.
-    """
+    """Parameters of a linear fit of the residuals, their covariance, and the number of cells with edges."""
 
     parameters: Float64
     covariance: Float64
-    separate: Float64
-    blocks: int
+    cells: int
 
 
 def _columns(edges: FittedEdges, transform: Transform, *, with_next: bool = False) -> Float64:
@@ -148,8 +142,8 @@ def _columns(edges: FittedEdges, transform: Transform, *, with_next: bool = Fals
     return np.array([*columns, *([np.ones_like(nx)] if edges.etch_bias_sigma else [])])
 
 
-def _fit(edges: FittedEdges, columns: Float64) -> _Fit:
-    """Fit the residuals by columns; the covariance is clustered by blocks of the image."""
+def _fit(edges: FittedEdges, columns: Float64, blocks: int, overlap: int = 1) -> _Fit:
+    """Fit the residuals by columns; the covariance is clustered by blocks of the image, of ``overlap`` cells."""
     scale = np.sqrt(np.mean(columns**2, axis=1)) + np.finfo(float).tiny
     root = np.sqrt(edges.weight)
     weighted, residual = columns / scale[:, None] * root, edges.residual * root
@@ -165,31 +159,25 @@ def _fit(edges: FittedEdges, columns: Float64) -> _Fit:
     independent = inverse * (left @ left / max(len(left) - len(columns), 1))
     shrunk = inverse @ shrinkage
 
-    def covariance(grids: list[npt.NDArray[np.intp]]) -> Float64:
-        clustered = np.mean([cluster_jackknife(weighted, normal, left, grid) for grid in grids], axis=0)
-        return np.asarray((not_below(clustered, independent) + np.outer(shrunk, shrunk)) / np.outer(scale, scale))
-
-    separate = _blocks(edges.place, _BLOCKS)
-    overlapping = [_blocks(edges.place, _WIDE_BLOCKS, (x, y)) for x in _SHIFTS for y in _SHIFTS]
-    return _Fit(parameters / scale, covariance(overlapping), covariance([separate]), len(np.unique(separate)))
+    cell = _cells(edges.place, blocks * overlap)
+    clustered = overlapping_jackknife(weighted, normal, left, cell, cells=blocks * overlap, overlap=overlap)
+    covariance = not_below(clustered, independent) + np.outer(shrunk, shrunk)
+    return _Fit(parameters / scale, covariance / np.outer(scale, scale), len(np.unique(cell, axis=0)))
 
 
-def _blocks(place: Float64, count: int, shift: tuple[float, float] = (0.0, 0.0)) -> npt.NDArray[np.intp]:
-    """Return the block (n,) of each place: equal parts of the bounding box, shifted by 0 to 1 block along x and y."""
+def _cells(place: Float64, count: int) -> npt.NDArray[np.intp]:
+    """Return column and row (n, 2) of the cell of each place: equal parts of the bounding box."""
     low = place.min(axis=0)
     extent = np.maximum(place.max(axis=0) - low, np.finfo(float).tiny)
-    # The last place is at the end of the last block. A shifted grid has one block more along its side.
-    cell = np.minimum((place - low) / extent * count, np.nextafter(count, 0.0))
-    column, row = (cell + np.array(shift)).astype(np.intp).T
-    return np.asarray(row * (count + 1) + column)
+    return np.minimum((place - low) / extent * count, count - 1).astype(np.intp)
 
 
 def _is_significant(fit: _Fit, further: slice) -> bool:
     """Return whether further parameters differ from 0: Wald test against the F distribution for the blocks."""
     values = fit.parameters[further]
-    freedom = fit.blocks - len(values)
+    freedom = fit.cells - len(values)
     if freedom < 1:
         return False
-    wald = float(values @ np.linalg.pinv(fit.separate[further, further], hermitian=True) @ values)
-    ratio = wald * freedom / (len(values) * (fit.blocks - 1))
+    wald = float(values @ np.linalg.pinv(fit.covariance[further, further], hermitian=True) @ values)
+    ratio = wald * freedom / (len(values) * (fit.cells - 1))
     return bool(stats.f.sf(ratio, len(values), freedom) < _SIGNIFICANCE)

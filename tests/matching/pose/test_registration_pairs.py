@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gpuvision.host import Device
-from gpuvision.jackknife import cluster_jackknife
+from gpuvision.jackknife import cluster_jackknife, overlapping_jackknife
 from gpuvision.matching.pose.registration import register_images
 from gpuvision.matching.pose.registration_errors import FittedEdges, registration_errors
 from gpuvision.status import Status
@@ -186,3 +186,18 @@ def test_the_jackknife_leaves_one_cluster_out(rng: np.random.Generator) -> None:
     fits = [np.linalg.lstsq(columns[:, cluster != k].T, left[cluster != k], rcond=None)[0] for k in range(7)]
     expected = sum(np.outer(each, each) for each in fits) * 6 / 7
     np.testing.assert_allclose(cluster_jackknife(columns, columns @ columns.T, left, cluster), expected, rtol=1e-9)
+
+
+def test_the_overlapping_jackknife_is_the_mean_over_shifted_grids(rng: np.random.Generator) -> None:
+    """Grids of blocks of 2 x 2 cells in 6 x 6 cells, shifted by a cell; each fit leaves out the points of one block."""
+    columns, residual = rng.normal(size=(3, 90)), rng.normal(size=90)
+    cell = rng.integers(0, 6, (90, 2))
+    cell[:20] = 5, 0  # cells without points are left out
+    left = residual - columns.T @ np.linalg.lstsq(columns.T, residual, rcond=None)[0]
+    covariances = []
+    for shift in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        block = (cell + shift) // 2 @ (10, 1)
+        fits = [np.linalg.lstsq(columns[:, block != k].T, left[block != k], rcond=None)[0] for k in np.unique(block)]
+        covariances.append(sum(np.outer(each, each) for each in fits) * (len(fits) - 1) / len(fits))
+    found = overlapping_jackknife(columns, columns @ columns.T, left, cell, cells=6, overlap=2)
+    np.testing.assert_allclose(found, np.mean(covariances, axis=0), rtol=1e-9)

@@ -31,6 +31,9 @@ Float64 = npt.NDArray[np.float64]
 
 # Largest damping ratio of a vibration that a fit looks for (chosen): above, nothing swings.
 _MAX_DAMPING = 0.7
+# Damping ratio below which an error swings: at 0.34 the amplitude falls to a tenth within a period. Above, a fit follows
+# the rest of the step response (chosen).
+_SWINGING = 0.34
 # Probability to find a vibration in the noise of a resting axis (chosen).
 _FALSE_ALARM = 1e-3
 
@@ -176,8 +179,7 @@ def vibration_of_loop(record: LoopRecord, since: float) -> ResidualVibration:
         degrees = len(times) - 5
         ratio = (rest - left) / 4.0 / (left / degrees) if left > 0.0 else math.inf if rest > 0.0 else 0.0
         is_significant = f_distribution.sf(ratio, 4, degrees) * len(times) / 2.0 < _FALSE_ALARM
-        # At the largest damping the fit follows the rest of the step response, which does not swing.
-        if is_significant and found.damping < 0.99 * _MAX_DAMPING:
+        if is_significant and found.damping < _SWINGING:
             frequency[axis], damping[axis] = found.frequency, found.damping
     return ResidualVibration(frequency, damping)
 

@@ -31,8 +31,8 @@ Float64 = npt.NDArray[np.float64]
 
 # Largest damping ratio of a vibration that a fit looks for (chosen): above, nothing swings.
 _MAX_DAMPING = 0.7
-# Damping ratio below which an error swings: at 0.34 the amplitude falls to a tenth within a period. Above, a fit follows
-# the rest of the step response (chosen).
+# Damping ratio below which an error swings (chosen): at 0.34 the amplitude falls to a tenth within a period. Above, a
+# fit follows the rest of the step response.
 _SWINGING = 0.34
 # Probability to find a vibration in the noise of a resting axis (chosen).
 _FALSE_ALARM = 1e-3

@@ -43,6 +43,11 @@ _KERNEL_CHANGES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = 
     (r"(?<![\w.])\d+\.\d+", lambda number: str(1.1 * float(number[0]) or 0.1)),
     (r"(?<![\w.])[1-9](?=[;,)\]])", lambda number: str(int(number[0]) - 1)),
 )
+# Keyword arguments of figures that set only the sizes of panes, text, lines and markers: no statement about data. They
+# are not changed in `gpuvision/plots`; every other number of a figure is.
+_APPEARANCE = re.compile(
+    "figsize|height_ratios|width_ratios|fontsize|labelsize|labelpad|linewidths?|markersize|markeredgewidth|alpha"
+)
 _NO_CODE = re.compile(r"//[^\n]*|/\*.*?\*/|^[ \t]*#(?:[^\n]*\\\n)*[^\n]*", re.DOTALL | re.MULTILINE)
 
 
@@ -129,7 +134,21 @@ def _code_fault(path: Path, rng: random.Random) -> Fault | None:
     start = next(k for k, (old, new) in enumerate(zip(text, changed, strict=False)) if old != new)
     rest = min(len(text), len(changed)) - start
     same = next((k for k in range(rest) if text[-1 - k] != changed[-1 - k]), rest)
+    if path.parent == ROOT / "gpuvision" / "plots" and _is_appearance(text, start):
+        return None
     return Fault(str(path.relative_to(ROOT)), start, len(text) - same, changed[start : len(changed) - same])
+
+
+def _is_appearance(text: str, place: int) -> bool:
+    """Return whether a character of a Python file belongs to a keyword argument that `_APPEARANCE` matches."""
+    lines = text[:place].split("\n")
+    at = (len(lines), len(lines[-1].encode()))  # columns of the syntax tree are bytes
+    return any(
+        _APPEARANCE.fullmatch(each.arg or "")
+        and (each.lineno, each.col_offset) <= at < (each.end_lineno or 0, each.end_col_offset or 0)
+        for each in ast.walk(ast.parse(text))
+        if isinstance(each, ast.keyword)
+    )
 
 
 class _Places(Visitor):

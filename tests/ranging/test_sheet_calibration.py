@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.views.camera_fit import Pose
 from gpuvision.camera.views.pose_response import PoseResponse, change_camera
-from gpuvision.ranging.sheet_calibration import fit_sheet
-from gpuvision.ranging.sheet_readings import LaserLine
+from gpuvision.ranging.sheet_calibration import _system, fit_sheet
+from gpuvision.ranging.sheet_readings import LaserLine, SheetFrame
 from gpuvision.ranging.sheet_result import SheetFit
 from laser_sensor import LaserSensor, on_stage, poses, readings, sensor
 
@@ -218,3 +219,58 @@ def test_lines_with_few_readings_are_left_out(rng: np.random.Generator) -> None:
     assert np.isnan(found.residuals[0]).all()
     np.testing.assert_allclose(found.origin, clean.origin, rtol=1e-9)
     np.testing.assert_allclose(found.noise_covariance, clean.noise_covariance, rtol=1e-6, atol=1e-30)
+
+
+def test_derivatives_of_the_distances(rng):
+    """A change of a ray, of a target's pose and of the bend moves the distance from a bent sheet as stated.
+
+    The point of a reading is the intersection of its ray with the plane of its target.
+    """
+    frame = SheetFrame(np.array([0.01, -0.02, 0.4]), Rotation.from_rotvec([0.3, -0.4, 0.2]).as_matrix())
+    bend = np.array([2.0, -3.0, 1.5])
+    view = np.array([0, 1, 1, 0, 1])
+    ray = rng.normal([0.0, 0.0, 1.0], 0.2, (5, 3))
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    normals, places = rng.normal([0.2, -0.1, -1.0], 0.2, (2, 3)), rng.normal([0.0, 0.0, 0.4], 0.05, (2, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    slope, by_camera = rng.normal(size=(5, 3)), rng.normal(size=(5, 3, 2))
+
+    def distances(ray: np.ndarray, normals: np.ndarray, places: np.ndarray, bend: np.ndarray = bend) -> np.ndarray:
+        normal = normals[view]
+        share = np.sum(normal * places[view], axis=1) / np.sum(normal * ray, axis=1)
+        g, h, d = frame.axes @ (share[:, None] * ray - frame.origin).T
+        return d - (bend[0] * g * g + bend[1] * g * h + bend[2] * h * h)
+
+    def slopes(change) -> np.ndarray:
+        return (change(1e-6) - change(-1e-6)) / 2e-6
+
+    share = np.sum(normals[view] * places[view], axis=1) / np.sum(normals[view] * ray, axis=1)
+    lines = tuple(SimpleNamespace(target=SimpleNamespace(pose=SimpleNamespace(translation=each))) for each in places)
+    readings = SimpleNamespace(
+        lines=lines,
+        view=view,
+        ray=ray,
+        slope=slope,
+        by_camera=by_camera,
+        point=share[:, None] * ray,
+        normal=normals[view],
+    )
+    found = _system(frame, bend, readings, 6)
+    np.testing.assert_allclose(found.distance, distances(ray, normals, places), rtol=1e-12)
+    np.testing.assert_allclose(
+        found.by_pixel, slopes(lambda e: distances(ray + e * slope, normals, places)), rtol=1e-6, atol=1e-9
+    )
+    for number in range(2):
+        expected = slopes(lambda e, n=number: distances(ray + e * by_camera[..., n], normals, places))
+        np.testing.assert_allclose(found.by_camera[:, number], expected, rtol=1e-6, atol=1e-9)
+    for axis, unit in enumerate(np.eye(3)):
+        turned = slopes(lambda e, w=unit: distances(ray, normals + e * np.cross(w, normals), places))
+        np.testing.assert_allclose(found.by_pose[:, axis], turned, rtol=1e-6, atol=1e-9)
+        moved = slopes(lambda e, t=unit: distances(ray, normals, places + e * t))
+        np.testing.assert_allclose(found.by_pose[:, 3 + axis], moved, rtol=1e-6, atol=1e-9)
+        bent = slopes(lambda e, b=unit: distances(ray, normals, places, bend + e * b))
+        np.testing.assert_allclose(found.design[:, 3 + axis], -bent, rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(found.design[:, 0], 1.0)
+    np.testing.assert_array_equal(found.design[:, 1:3], found.flat)
+    np.testing.assert_allclose(found.flat, (readings.point - frame.origin) @ frame.axes[:2].T, rtol=1e-12)
+    assert _system(frame, bend, readings, 3).design.shape == (5, 3)

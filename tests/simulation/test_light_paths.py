@@ -97,6 +97,16 @@ def test_further_bounces_come_on_top(device):
     assert 0.05 * first < further < first
 
 
+def test_patches_are_a_sixteenth_of_the_diagonal_by_default(device):
+    bounds = (0.12, 0.2, 0.05)
+    made = {size: paths(corner(), device, paths=(*PATHS, "multi-bounce"), patch_size=size) for size in (None, 0.02)}
+    diagonal = math.hypot(*bounds)
+    made[diagonal] = paths(corner(), device, paths=(*PATHS, "multi-bounce"), patch_size=diagonal / 16.0)
+    power = {size: each.profile(0.0).exposures["multi-bounce"].power for size, each in made.items()}
+    np.testing.assert_array_equal(power[None], power[diagonal])
+    assert np.any(power[None] != power[0.02])
+
+
 def test_nothing_lit_is_dark_and_not_zero(device):
     model = paths(corner(), device)
     # Far beyond the part, the sheet intersects no surface.

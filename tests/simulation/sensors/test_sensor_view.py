@@ -40,6 +40,16 @@ def test_what_is_behind_the_lens_or_over_the_horizon_is_nowhere():
     assert np.isnan(one.project([[0.0, 2 * BASELINE, 2 * STAND_OFF], [0.0, 0.5, 0.2]])).all()
     assert one.aperture_solid_angle([0.0, 2 * BASELINE, 2 * STAND_OFF]) == 0.0
 
+    # In front of the lens, on rays that part from the sheet: the sheet lies 0.1 and 0.9 of the way backwards.
+    away = one.lens[1] * np.array([0.0, 1.0, 0.0])  # from the sheet to the lens
+    across = away / np.linalg.norm(away)
+    axis = np.array(one.axis)
+    way = across + (0.1 - across @ axis) * axis
+    assert way @ axis > 0.0
+    assert way @ across > 0.0
+    for share in (0.1, 0.9):
+        assert np.isnan(one.project(np.array(one.lens) + one.lens[1] / (share * (way @ across)) * way)).all()
+
 
 def test_an_untilted_lens_loses_by_the_fourth_power_of_the_cosine():
     one = sensor_view()

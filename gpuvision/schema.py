@@ -56,7 +56,7 @@ class Section:
     table : mapping
         Parsed table.
     source : str
-        File name for messages.
+        File for messages: its path as the user gave it.
     name : str
         Dotted name of this table; empty for the whole file.
     folder : Path, optional
@@ -331,7 +331,7 @@ def read_preset(path: str | Path, folder: str, kind: str) -> Section:
     names = preset_names(folder)
     if str(path) in names:
         with resources.as_file(_presets(folder) / f"{path}.toml") as file:
-            return read_toml(file)
+            return _read_toml(file, f"preset {path}")
     path = Path(path)
     if not path.exists():
         close = difflib.get_close_matches(path.stem, names, 1)
@@ -346,6 +346,7 @@ def read_toml(path: Path) -> Section:
     Parameters
     ----------
     path : Path
+        The messages show it as it is given, relative or absolute.
 
     Returns
     -------
@@ -359,18 +360,23 @@ def read_toml(path: Path) -> Section:
     DescriptionError
         The file is not valid TOML; the message has line and column.
     """
+    return _read_toml(path, one_line(str(path)))
+
+
+def _read_toml(path: Path, source: str) -> Section:
+    """Read a TOML file; the messages call it `source`."""
     if path.is_dir():
-        raise IsADirectoryError(f"{path}: a folder, expected a TOML file")
-    with reading(path.name, "TOML file", DescriptionError):
+        raise IsADirectoryError(f"{source}: a folder, expected a TOML file")
+    with reading(source, "TOML file", DescriptionError):
         try:
             with path.open("rb") as file:
                 content = file.read(int(MAX_DESCRIPTION_BYTES.value) + 1)
-            MAX_DESCRIPTION_BYTES.check(len(content), f"{path.name}: {len(content)} bytes", DescriptionError)
+            MAX_DESCRIPTION_BYTES.check(len(content), f"{source}: {len(content)} bytes", DescriptionError)
             text = content.decode("utf-8")
-            _check_nesting(text, path.name)
-            return Section(tomllib.loads(text), path.name, folder=path.parent)
+            _check_nesting(text, source)
+            return Section(tomllib.loads(text), source, folder=path.parent)
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise DescriptionError(f"{path.name}: not valid TOML: {reason_of(error)}") from None
+            raise DescriptionError(f"{source}: not valid TOML: {reason_of(error)}") from None
 
 
 def _check_nesting(text: str, source: str) -> None:

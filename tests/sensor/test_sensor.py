@@ -23,7 +23,7 @@ from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.range_image import RotatingSheet, StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
-from gpuvision.schema import DescriptionError, Section
+from gpuvision.schema import DescriptionError, Section, read_preset
 from gpuvision.sensor.sensor import Sensor
 
 SHIPPED = sorted(Path(each.name).stem for each in resources.files("gpuvision").joinpath("presets", "sensors").iterdir())
@@ -448,6 +448,23 @@ def test_an_automatic_threshold() -> None:
     assert not Sensor.load("camera_line").auto_threshold
     with pytest.raises(DescriptionError, match=r"line\.threshold is 'automatic', expected a number"):
         sensor_of(changed("camera_line", line__threshold="automatic"))
+
+
+@pytest.mark.parametrize("content", ["kind = camera\n", 'kind = "psdd"\n', "[[[", "#" * (1 << 20) + "\n"])
+def test_messages_show_the_path_as_it_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str) -> None:
+    """Two sensors of the same name in two folders: the base name does not tell them apart."""
+    (tmp_path / "left").mkdir()
+    (tmp_path / "left" / "sensor.toml").write_text(content)
+    monkeypatch.chdir(tmp_path)
+    for path in (Path("left") / "sensor.toml", tmp_path / "left" / "sensor.toml"):
+        with pytest.raises(DescriptionError) as caught:
+            Sensor.load(path)
+        assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_messages_call_a_preset_by_its_name() -> None:
+    with pytest.raises(DescriptionError, match=r"^preset camera_line: the key 'nothing' is missing"):
+        read_preset("camera_line", "sensors", "sensor").section("nothing")
 
 
 def test_a_folder_is_no_sensor_file(tmp_path: Path) -> None:

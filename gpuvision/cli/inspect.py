@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
@@ -24,6 +25,7 @@ from gpuvision.cli.select import Side
 
 if TYPE_CHECKING:
     from gpuvision.formats.height_files import ImageScale
+    from gpuvision.host.outputs import Outputs
     from gpuvision.inspection.apertures import Aperture
     from gpuvision.inspection.paste import PasteSettings
     from gpuvision.workflows.inspecting_leads import LeadInspection
@@ -127,7 +129,7 @@ Sigma = Annotated[
     str | None,
     typer.Option(
         metavar="LENGTH",
-        help="Random standard deviation of the heights. Default: that of the height map, or else estimated.",
+        help="Random standard deviation of the heights. Default: from the height map, or else estimated.",
     ),
 ]
 CorrelationArea = Annotated[
@@ -193,17 +195,10 @@ def inspect(
     largest height, offset. Of each lead or ball: distance from the seating plane and from the least-squares plane.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    from gpuvision.host.outputs import Outputs
-    from gpuvision.workflows.inspecting_leads import LEAD_FILES
-    from gpuvision.workflows.inspecting_paste import PASTE_FILES
-
     if not heights.exists():
         raise FileNotFoundError(f"{heights}: no such file")
     lead_file = Path(leads) if leads is not None and leads.lower().endswith(".csv") else None
-    inputs = [each for each in (heights, board, lead_file) if each is not None]
-    outputs = Outputs("inspect", inputs=inputs, overwrite=overwrite)
-    outputs.claim_folder(out, PASTE_FILES if leads is None else LEAD_FILES)
-    outputs.claim(as_json)
+    outputs = _claim_outputs((heights, board, lead_file), out, as_json, overwrite, has_leads=leads is not None)
     common = _Common(
         heights=heights,
         scale=_image_scale(cell, height_step, height_offset, hole),
@@ -214,47 +209,47 @@ def inspect(
         sigma=_sigma(sigma),
         correlation_area=_correlation_area(correlation_area),
     )
+    paste = _PasteOptions(
+        stencil=stencil,
+        initial_pose=initial_pose,
+        search_range=search_range,
+        threshold=threshold,
+        margin=margin,
+        ring=ring,
+        reference_order=reference_order,
+        pad_height=pad_height,
+        minimum_volume=minimum_volume,
+        maximum_volume=maximum_volume,
+        scale_sigma=scale_sigma,
+        pin_names=pin_names,
+    )
     found: PasteInspection | LeadInspection
     if leads is not None:
-        reject_unused(
-            "with --leads",
-            stencil=stencil,
-            initial_pose=initial_pose,
-            search_range=search_range,
-            threshold=threshold,
-            margin=margin,
-            ring=ring,
-            reference_order=reference_order,
-            pad_height=pad_height,
-            minimum_volume=minimum_volume,
-            maximum_volume=maximum_volume,
-            scale_sigma=scale_sigma,
-            pin_names=pin_names,
-        )
+        reject_unused("with --leads", **paste._asdict())
         found = _inspect_leads(
             common, leads, lead_file, side_given=side is not None, centre=centre, maximum_gap=maximum_gap
         )
     else:
         reject_unused("without --leads", centre=centre, maximum_gap=maximum_gap)
-        if board is None or stencil is None:
-            missing = "--board" if board is None else "--stencil"
-            raise ValueError(f"{missing} is missing; expected a board with its stencil, or --leads")
-        if pose is not None:
-            reject_unused("with --pose, a known place", initial_pose=initial_pose, search_range=search_range)
-        found = _inspect_paste(
-            common,
-            board,
-            _paste_settings(stencil, threshold, margin, ring, reference_order, pad_height),
-            _volume_limits(minimum_volume, maximum_volume),
-            initial_pose=initial_pose,
-            search_range=search_range,
-            scale_sigma=scale_sigma,
-            pin_names=pin_names,
-        )
+        found = _inspect_paste(common, paste)
     found.write(out, overwrite=overwrite)
     write_report(as_json, found.report(), outputs)
     picture = out / ("volume.png" if leads is None else "coplanarity.png")
     echo(f"{found.summary()}\nlook at {picture} and {out / 'report.json'}", err=prints_report(as_json))
+
+
+def _claim_outputs(
+    inputs: Iterable[Path | None], out: Path, as_json: Path | None, overwrite: bool, *, has_leads: bool
+) -> Outputs:
+    """Check that the results and the report may be written, before the work."""
+    from gpuvision.host.outputs import Outputs
+    from gpuvision.workflows.inspecting_leads import LEAD_FILES
+    from gpuvision.workflows.inspecting_paste import PASTE_FILES
+
+    outputs = Outputs("inspect", inputs=[each for each in inputs if each is not None], overwrite=overwrite)
+    outputs.claim_folder(out, LEAD_FILES if has_leads else PASTE_FILES)
+    outputs.claim(as_json)
+    return outputs
 
 
 class _Common(NamedTuple):
@@ -268,6 +263,55 @@ class _Common(NamedTuple):
     pose: tuple[float, float, float] | None
     sigma: float | None
     correlation_area: float | None
+
+
+class _PasteOptions(NamedTuple):
+    """Options of the inspection of paste alone, as they were given."""
+
+    stencil: str | None
+    initial_pose: str | None
+    search_range: str | None
+    threshold: str | None
+    margin: str | None
+    ring: str | None
+    reference_order: int | None
+    pad_height: str | None
+    minimum_volume: float | None
+    maximum_volume: float | None
+    scale_sigma: str | None
+    pin_names: bool
+
+    def settings(self, stencil: str) -> PasteSettings:
+        """Parse the settings of the measurement of paste."""
+        from gpuvision.inspection.paste import PasteSettings
+
+        return PasteSettings(
+            stencil=quantities(stencil, "--stencil", "m")[0],
+            threshold=_length(self.threshold, "--threshold"),
+            margin=quantities(self.margin or "50um", "--margin", "m")[0],
+            ring=quantities(self.ring or "0.2mm", "--ring", "m")[0],
+            reference_order=1 if self.reference_order is None else self.reference_order,
+            pad_height=quantities(self.pad_height or "0", "--pad-height", "m")[0],
+        )
+
+    @property
+    def limits(self) -> VolumeLimits:
+        """Limits of the verdicts, 50 % and 150 % by default."""
+        from gpuvision.workflows.inspecting_paste import VolumeLimits
+
+        least, most = self.minimum_volume, self.maximum_volume
+        return VolumeLimits(minimum=0.5 if least is None else least, maximum=1.5 if most is None else most)
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Search range: shift [m] and rotation [rad]."""
+        from gpuvision.validation import finite
+
+        shift, turn = quantities(self.search_range or "2mm,3deg", "--search-range", "m,rad")
+        return (
+            finite(shift, "the shift of --search-range", minimum=0.0),
+            finite(turn, "the rotation of --search-range", minimum=0.0),
+        )
 
 
 def _inspect_leads(
@@ -312,39 +356,31 @@ def _inspect_leads(
     )
 
 
-def _inspect_paste(
-    common: _Common,
-    board: Path,
-    settings: PasteSettings,
-    limits: VolumeLimits,
-    *,
-    initial_pose: str | None,
-    search_range: str | None,
-    scale_sigma: str | None,
-    pin_names: bool,
-) -> PasteInspection:
+def _inspect_paste(common: _Common, options: _PasteOptions) -> PasteInspection:
     """Measure the solder paste of a board, and print the warnings."""
     from gpuvision.formats.height_files import read_heights
     from gpuvision.inspection.apertures import read_apertures
     from gpuvision.matching.artwork.artwork import read_artwork
-    from gpuvision.validation import finite
     from gpuvision.workflows.inspecting_paste import ScaleSigma, inspect_paste
 
-    scales = None if scale_sigma is None else ScaleSigma(**_scale_sigmas(scale_sigma))
-    shift, turn = quantities(search_range or "2mm,3deg", "--search-range", "m,rad")
-    reach = (
-        finite(shift, "the shift of --search-range", minimum=0.0),
-        finite(turn, "the rotation of --search-range", minimum=0.0),
-    )
-    layers = layers_of(common.layers)
-    pads = read_artwork(board, side=common.side, layers=layers).pads if pin_names else ()
+    board = common.board
+    if board is None or options.stencil is None:
+        missing = "--board" if board is None else "--stencil"
+        raise ValueError(f"{missing} is missing; expected a board with its stencil, or --leads")
+    if common.pose is not None:
+        given = {"initial_pose": options.initial_pose, "search_range": options.search_range}
+        reject_unused("with --pose, a known place", **given)
+    settings, limits = options.settings(options.stencil), options.limits
+    scales = None if options.scale_sigma is None else ScaleSigma(**_scale_sigmas(options.scale_sigma))
+    reach, layers = options.reach, layers_of(common.layers)
+    pads = read_artwork(board, side=common.side, layers=layers).pads if options.pin_names else ()
     found = inspect_paste(
         read_heights(common.heights, common.scale),
         read_apertures(board, side=common.side, layers=layers, pads=pads),
         settings,
         side=common.side,
         pose=common.pose,
-        initial_pose=_pose(initial_pose, "--initial-pose"),
+        initial_pose=_pose(options.initial_pose, "--initial-pose"),
         search_range=reach,
         sigma=common.sigma,
         correlation_area=common.correlation_area,
@@ -371,29 +407,6 @@ def _regions(
     if board is None:
         raise ValueError(f"--leads is {leads!r}, a part: give --board too, or a CSV file of leads")
     return pads_of_part(read_artwork(board, side=side, layers=layers_of(layers)).pads, leads)
-
-
-def _paste_settings(
-    stencil: str, threshold: str | None, margin: str | None, ring: str | None, order: int | None, pad_height: str | None
-) -> PasteSettings:
-    """Parse the settings of the measurement of paste."""
-    from gpuvision.inspection.paste import PasteSettings
-
-    return PasteSettings(
-        stencil=quantities(stencil, "--stencil", "m")[0],
-        threshold=_length(threshold, "--threshold"),
-        margin=quantities(margin or "50um", "--margin", "m")[0],
-        ring=quantities(ring or "0.2mm", "--ring", "m")[0],
-        reference_order=1 if order is None else order,
-        pad_height=quantities(pad_height or "0", "--pad-height", "m")[0],
-    )
-
-
-def _volume_limits(minimum: float | None, maximum: float | None) -> VolumeLimits:
-    """Return the limits of the verdicts, 50 % and 150 % by default."""
-    from gpuvision.workflows.inspecting_paste import VolumeLimits
-
-    return VolumeLimits(minimum=0.5 if minimum is None else minimum, maximum=1.5 if maximum is None else maximum)
 
 
 def _sigma(text: str | None) -> float | None:

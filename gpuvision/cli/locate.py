@@ -167,7 +167,6 @@ def locate(
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size, read_lens
-    from gpuvision.formats.features_file import read_features
     from gpuvision.host import Device
     from gpuvision.host.recordings import read_image
     from gpuvision.plots.board import draw_located_board
@@ -177,13 +176,7 @@ def locate(
     outputs = claim_outputs("locate", (image, board, camera, features), out, as_json, overwrite)
     outputs.claim(gcode)
     machine = _camera_at(camera_at, gcode, gcode_dialect)
-    chosen = None if features is None else read_features(features)
-    if chosen is not None:
-        reject_unused("with --features, a file with a fixed selection of calipers", budget=budget)
-        if side is not None and side.value != chosen.side:
-            raise ValueError(
-                f"--side is {side.value}, but the features in {features} are on the {chosen.side}; leave it out"
-            )
+    chosen = None if features is None else _features(features, budget, side)
     pixel = _pixel(scale, chosen)
     blur_px = blur or (_BLUR_PX if chosen is None else chosen.imaging.blur_px)
     # Check the options before the files, which take longer to read.
@@ -216,6 +209,17 @@ def locate(
         outputs.write_text(gcode, _gcode(located, machine, gcode_dialect, comment))
 
 
+def _features(file: Path, budget: int | None, side: Side | None) -> FeatureSet:
+    """Read ``--features``, and refuse options that contradict the file."""
+    from gpuvision.formats.features_file import read_features
+
+    features = read_features(file)
+    reject_unused("with --features, a file with a fixed selection of calipers", budget=budget)
+    if side is not None and side.value != features.side:
+        raise ValueError(f"--side is {side.value}, but the features in {file} are on the {features.side}; leave it out")
+    return features
+
+
 def _gcode(located: LocatedBoard, machine: tuple[float, ...], dialect: GcodeDialect | None, comment: str) -> str:
     """Return the G-code of a located board."""
     from gpuvision.formats.gcode_file import work_offset, work_offset_code
@@ -245,7 +249,7 @@ def _search_range(text: str | None) -> tuple[float, float] | None:
 
 
 def _pixel(scale: str | None, features: FeatureSet | None) -> float:
-    """Return the size of a pixel on the board [m]: that of ``--scale``, else that of the features."""
+    """Return the size of a pixel on the board [m]: from ``--scale``, else from the features."""
     if scale is not None:
         return quantities(scale, "--scale", "m")[0]
     if features is None:

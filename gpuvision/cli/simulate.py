@@ -165,10 +165,6 @@ def simulate(
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
-    from gpuvision.workflows.sensor_pair import pair_files
-    from gpuvision.workflows.simulated_recording import RECORDING_FILES
-    from gpuvision.workflows.simulating import prepare_simulation
-    from gpuvision.workflows.simulation_result import simulation_files
 
     reject_unused("with --materials", albedo=None if materials is None else albedo)
     reject_unused("without --second", rule=rule if second is None else None)
@@ -180,31 +176,13 @@ def simulate(
     read = [each for each in (part, sensor, second, materials, mask) if each is not None]
     read += [*described.files, *(() if second_sensor is None else second_sensor.files)]
     outputs = Outputs("simulate", inputs=read, overwrite=overwrite)
-    has_mask = mask == "best"
-    names_out = simulation_files(has_mask=has_mask) + (() if second is None else pair_files(has_mask=has_mask))
     described_by = [sensor] if second is None else [sensor, second]
-    if recording:
-        names_out += tuple(
-            f"{place}{name}" for place in ("", "second/")[: len(described_by)] for name in RECORDING_FILES
-        )
-    outputs.claim_folder(out, names_out)
+    outputs.claim_folder(out, _files(len(described_by), has_mask=mask == "best", has_recording=recording))
     outputs.claim(as_json)
     before = _mask(mask)
-    scene, made_of = _load_part(part, unit, materials, albedo, described)
-    task = prepare_simulation(
-        scene, made_of, described, paths=names, tolerance=tolerance, patch_size=patch_size, profiles=profiles
-    )
-    other = None
-    if second_sensor is not None:
-        other = prepare_simulation(
-            scene,
-            made_of,
-            second_sensor,
-            paths=names,
-            tolerance=tolerance,
-            patch_size=patch_size,
-            transports=task.transports,
-        )
+    loaded = _load_part(part, unit, materials, albedo, described)
+    light = {"paths": names, "tolerance": tolerance, "patch_size": patch_size}
+    task, other = _prepare(*loaded, described, second_sensor, light, profiles)
     made: dict[str, Any] = {
         "mask": before,
         "seed": (1 if seed is None else seed) if noise else None,
@@ -220,6 +198,34 @@ def simulate(
         f"{summary}\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}",
         err=prints_report(as_json),
     )
+
+
+def _files(sensors: int, *, has_mask: bool, has_recording: bool) -> tuple[str, ...]:
+    """Return the names of the files that a simulation of one sensor or of two writes."""
+    from gpuvision.workflows.sensor_pair import pair_files
+    from gpuvision.workflows.simulated_recording import RECORDING_FILES
+    from gpuvision.workflows.simulation_result import simulation_files
+
+    names = simulation_files(has_mask=has_mask) + (pair_files(has_mask=has_mask) if sensors > 1 else ())
+    places = ("", "second/")[:sensors] if has_recording else ()
+    return names + tuple(f"{place}{name}" for place in places for name in RECORDING_FILES)
+
+
+def _prepare(
+    scene: Scene,
+    materials: tuple[Material, ...],
+    sensor: Sensor,
+    second: Sensor | None,
+    light: dict[str, Any],
+    profiles: int | None,
+) -> tuple[SimulationTask, SimulationTask | None]:
+    """Prepare the simulation of a sensor, and of a second one with the same transports."""
+    from gpuvision.workflows.simulating import prepare_simulation
+
+    task = prepare_simulation(scene, materials, sensor, profiles=profiles, **light)
+    if second is None:
+        return task, None
+    return task, prepare_simulation(scene, materials, second, transports=task.transports, **light)
 
 
 def _names(paths: str) -> tuple[str, ...]:

@@ -5,7 +5,8 @@ its sides. All candidates copy the frame, place the rulers for the predicted pos
 from 64 start candidates and 12 iterations, and return the pose and covariance of the camera. Numba uses all cores for
 the rulers; `FeatureSet.bind` runs in the calling thread where the device has inline queues.
 
-The metadata of a row have the 50th and the 99th percentile of the time of a call, in microseconds, of 2000 calls.
+The metadata of a row have the 50th and the 99th percentile of the time of a call, in microseconds, of 2000 calls. Calls
+with the frame behind a lens (``lens_p50_us``) alternate with the calls without.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.imaging import Imaging
@@ -38,14 +40,16 @@ _HALF, _ONE = np.float32(0.5), np.float32(1.0)
 _rulers = of_ruler._compiled(of_ruler._sample_flat)
 
 
-def scene(size: int) -> tuple[NDArray[np.uint8], FeatureSet]:
-    """Return a frame of a bright square at the true pose, and rulers across its sides."""
+def scene(size: int, lens: Lens | None = None) -> tuple[NDArray[np.uint8], FeatureSet]:
+    """Return a frame of a bright square at the true pose, through a lens, and rulers across its sides."""
     half = 0.235 * size * PIXEL
     normal = np.repeat([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)], RULERS // 4, axis=0)
     along = np.tile(np.linspace(-0.6 * half, 0.6 * half, RULERS // 4), 4)[:, None]
     placement = PREDICTED[:2]
     point = placement + half * normal + along * normal[:, ::-1] * (-1, 1)
-    row, column = np.mgrid[:size, :size] - (size - 1) / 2
+    middle = (size - 1) / 2
+    pixels = np.stack(np.mgrid[:size, :size][::-1], axis=-1).astype(np.float64)
+    column, row = ((pixels if lens is None else lens.undistort(pixels)) - middle).transpose(2, 0, 1)
     x, y, theta = PREDICTED + MOTION
     c, s = np.cos(theta), np.sin(theta)
     seen = np.stack([column * c + row * s, column * s - row * c], axis=-1) * PIXEL + (x, y) - placement
@@ -142,7 +146,12 @@ def _case(device: Device, size: int) -> Case:
     frame, features = scene(size)
     solver = SolvePose(max_trials=TRIALS, max_iterations=STEPS)
     levels: dict[str, Any] = {"threshold": of_ruler.THRESHOLD, "noise": NOISE}
-    bound = features.bind(device, frame.shape, np.uint8, copper="bright", etch_bias_sigma=0.0, solver=solver, **levels)
+    options: dict[str, Any] = levels | {"copper": "bright", "etch_bias_sigma": 0.0, "solver": solver}
+    bound = features.bind(device, frame.shape, np.uint8, **options)
+    # A distortion of 3 % of the distance at a corner.
+    lens = Lens(k1=0.06 / size**2, centre=((size - 1) / 2, (size - 1) / 2))
+    distorted, _ = scene(size, lens)
+    behind_lens = features.bind(device, frame.shape, np.uint8, model=lens, **options)
     noise = bound.operation.ruler._packed(frame.dtype)[2]
     by_numpy = _Numpy(features, float(noise) / of_ruler.WIDTH, size)
     image, found = np.empty_like(frame), np.empty(3)
@@ -160,27 +169,33 @@ def _case(device: Device, size: int) -> Case:
     def ours() -> object:
         return bound(frame, PREDICTED)
 
+    def ours_behind_lens() -> object:
+        return behind_lens(distorted, PREDICTED)
+
     by_numba()
     result, true = bound(frame, PREDICTED), PREDICTED + MOTION
     sigma = np.sqrt(np.diag(np.asarray(result.covariance)))
     of_ours = np.array(result.pose)
-    for name, each in (("gpuvision", of_ours), ("numba", found), ("numpy", by_numpy(frame, PREDICTED))):
+    of_lens = np.array(behind_lens(distorted, PREDICTED).pose)
+    of_numpy = by_numpy(frame, PREDICTED)
+    for name, each in (("gpuvision", of_ours), ("lens", of_lens), ("numba", found), ("numpy", of_numpy)):
         if np.any(np.abs(each - true) > 6.0 * sigma):
             raise AssertionError(f"the pose of {name} differs from the truth: {each - true}, sigmas {sigma}")
     peers: dict[str, Callable[[], object]] = {"numpy": lambda: by_numpy(frame, PREDICTED), "numba": by_numba}
-    p50, p99 = percentiles(ours)
-    numba_p50, numba_p99 = percentiles(by_numba)
-    metadata = {"p50_us": p50, "p99_us": p99, "numba_p50_us": numba_p50, "numba_p99_us": numba_p99}
+    metadata: dict[str, float] = {}
+    for names, calls in ((("", "lens_"), (ours, ours_behind_lens)), (("numba_",), (by_numba,))):
+        for name, (p50, p99) in zip(names, percentiles(*calls), strict=True):
+            metadata |= {f"{name}p50_us": p50, f"{name}p99_us": p99}
     error = float(np.max(np.abs(of_ours[:2] - true[:2])))
     return Case("servo", str(size), ours, peers, error, metadata=metadata | {"sigma_m": float(sigma[0])})
 
 
-def percentiles(call: Callable[[], object]) -> tuple[float, float]:
-    """Return the 50th and 99th percentile of the time of a call in a sequence of calls [us]."""
-    times = np.empty(_CALLS)
-    for number in range(_CALLS):
-        begun = time.perf_counter()
-        call()
-        times[number] = time.perf_counter() - begun
-    p50, p99 = 1e6 * np.percentile(times, (50, 99))
-    return float(p50), float(p99)
+def percentiles(*calls: Callable[[], object]) -> list[tuple[float, float]]:
+    """Return the 50th and 99th percentile of the time of each call in a sequence of alternating calls [us]."""
+    times = np.empty((_CALLS, len(calls)))
+    for row in times:
+        for number, call in enumerate(calls):
+            begun = time.perf_counter()
+            call()
+            row[number] = time.perf_counter() - begun
+    return [(float(p50), float(p99)) for p50, p99 in 1e6 * np.percentile(times, (50, 99), axis=0).T]

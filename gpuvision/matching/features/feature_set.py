@@ -15,6 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import DTypeLike
 
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.lens import Lens
+from gpuvision.camera.magnification import largest_magnification
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, Side
 from gpuvision.matching.features.blob import FindBlobs
@@ -165,6 +168,7 @@ class FeatureSet:
         blur_px: float | None = None,
         etch_bias_sigma: float | None = None,
         search_px: float | None = None,
+        model: Lens | Camera | None = None,
         solver: SolvePose | None = None,
         queue: Any = None,
     ) -> BoundFeatures:
@@ -198,6 +202,9 @@ class FeatureSet:
         search_px : float, optional
             Largest distance of a feature from its predicted place [px], above 0. None: the search range for which the
             features were selected. A loop that follows the board needs a few pixels only; shorter rulers are faster.
+        model : Lens or Camera, optional
+            Lens distortion, in pixels of the full image (of a `Camera`: with the camera matrix of the model). The
+            frames are then distorted; the pose and the pixel size refer to the undistorted image. None: no distortion.
         solver : SolvePose, optional
             None: Tukey's loss with the scale from the residuals, 64 start candidates, an unknown etch bias where there
             are single edges, and twice the search range as limit.
@@ -224,36 +231,57 @@ class FeatureSet:
         scale = self.imaging.pixel if pixel_size is None else pixel_size
         blur = self.imaging.blur_px if blur_px is None else blur_px
         etch = self.imaging.etch_bias_sigma if etch_bias_sigma is None else etch_bias_sigma
-        device = Device.best() if device is None else device
-        limits = FiducialLimits()
-        drilled = self.fiducials.hole > 0
-        levels: dict[str, Any] = {"threshold": threshold, "noise": noise}
-        blobs: dict[str, Any] = levels | {
-            "polarity": copper,
-            "search_px": self._fiducial_search_px(scale, etch) if search_px is None else search_px,
-            "spokes": SPOKES,
-        }
+        full = shape if frame_shape is None else frame_shape
+        camera = self._camera_features(copper, scale, full, model)
+        magnification = 1.0 if model is None else largest_magnification(model, full)
         has_etch = etch > 0 and bool(np.any(self.spacing == 0)) and len(self.spacing) > 0
+        levels = {"threshold": threshold, "noise": noise}
+        limits = FiducialLimits()
+        matched, drilled = self._blobs(copper, scale, blur, etch, search_px, magnification, levels)
         operation = EstimateFeaturePose(
-            features=self._camera_features(copper, scale, shape if frame_shape is None else frame_shape),
+            features=camera,
             ruler=RulerEdges(
                 per_ruler=True,
-                length=self._ruler_length(scale, blur, search_px),
+                length=self._ruler_length(scale, blur, search_px, magnification),
                 width=self.imaging.width_px,
                 smoothing_px=self.imaging.smoothing_ratio * blur,
                 **levels,
             ),
-            matched=FindBlobs(smoothing_px=self._fiducial_smoothing(~drilled, scale, blur), **blobs),
-            drilled=FindBlobs(smoothing_px=self._fiducial_smoothing(drilled, scale, blur), match=False, **blobs),
+            matched=matched,
+            drilled=drilled,
             solver=self._solver(etch if has_etch else None, scale, search_px) if solver is None else solver,
             ruler_sigma_px=SAMPLING_SIGMA_PX,
             matched_sigma_px=limits.matched_sigma_px,
             drilled_sigma_px=limits.edges_sigma_px,
             size_tolerance=limits.size_tolerance_px * scale + limits.size_sigmas * etch,
         )
-        return BoundFeatures(operation, device, shape, dtype, queue)
+        return BoundFeatures(operation, Device.best() if device is None else device, shape, dtype, queue)
 
-    def _camera_features(self, copper: Copper, scale: float, frame_shape: tuple[int, int]) -> CameraFeatures:
+    def _blobs(
+        self,
+        copper: Copper,
+        scale: float,
+        blur: float,
+        etch: float,
+        search_px: float | None,
+        magnification: float,
+        levels: dict[str, float],
+    ) -> tuple[FindBlobs, FindBlobs]:
+        """Return the measurements of the fiducials whose grey levels are matched, and of the drilled fiducials."""
+        drilled = self.fiducials.hole > 0
+        common: dict[str, Any] = levels | {
+            "polarity": copper,
+            "search_px": self._fiducial_search_px(scale, etch, magnification) if search_px is None else search_px,
+            "spokes": SPOKES,
+        }
+        return (
+            FindBlobs(smoothing_px=self._fiducial_smoothing(~drilled, scale, blur), **common),
+            FindBlobs(smoothing_px=self._fiducial_smoothing(drilled, scale, blur), match=False, **common),
+        )
+
+    def _camera_features(
+        self, copper: Copper, scale: float, frame_shape: tuple[int, int], model: Lens | Camera | None
+    ) -> CameraFeatures:
         spacing = self.spacing / scale
         is_pair = spacing > 0
         # The normal points out of the copper: bright copper falls along it, a bright trace begins with a rising edge.
@@ -276,22 +304,24 @@ class FeatureSet:
             pixel_size=scale,
             frame_shape=frame_shape,
             mirrored=self.side == "bottom",
+            model=model,
         )
 
-    def _ruler_length(self, scale: float, blur_px: float, search_px: float | None) -> int:
+    def _ruler_length(self, scale: float, blur_px: float, search_px: float | None, magnification: float) -> int:
         """Return the number of samples of all rulers: a multiple of 16, so that few lengths are built."""
         smoothing = self.imaging.smoothing_ratio * blur_px
         if search_px is None:
-            lengths = self.length / scale
+            lengths = self.length / scale * magnification
         else:
-            lengths = 2 * (search_px + 3 * smoothing) + 3 + self.spacing / scale
+            lengths = 2 * (search_px + 3 * smoothing) + 3 + self.spacing / scale * magnification
         longest = max(float(lengths.max(initial=0.0)), 2 * math.ceil(3 * smoothing) + 3)
         return min(16 * math.ceil(longest / 16), MAX_LENGTH)
 
-    def _fiducial_search_px(self, scale: float, etch_bias_sigma: float) -> float:
+    def _fiducial_search_px(self, scale: float, etch_bias_sigma: float, magnification: float) -> float:
         distance = float(search_distance(self.fiducials.point, self.placement, self.imaging).max(initial=0.0))
         return min(
-            (distance + _FIDUCIAL_SIGMAS * etch_bias_sigma) / scale + _FIDUCIAL_SLACK_PX, _MAX_FIDUCIAL_SEARCH_PX
+            (distance + _FIDUCIAL_SIGMAS * etch_bias_sigma) / scale * magnification + _FIDUCIAL_SLACK_PX,
+            _MAX_FIDUCIAL_SEARCH_PX,
         )
 
     def _fiducial_smoothing(self, which: npt.NDArray[np.bool_], scale: float, blur_px: float) -> float:

@@ -18,6 +18,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.camera.camera import Camera, Direction
+from gpuvision.camera.lens import Lens
 from gpuvision.host import (
     Define,
     Device,
@@ -133,6 +135,8 @@ class CameraFeatures:
         Rows and columns of the full image, whose middle the pose refers to.
     mirrored : bool
         Whether the camera sees the artwork from behind.
+    model : Lens or Camera, optional
+        Lens distortion, in pixels of the full image; frames are then distorted. None: no distortion.
     """
 
     rulers: Rows
@@ -142,17 +146,26 @@ class CameraFeatures:
     pixel_size: float
     frame_shape: tuple[int, int]
     mirrored: bool = False
+    model: Lens | Camera | None = None
 
     def __post_init__(self) -> None:
+        if self.model is not None and not isinstance(self.model, Lens | Camera):
+            raise TypeError(f"CameraFeatures.model is {self.model!r}, expected a Lens or a Camera")
         finite(self.pixel_size, "CameraFeatures.pixel_size [m]", above=0.0)
         numbers(self.placement, (2,), "CameraFeatures.placement [m]")
         if not 3 <= self.rows <= _MAX_ROWS:
             raise ValueError(f"{self.rows} rows (a fiducial has two), a pose takes 3 to {_MAX_ROWS}")
 
     @property
+    def counts(self) -> tuple[int, int, int]:
+        """Numbers of rulers, matched and drilled fiducials."""
+        return len(self.rulers), len(self.matched), len(self.drilled)
+
+    @property
     def rows(self) -> int:
         """Number of rows of the pose: one of a ruler, two of a fiducial."""
-        return len(self.rulers) + 2 * (len(self.matched) + len(self.drilled))
+        rulers, matched, drilled = self.counts
+        return rulers + 2 * (matched + drilled)
 
     def tables(self, wide: np.dtype[Any]) -> list[Any]:
         """Return the tables and numbers that both kernels of ``feature_pose.cl`` take."""
@@ -163,8 +176,21 @@ class CameraFeatures:
             _table(self.rulers, RULER_FEATURE),
             _table((*self.matched, *self.drilled), FIDUCIAL_FEATURE),
             np.array(view, wide),
-            *map(np.int32, (len(self.rulers), len(self.matched), len(self.drilled))),
+            *map(np.int32, self.counts),
         ]
+
+    def model_defines(self, real: np.dtype[Any]) -> dict[str, Define]:
+        """Return the build options of ``feature_lens.h``."""
+        if isinstance(self.model, Camera):
+            return {**self.model.defines(), "CAMERA_STEPS": self.model.newton_steps(real)}
+        return {} if self.model is None else dict(self.model.defines)
+
+    def model_table(self, real: np.dtype[Any], direction: Direction) -> npt.NDArray[Any] | None:
+        """Return a table of ``feature_lens.h``; None without a model."""
+        if isinstance(self.model, Camera):
+            return self.model.packed(real, direction)
+        with np.errstate(over="ignore"):
+            return None if self.model is None else self.model.packed((0.0, 0.0), 1.0, inverse=True).astype(real)
 
     @property
     def present(self) -> dict[str, Define]:
@@ -201,31 +227,29 @@ class PlaceFeatures(VisionOperation[PlacedFeatures]):
         build = LaunchBuilder(self, device, shape, dtype, precision="single", narrows=True, variant=self.variant)
         build.check_dtype(build.widest.name, of="poses")
         build.check_shape(shape == (3,), "a pose (3,)")
-        of, counts = self.features, (len(self.features.rulers), len(self.features.matched), len(self.features.drilled))
+        of = self.features
         work = build.work(1, each=1, group=_ITEMS)
-        shapes = {name: (count, size) if count else None for name, count, size in _placed(counts)}
+        sizes = zip(PlacedFeatures._fields, of.counts, (7, 3, 3), strict=True)
+        shapes = {name: (count, size) if count else None for name, count, size in sizes}
         return build.launch(
             "feature_pose/feature_pose.cl",
             "place_features",
             work=work,
             more_inputs=[((2,), build.real)],
             outputs=build.outputs(shapes),
-            defines={**type_defines("WIDE", dtype), **flags(PLACE_FEATURES=True)},
-            arguments=of.tables(dtype),
+            defines={**type_defines("WIDE", dtype), **flags(PLACE_FEATURES=True), **of.model_defines(build.real)},
+            arguments=[*of.tables(dtype), *(of.model_table(build.real, each) for each in ("distort", "undistort"))],
             passes_once=work.vectors,
         )
-
-
-def _placed(counts: tuple[int, int, int]) -> list[tuple[str, int, int]]:
-    return [("rulers", counts[0], 7), ("matched", counts[1], 3), ("drilled", counts[2], 3)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolveFeatures(VisionOperation[FeaturePose]):
     """Pose of the camera from measured features: last stage of `EstimateFeaturePose`.
 
-    Inputs are the expected pose; position, sigma, status of the rulers; shift, size, covariance, status of the matched
-    fiducials; the same of the drilled fiducials. A kind without features has no inputs.
+    Inputs are the expected pose and the corner; position, sigma, status and place of the rulers; shift, size,
+    covariance, status and place of the matched fiducials; the same of the drilled fiducials. The places come from
+    `PlaceFeatures`. A kind without features has no inputs.
 
     Parameters
     ----------
@@ -252,14 +276,15 @@ class SolveFeatures(VisionOperation[FeaturePose]):
         build = LaunchBuilder(self, device, shape, dtype, precision="single", narrows=True, variant=self.solver.variant)
         of, solver = self.features, self.solver
         work = build.work(1, each=1, group=_ITEMS)
-        rows, features = of.rows, len(of.rulers) + len(of.matched) + len(of.drilled)
+        rows, features = of.rows, sum(of.counts)
         real, flag = build.real, np.dtype(np.uint8)
-        inputs: list[Any] = []
+        inputs: list[Any] = [((2,), real)]
         if of.rulers:
-            inputs += [((len(of.rulers),), each) for each in (real, real, flag)]
-        for count in (len(of.matched), len(of.drilled)):
+            inputs += [*(((len(of.rulers),), each) for each in (real, real, flag)), ((len(of.rulers), 7), real)]
+        for count in of.counts[1:]:
             if count:
                 inputs += [((count, 2), real), ((count,), real), ((count, 3, 3), real), ((count,), flag)]
+                inputs.append(((count, 3), real))
         shapes: dict[str, tuple[int, ...] | None] = dict.fromkeys(FeaturePose._fields, ())
         shapes |= {"pose": (3,), "covariance": (3, 3), "motion": (3,), "motion_covariance": (3, 3)}
         shapes |= {"residuals": (rows,), "weights": (rows,), "feature_status": (features,)}
@@ -273,9 +298,15 @@ class SolveFeatures(VisionOperation[FeaturePose]):
             work=work,
             more_inputs=inputs,
             outputs=build.outputs(shapes, **types),
-            defines={**type_defines("WIDE", dtype), **of.present, **solver.defines(rows, vectors=work.vectors)},
+            defines={
+                **type_defines("WIDE", dtype),
+                **of.present,
+                **of.model_defines(real),
+                **solver.defines(rows, vectors=work.vectors),
+            },
             arguments=[
                 *of.tables(dtype),
+                of.model_table(real, "undistort"),
                 solver.starts(rows, vectors=work.vectors),
                 np.int32(solver.max_trials),
                 np.int32(solver.max_iterations),
@@ -307,7 +338,10 @@ class EstimateFeaturePose(OperationSequence[FeaturePose]):
     Notes
     -----
     Error: coordinates are relative to the placement point, so that single precision costs 1e-7 of the distance of a
-    feature from it. The pose has the error of `SolvePose`.
+    feature from it. The pose has the error of `SolvePose`. With a lens two points of Gauss-Legendre integrate the lens
+    along a ruler; the edge is a straight line over the width of a ruler: a curvature k [1/px] of its image shifts it by
+    k (width^2 - 1) / 24 px, 5e-4 px for 5 lines, k1 = -0.2, f = 220 px and 60 px off the centre. Where a feature lies
+    past the fold of the lens, its status is NOT_INVERTIBLE.
     """
 
     Result: ClassVar[type[Any]] = FeaturePose
@@ -340,11 +374,12 @@ class EstimateFeaturePose(OperationSequence[FeaturePose]):
         stages = [Stage("place", PlaceFeatures(features=of, variant=self.solver.variant), ("pose", "corner"))]
         if of.rulers:
             stages.append(Stage("edges", replace(self.ruler, count=len(of.rulers)), ("frame", "place.rulers")))
-            measured += [f"edges.{name}" for name in ("position", "sigma", "status")]
+            measured += [*(f"edges.{name}" for name in ("position", "sigma", "status")), "place.rulers"]
         for name, operation, rows in (("matched", self.matched, of.matched), ("drilled", self.drilled, of.drilled)):
             if rows:
                 stages.append(Stage(name, replace(operation, count=len(rows)), ("frame", f"place.{name}")))
-                measured += [f"{name}.{each}" for each in ("shift", "size", "covariance", "status")]
+                fields = (f"{name}.{each}" for each in ("shift", "size", "covariance", "status"))
+                measured += [*fields, f"place.{name}"]
         solve = SolveFeatures(
             features=of,
             solver=self.solver,
@@ -353,5 +388,5 @@ class EstimateFeaturePose(OperationSequence[FeaturePose]):
             drilled_sigma_px=self.drilled_sigma_px,
             size_tolerance=self.size_tolerance,
         )
-        stages.append(Stage("solve", solve, ("pose", *measured)))
+        stages.append(Stage("solve", solve, ("pose", "corner", *measured)))
         return Layout(inputs, stages, {name: f"solve.{name}" for name in FeaturePose._fields})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -142,6 +143,21 @@ def test_a_region_of_the_image_gives_the_pose_of_the_image(
     cut = np.ascontiguousarray(whole[top:-2, left:-2])
     found = bind(features, device, shape=cut.shape, frame_shape=SHAPE, model=CAMERA)(cut, NEAR, corner=(left, top))
     assert (np.abs(found.pose - expected) <= (1e-3 * PIXEL, 1e-3 * PIXEL, 3e-6)).all()
+
+
+@pytest.mark.slow  # two more builds
+@pytest.mark.parametrize("model", [CAMERA, LENS], ids=["camera", "lens"])
+def test_both_kernel_variants_give_the_same_pose(
+    model: Camera | Lens, features: FeatureSet, device: Device, rng: np.random.Generator
+) -> None:
+    seen = image(picture(model, NEAR), rng)
+    bound = bind(features, device, model=model)
+    pose, residuals = bound(seen, NEAR).pose.copy(), bound(seen, NEAR).residuals.copy()
+    for variant in ("vector", "work_item"):
+        solver = replace(bound.operation.solver, variant=variant)
+        found = bind(features, device, model=model, solver=solver)(seen, NEAR)
+        np.testing.assert_allclose(found.residuals, residuals, atol=1e-4 * PIXEL)
+        assert (np.abs(found.pose - pose) <= (1e-4 * PIXEL, 1e-4 * PIXEL, 1e-6)).all()
 
 
 def test_features_past_the_fold_are_not_invertible(

@@ -48,7 +48,7 @@ def scene(size: int, lens: Lens | None = None) -> tuple[NDArray[np.uint8], Featu
     placement = PREDICTED[:2]
     point = placement + half * normal + along * normal[:, ::-1] * (-1, 1)
     middle = (size - 1) / 2
-    pixels = np.stack(np.mgrid[:size, :size][::-1], axis=-1).astype(np.float64)
+    pixels = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
     column, row = ((pixels if lens is None else lens.undistort(pixels)) - middle).transpose(2, 0, 1)
     x, y, theta = PREDICTED + MOTION
     c, s = np.cos(theta), np.sin(theta)

@@ -235,7 +235,7 @@ class FeatureSet:
         camera = self._camera_features(copper, scale, full, model)
         magnification = 1.0 if model is None else largest_magnification(model, full)
         has_etch = etch > 0 and bool(np.any(self.spacing == 0)) and len(self.spacing) > 0
-        levels = {"threshold": threshold, "noise": noise}
+        levels: dict[str, Any] = {"threshold": threshold, "noise": noise}
         limits = FiducialLimits()
         matched, drilled = self._blobs(copper, scale, blur, etch, search_px, magnification, levels)
         operation = EstimateFeaturePose(
@@ -265,7 +265,7 @@ class FeatureSet:
         etch: float,
         search_px: float | None,
         magnification: float,
-        levels: dict[str, float],
+        levels: dict[str, Any],
     ) -> tuple[FindBlobs, FindBlobs]:
         """Return the measurements of the fiducials whose grey levels are matched, and of the drilled fiducials."""
         drilled = self.fiducials.hole > 0

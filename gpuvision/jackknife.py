@@ -80,8 +80,8 @@ def overlapping_jackknife(
     weight = np.zeros(has_edges.shape)
     for row, column in np.ndindex(overlap, overlap):
         grid = np.s_[row::overlap, column::overlap]
-        count = max(np.count_nonzero(has_edges[grid]), 1)
-        weight[grid] = (count - 1) / count
+        number_of_blocks = max(int(np.count_nonzero(has_edges[grid])), 1)
+        weight[grid] = 1.0 - 1.0 / number_of_blocks
     filled, count = blocks[:, has_edges], len(columns)
     shifts = _shifts(normal, filled[:count], filled[count:-1].reshape(count, count, -1))
     return np.asarray(shifts.T @ (shifts * weight[has_edges][:, None]) / overlap**2)

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -113,35 +114,54 @@ def align_apertures(
     middle = np.mean([each.centroid for each in apertures], axis=0)
     coarse, heights = _coarse_heights(np.asarray(z, np.float64), grid, apertures)
     placement, best, second = _correlate(coarse, heights, apertures, middle, initial, (shift, min(turn, math.pi)))
-    step = max(len(apertures) // _MOST_FITTED, 1)
-    fitted = list(apertures)[::step]
-    fit = None
     reach = max(settings.margin, 1.5 * max(coarse.cell_x, coarse.cell_y))
-    for _ in range(_ROUNDS):
-        # The first rounds look farther: the correlation is right to about a coarse cell.
-        found = measure_deposits(
-            z, grid, fitted, placement, dataclasses.replace(settings, margin=reach), correlation_area=1.0
-        )
-        fit = _fit_rigid(found, placement)
-        if fit is None:
-            raise ValueError(
-                "the board was not found in the height map: fewer than two deposits of its paste layer; give another "
-                "initial pose, a larger search range, or the pose"
-            )
-        before, (placement, covariance, scale, count, centre) = placement, fit
-        moved = placement.to_map(middle) - before.to_map(middle)
-        if reach == settings.margin and np.hypot(*moved) < _CONVERGED:
-            break
-        reach = settings.margin
+    fit = _fit_deposits(z, grid, apertures, settings, placement, reach)
     return Alignment(
-        placement=placement,
-        covariance=covariance,
-        centre=centre,
-        residual_scale=scale,
-        count=count,
+        placement=fit.placement,
+        covariance=fit.covariance,
+        centre=fit.centre,
+        residual_scale=fit.residual_scale,
+        count=fit.deposits,
         correlation=best,
         second_correlation=second,
     )
+
+
+class _RigidFit(NamedTuple):
+    """Fitted place of a board, and the number of fitted deposits; see the attributes of `Alignment`."""
+
+    placement: BoardPlacement
+    covariance: Float64
+    residual_scale: float
+    deposits: int
+    centre: Float64
+
+
+def _fit_deposits(
+    z: npt.NDArray[np.floating],
+    grid: Grid,
+    apertures: Sequence[Aperture],
+    settings: PasteSettings,
+    placement: BoardPlacement,
+    reach: float,
+) -> _RigidFit:
+    """Fit the place to the offsets of the deposits, first within a distance ``reach`` [m] from the apertures.
+
+    The first round looks farther: the correlation is right to about a coarse cell.
+    """
+    middle = np.mean([each.centroid for each in apertures], axis=0)
+    fitted = list(apertures)[:: max(len(apertures) // _MOST_FITTED, 1)]
+    rounds = [reach] + [settings.margin] * (_ROUNDS - 1)
+    for margin in rounds:
+        found = measure_deposits(
+            z, grid, fitted, placement, dataclasses.replace(settings, margin=margin), correlation_area=1.0
+        )
+        fit = _fit_rigid(found, placement)
+        before, placement = placement, fit.placement
+        moved = placement.to_map(middle) - before.to_map(middle)
+        if margin == settings.margin and np.hypot(*moved) < _CONVERGED:
+            break
+    return fit
 
 
 def _coarse_heights(z: Float64, grid: Grid, apertures: Sequence[Aperture]) -> tuple[Grid, Float64]:
@@ -206,15 +226,24 @@ def _correlate(
                 score, best, place = peak, found, placement
     if not math.isfinite(score):
         raise ValueError("the height map shows no part of the paste pattern; give another initial pose")
-    row, column = np.unravel_index(int(np.argmax(best)), pad)
-    row_shift, column_shift = int(rows[row, 0]), int(columns[0, column])
-    away = math.sqrt(float(np.median([each.area for each in apertures]))) / 2
-    near = np.hypot((rows - row_shift) * grid.cell_y, (columns - column_shift) * grid.cell_x) <= max(
-        away, 2 * max(grid.cell_x, grid.cell_y)
-    )
-    second = float(np.max(np.where(near, -np.inf, best)))
-    placement = dataclasses.replace(place, x=place.x + column_shift * grid.cell_x, y=place.y - row_shift * grid.cell_y)
-    return placement, score, max(second, 0.0)
+    size = math.sqrt(float(np.median([each.area for each in apertures])))
+    row, column, second = _peaks(best, rows, columns, grid, size)
+    placement = dataclasses.replace(place, x=place.x + column * grid.cell_x, y=place.y - row * grid.cell_y)
+    return placement, score, second
+
+
+def _peaks(
+    correlation: Float64, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], grid: Grid, size: float
+) -> tuple[int, int, float]:
+    """Return rows and columns of the best shift, and the correlation of the second best.
+
+    The second best shift is farther away than half the ``size`` of an aperture [m]; its correlation is 0 or more.
+    """
+    row, column = np.unravel_index(int(np.argmax(correlation)), correlation.shape)
+    best_row, best_column = int(rows[row, 0]), int(columns[0, column])
+    distance = np.hypot((rows - best_row) * grid.cell_y, (columns - best_column) * grid.cell_x)
+    is_near = distance <= max(size / 2, 2 * max(grid.cell_x, grid.cell_y))
+    return best_row, best_column, max(float(np.max(np.where(is_near, -np.inf, correlation))), 0.0)
 
 
 def _turned(placement: BoardPlacement, middle: Float64, turn: float) -> BoardPlacement:
@@ -238,13 +267,14 @@ def _pattern(grid: Grid, apertures: Sequence[Aperture], placement: BoardPlacemen
     return np.minimum(pattern, 1.0)
 
 
-def _fit_rigid(
-    found: Deposits, placement: BoardPlacement
-) -> tuple[BoardPlacement, Float64, float, int, Float64] | None:
-    """Fit a shift and a rotation to the offsets of deposits, robustly; None for fewer than two deposits."""
+def _fit_rigid(found: Deposits, placement: BoardPlacement) -> _RigidFit:
+    """Fit a shift and a rotation to the offsets of deposits, robustly."""
     known = np.isfinite(found.offset).all(axis=1)
     if np.count_nonzero(known) < 2:
-        return None
+        raise ValueError(
+            "the board was not found in the height map: fewer than two deposits of its paste layer; give another "
+            "initial pose, a larger search range, or the pose"
+        )
     offset = found.offset[known] @ placement.matrix.T  # in the height map
     at = found.centre[known]
     centre = at.mean(axis=0)
@@ -273,4 +303,4 @@ def _fit_rigid(
     coordinates = 2.0 * float(weights.sum())
     covariance = scale**2 * coordinates / (coordinates - 3.0) * np.linalg.pinv(normal)
     turned = dataclasses.replace(turned, x=float(moved[0]), y=float(moved[1]))
-    return turned, covariance, scale, int(np.count_nonzero(weights > 0)), centre
+    return _RigidFit(turned, covariance, scale, int(np.count_nonzero(weights > 0)), centre)

@@ -196,7 +196,13 @@ def measure_coplanarity(
     parts = [_region(heights, grid, each) for each in regions]
     noise = _noise(parts) if sigma is None else sigma
     sigmas = complete_sigmas(np.asarray(noise, np.float64), grid.shape)
-    tops = _tops(regions, parts, sigmas, grid, correlated)
+    return _compare_tops(regions, _tops(regions, parts, sigmas, grid, correlated), centre, float(np.median(sigmas)))
+
+
+def _compare_tops(
+    regions: Sequence[Aperture], tops: Float64, centre: tuple[float, float] | None, noise: float
+) -> Coplanarity:
+    """Compare tops and their sigmas (n, 2) with the seating plane and with the least-squares plane."""
     place = np.array([each.centroid for each in regions]).reshape(-1, 2)
     known = np.flatnonzero(np.isfinite(tops[:, 0]))
     if len(known) < 3:
@@ -222,7 +228,7 @@ def measure_coplanarity(
         coplanarity=float(result[0, worst]),
         coplanarity_sigma=float(result[1, worst]),
         lowest=regions[worst].name,
-        noise=float(np.median(sigmas)),
+        noise=noise,
     )
 
 

@@ -7,7 +7,7 @@ for industrial applications*, TU Delft 2008, section 1.2.2.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -210,40 +210,17 @@ def measure_deposits(
     heights = np.asarray(z, np.float64)
     if heights.shape != grid.shape:
         raise ValueError(f"heights have shape {heights.shape}, the grid has {grid.shape}; expected the same")
-    moved = [each.moved(placement) for each in apertures]
-    windows = aperture_windows(moved, grid, settings.margin)
-    free = np.isfinite(heights)
-    for window in windows:
-        if window is not None:
-            free[window.rows, window.columns] &= ~window.cells
-    surfaces = [
-        None if window is None else _reference(heights, free, grid, window, each, settings)
-        for window, each in zip(windows, moved, strict=True)
-    ]
-    scales = [each.scale for each in surfaces if each is not None]
-    estimated = float(np.median(scales)) if scales else math.nan
-    noise = np.asarray(estimated if sigma is None else sigma, np.float64)
-    sigmas = height_noise.complete_sigmas(noise, grid.shape)
-    known = [
-        _Known(number, aperture, window, surface)
-        for number, (aperture, window, surface) in enumerate(zip(moved, windows, surfaces, strict=True))
-        if window is not None and surface is not None
-    ]
-    correlated = _correlation_area(heights, free, grid, known, settings, correlation_area)
-    job = _Job(heights, sigmas, grid, settings, correlated, placement)
-    sums = _sums(job, known, precision, device)
-    statuses = ["outside" if each is None else "no reference" for each in windows]
-    for each, flags in zip(known, sums.pop("status"), strict=True):
-        statuses[each.number] = _STATUS[Status(int(flags))]
-    tops, references = _tops_and_references(job, known, statuses)
-    valid = _spread(sums.pop("valid"), known, [0.0 if each is None else math.nan for each in windows])
-    return _deposits(apertures, moved, settings, known, sums, tops, references)._replace(
-        status=tuple(statuses),
-        valid=valid,
-        noise=float(np.median(sigmas[free] if free.any() else sigmas)),
-        board_scatter=estimated,
-        correlation_area=correlated,
+    board = _measure_board(heights, grid, [each.moved(placement) for each in apertures], settings)
+    noise = np.asarray(board.scatter if sigma is None else sigma, np.float64)
+    job = _Job(
+        heights,
+        height_noise.complete_sigmas(noise, grid.shape),
+        grid,
+        settings,
+        _correlation_area(heights, grid, board, settings, correlation_area),
+        placement,
     )
+    return _deposits(apertures, job, board, _sums(job, board.known, precision, device))
 
 
 class _Known(NamedTuple):
@@ -255,6 +232,20 @@ class _Known(NamedTuple):
     surface: ReferenceSurface
 
 
+class _Board(NamedTuple):
+    """Board around the apertures.
+
+    ``apertures`` and their ``windows`` (None: outside) in the height map, (rows, columns) which cells are ``free`` of
+    paste, the ``known`` apertures, which have a reference surface, and the median ``scatter`` about these surfaces [m].
+    """
+
+    apertures: Sequence[Aperture]
+    windows: Sequence[Window | None]
+    free: Bools
+    known: Sequence[_Known]
+    scatter: float
+
+
 class _Job(NamedTuple):
     """Height map with its standard deviations, and how it is measured."""
 
@@ -264,6 +255,22 @@ class _Job(NamedTuple):
     settings: PasteSettings
     correlated: float
     placement: BoardPlacement
+
+
+def _measure_board(z: Float64, grid: Grid, apertures: Sequence[Aperture], settings: PasteSettings) -> _Board:
+    """Find the cells of apertures in the height map, and fit the board around each aperture."""
+    windows = aperture_windows(apertures, grid, settings.margin)
+    free = np.isfinite(z)
+    for window in windows:
+        if window is not None:
+            free[window.rows, window.columns] &= ~window.cells
+    known = []
+    for number, (aperture, window) in enumerate(zip(apertures, windows, strict=True)):
+        surface = None if window is None else _reference(z, free, grid, window, aperture, settings)
+        if window is not None and surface is not None:
+            known.append(_Known(number, aperture, window, surface))
+    scatter = float(np.median([each.surface.scale for each in known])) if known else math.nan
+    return _Board(apertures, windows, free, known, scatter)
 
 
 def _reference(
@@ -281,15 +288,13 @@ def _reference(
     return None
 
 
-def _correlation_area(
-    z: Float64, free: Bools, grid: Grid, known: Sequence[_Known], settings: PasteSettings, given: float | None
-) -> float:
+def _correlation_area(z: Float64, grid: Grid, board: _Board, settings: PasteSettings, given: float | None) -> float:
     """Return the given number of cells whose noise is common, or the number that the board shows."""
     if given is not None:
         return finite(given, "correlation_area", minimum=1.0)
     width = settings.margin + settings.ring
-    rings = [height_noise.Ring(each.window, each.surface, width) for each in known]
-    return height_noise.correlation_area(z, free, grid, rings[:: max(len(rings) // _MOST_RINGS, 1)])
+    rings = [height_noise.Ring(each.window, each.surface, width) for each in board.known]
+    return height_noise.correlation_area(z, board.free, grid, rings[:: max(len(rings) // _MOST_RINGS, 1)])
 
 
 def _sums(job: _Job, known: Sequence[_Known], precision: Precision, device: Device | None) -> dict[str, Float64]:
@@ -360,32 +365,30 @@ def _spread(values: npt.ArrayLike, known: Sequence[_Known], others: Sequence[flo
     return spread
 
 
-def _deposits(
-    apertures: Sequence[Aperture],
-    moved: Sequence[Aperture],
-    settings: PasteSettings,
-    known: Sequence[_Known],
-    sums: dict[str, Float64],
-    tops: Sequence[tuple[float, float]],
-    references: Sequence[float],
-) -> Deposits:
-    """Return the deposits of all apertures, NaN where a deposit is not measured; the caller completes the result."""
+def _deposits(apertures: Sequence[Aperture], job: _Job, board: _Board, sums: Mapping[str, Float64]) -> Deposits:
+    """Return the deposits of all apertures of the board, NaN where a deposit is not measured."""
+    statuses = ["outside" if each is None else "no reference" for each in board.windows]
+    for each, flags in zip(board.known, sums["status"], strict=True):
+        statuses[each.number] = _STATUS[Status(int(flags))]
+    tops, references = _tops_and_references(job, board.known, statuses)
+    top = np.array(tops).reshape(-1, 2)
     areas = np.array([each.area for each in apertures])
     unknown = [math.nan] * len(apertures)
-    top = np.array(tops).reshape(-1, 2)
-    own = {name: _spread(values, known, unknown) for name, values in sums.items()}
+    measured = {
+        name: _spread(values, board.known, unknown) for name, values in sums.items() if name not in ("status", "valid")
+    }
     return Deposits(
         names=tuple(each.name for each in apertures),
-        status=(),
+        status=tuple(statuses),
         expected_area=areas,
-        expected_volume=areas * settings.stencil,
-        centre=np.array([each.centroid for each in moved]).reshape(-1, 2),
-        height_max=_spread(top[:, 0], known, unknown),
-        height_max_sigma=_spread(top[:, 1], known, unknown),
-        reference=_spread(np.array(references), known, unknown),
-        valid=np.array(unknown),
-        noise=math.nan,
-        board_scatter=math.nan,
-        correlation_area=math.nan,
-        **own,
+        expected_volume=areas * job.settings.stencil,
+        centre=np.array([each.centroid for each in board.apertures]).reshape(-1, 2),
+        height_max=_spread(top[:, 0], board.known, unknown),
+        height_max_sigma=_spread(top[:, 1], board.known, unknown),
+        reference=_spread(np.array(references), board.known, unknown),
+        valid=_spread(sums["valid"], board.known, [0.0 if each is None else math.nan for each in board.windows]),
+        noise=float(np.median(job.sigmas[board.free] if board.free.any() else job.sigmas)),
+        board_scatter=board.scatter,
+        correlation_area=job.correlated,
+        **measured,
     )

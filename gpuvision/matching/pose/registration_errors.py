@@ -169,7 +169,7 @@ def _cells(place: Float64, count: int) -> npt.NDArray[np.intp]:
     """Return column and row (n, 2) of the cell of each place: equal parts of the bounding box."""
     low = place.min(axis=0)
     extent = np.maximum(place.max(axis=0) - low, np.finfo(float).tiny)
-    return np.minimum((place - low) / extent * count, count - 1).astype(np.intp)
+    return np.asarray(np.minimum((place - low) / extent * count, count - 1).astype(np.intp))
 
 
 def _is_significant(fit: _Fit, further: slice) -> bool:

@@ -19,7 +19,7 @@ from gpuvision.camera.image import estimate_pixel_noise
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device, to_numpy
-from gpuvision.matching.features.ruler import RulerEdges
+from gpuvision.matching.features.ruler import Edges, RulerEdges
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -333,36 +333,71 @@ def _octave(
     )
     if not runs:
         return None
-    starts = np.array([each.start for each in runs])
-    far = np.linalg.norm([each.end - each.start for each in runs], axis=-1)
-    directions = np.array([each.end - each.start for each in runs]) / far[:, None]
-    room = np.array(rooms)
-    pieces, path = place_rulers_along(
-        starts + room[:, :1] * directions, starts + room[:, 1:2] * directions, rulers, wide
-    )
-    edges = rulers(white, pieces, device=device)
-    assert edges.spacing is not None
-    position, sigma, spacing = to_numpy(edges.position), to_numpy(edges.sigma), to_numpy(edges.spacing)
-    places = pieces[:, None, :2] + position[..., None] * pieces[:, None, 2:]
-    away = np.sum((places - starts[path][:, None]) * directions[path][:, None], axis=-1)
-    with np.errstate(invalid="ignore"):
-        found = (away >= 0.0) & (away < far[path][:, None])
-    half = 0.5 * spacing[found][:, None] * np.broadcast_to(pieces[:, None, 2:], places.shape)[found]
-    sides = camera.to_floor(places[found] - half), camera.to_floor(places[found] + half)
+    lines = _ScanLines.of(runs, rooms)
+    pieces, path = place_rulers_along(lines.at(0), lines.at(1), rulers, wide)
+    stripes = _find_stripes(rulers(white, pieces, device=device), pieces, path, lines)
+    sides = camera.to_floor(stripes.place - stripes.half), camera.to_floor(stripes.place + stripes.half)
     size = np.hypot(*(sides[1] - sides[0]).T)
     good = (size > _MIN_WIDTH_RATIO * line_width) & (size < _MAX_WIDTH_RATIO * line_width)
     points = (0.5 * (sides[0] + sides[1]))[good]
-    number = np.broadcast_to(path[:, None], found.shape)[found][good]
-    kept = unique_points(points, number, away[found][good], line_width)
-    per_px = (size / spacing[found])[good]
-    ends = [camera.to_floor(starts + room[:, which, None] * directions) for which in (2, 3)]
-    is_valid = room[:, 3] > room[:, 2]
+    kept = unique_points(points, stripes.path[good], stripes.away[good], line_width)
+    per_px = (size / stripes.spacing)[good]
+    ends = [camera.to_floor(lines.at(which)) for which in (2, 3)]
+    is_valid = lines.room[:, 3] > lines.room[:, 2]
     return FloorScan(
         points=np.ascontiguousarray(points[kept], np.float32),
-        sigmas=np.ascontiguousarray((per_px * sigma[found][good])[kept], np.float32),
+        sigmas=np.ascontiguousarray((per_px * stripes.sigma[good])[kept], np.float32),
         paths=np.ascontiguousarray(np.concatenate(ends, axis=-1)[is_valid], np.float32),
         line_width=line_width,
     )
+
+
+class _ScanLines(NamedTuple):
+    """Scan lines [px]: starts (n, 2), directions (n, 2), lengths (n,), and rooms (n, 4) as `_room` returns them."""
+
+    start: Float64
+    direction: Float64
+    length: Float64
+    room: Float64
+
+    @classmethod
+    def of(cls, runs: list[_Run], rooms: list[tuple[float, float, float, float]]) -> _ScanLines:
+        """Return the scan lines of parts with room."""
+        way = np.array([each.end - each.start for each in runs])
+        length = np.linalg.norm(way, axis=-1)
+        return cls(np.array([each.start for each in runs]), way / length[:, None], length, np.array(rooms))
+
+    def at(self, which: int) -> Float64:
+        """Return the points (n, 2) at one of the four distances of the room."""
+        return np.asarray(self.start + self.room[:, which, None] * self.direction)
+
+
+class _Stripes(NamedTuple):
+    """Stripes found on scan lines [px], (m, ...).
+
+    Middles (m, 2), vectors to an edge (m, 2), standard deviations and widths, numbers of the scan lines, and distances
+    from their starts.
+    """
+
+    place: Float64
+    half: Float64
+    sigma: Float32
+    spacing: Float32
+    path: npt.NDArray[np.intp]
+    away: Float64
+
+
+def _find_stripes(edges: Edges, pieces: Float32, path: npt.NDArray[np.intp], lines: _ScanLines) -> _Stripes:
+    """Return the stripes that rulers along scan lines found between the ends of their lines."""
+    assert edges.spacing is not None
+    position, sigma, spacing = to_numpy(edges.position), to_numpy(edges.sigma), to_numpy(edges.spacing)
+    places = pieces[:, None, :2] + position[..., None] * pieces[:, None, 2:]
+    away = np.sum((places - lines.start[path][:, None]) * lines.direction[path][:, None], axis=-1)
+    with np.errstate(invalid="ignore"):
+        found = (away >= 0.0) & (away < lines.length[path][:, None])
+    half = 0.5 * spacing[found][:, None] * np.broadcast_to(pieces[:, None, 2:], places.shape)[found]
+    number = np.broadcast_to(path[:, None], found.shape)[found]
+    return _Stripes(places[found], half, sigma[found], spacing[found], number, away[found])
 
 
 def _room(run: _Run, edge: float, over: float, length: float) -> tuple[float, float, float, float] | None:

@@ -144,20 +144,12 @@ def smallest_exposure(
 
     # Rounding may put the longest exposure just beyond saturation.
     last = math.log(sensor.saturation / (max(board.copper, board.laminate) * per_second)) - 1e-12
-    return math.exp(_first_below(sigma, last - _DECADES * math.log(10.0), last, wanted))
+    return math.exp(_shortest_log_time(sigma, last, wanted))
 
 
-def _first_below(sigma: Callable[[float], float], first: float, last: float, wanted: float) -> float:
-    """Return the least log time between two at which the sigma [px] of an edge is at most a wanted one.
-
-    The sigma has one minimum: it falls with the time, and rises again where motion blurs the edges.
-
-    Raises
-    ------
-    ValueError
-        The sigma exceeds the wanted one at all times; the message states the minimum.
-    """
-    times = np.linspace(first, last, _STEPS + 1)
+def _shortest_log_time(sigma: Callable[[float], float], last: float, wanted: float) -> float:
+    """Return the logarithm of the shortest time, up to ``last``, at which a standard deviation [px] is reached."""
+    times = np.linspace(last - _DECADES * math.log(10.0), last, _STEPS + 1)
     sigmas = np.array([sigma(each) for each in times])
     best = int(np.argmin(sigmas))
     inner = minimize_scalar(sigma, bounds=(times[max(best - 1, 0)], times[min(best + 1, _STEPS)]), method="bounded")
@@ -168,4 +160,6 @@ def _first_below(sigma: Callable[[float], float], first: float, last: float, wan
             "give more light, wider rulers or less speed"
         )
     before = times[(times < longest) & (sigmas > wanted)]
-    return float(brentq(lambda at: sigma(at) - wanted, before[-1], longest) if len(before) else times[0])
+    if not len(before):
+        return float(times[0])
+    return float(brentq(lambda at: sigma(at) - wanted, before[-1], longest))

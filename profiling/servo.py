@@ -180,8 +180,8 @@ class _Frames:
         was_interrupted = self.computing[:-1] < 1e9 / rate
         duration = max(1e-9 * float(self.published[-1] - self.published[0]), 1e-9)
         return LoopTimes(
-            latencies=1e-3 * (self.commanded - self.published),
-            computing=1e-3 * self.computing,
+            latencies=np.asarray(1e-3 * (self.commanded - self.published), np.float64),
+            computing=np.asarray(1e-3 * self.computing, np.float64),
             missed=int(skipped.sum()),
             interrupted=int(skipped[was_interrupted].sum()),
             camera_stalls=late,
@@ -389,7 +389,8 @@ def main() -> None:
     device = Device.best() if options.device is None else Device.named(options.device)
     seconds = options.seconds or (_QUICK_SECONDS if options.quick else 5.0 if options.highest else 60.0)
     priority = Placement.default().priority if options.priority is None else options.priority
-    placement = Placement(*options.cores, priority)
+    loop_core, camera_core = options.cores
+    placement = Placement(loop_core, camera_core, priority)
     for size in options.sizes:
         if options.highest:
             highest = highest_rate(device, size, seconds=seconds, start=options.rate, placement=placement)

@@ -32,6 +32,7 @@ _SILENT_S = 10.0  # longest time without a frame
 # The camera sleeps until this time before a frame, and polls from then on: timers of ordinary threads end up to 50 us
 # late.
 _POLLING_NS = 60_000
+_AWAKE_NS = 200_000  # time before and after the expected frame in which the loop polls: a sleeping core wakes up slowly
 
 
 def board() -> Artwork:
@@ -81,7 +82,15 @@ class Camera:
         return int(self.header[0])
 
     def wait_after(self, taken: int) -> int:
-        """Sleep until a frame after a number is published, and return the number of the newest frame."""
+        """Wait until a frame after a number is published, and return the number of the newest frame.
+
+        The thread sleeps, and polls shortly before the frame is expected: its core is then awake.
+        """
+        due = int(self.times[taken % _TIMES]) + round(1e9 * float(self.step[0]))
+        if _wait_until(due, _AWAKE_NS):
+            end = due + _AWAKE_NS
+            while int(self.header[0]) == taken and time.perf_counter_ns() < end:
+                pass
         while (newest := int(self.header[0])) == taken:
             if not self.published.acquire(timeout=_SILENT_S):
                 raise RuntimeError(f"the camera published no frame for {_SILENT_S:g} s")
@@ -121,7 +130,9 @@ def _render(name: str, published: Any, size: int, label: str, core: int | None, 
             poses[0, 0], numbers[0], step = pose, number, float(shared.step[0])
             bound.run()
             shared.frames[number % _SLOTS] = image[0]
-            _wait_until(due)
+            _wait_until(due, _POLLING_NS)
+            while time.perf_counter_ns() < due:
+                os.sched_yield()
             shared.pose[:] = pose
             now = shared.times[number % _TIMES] = time.perf_counter_ns()
             shared.header[0] = number
@@ -135,12 +146,12 @@ def _render(name: str, published: Any, size: int, label: str, core: int | None, 
     shared.close()
 
 
-def _wait_until(due: int) -> None:
-    left = due - time.perf_counter_ns()
-    if left > _POLLING_NS:
-        time.sleep(1e-9 * (left - _POLLING_NS))
-    while time.perf_counter_ns() < due:
-        os.sched_yield()
+def _wait_until(due: int, early: int) -> bool:
+    """Sleep until some nanoseconds before a time, and return whether there was time to sleep."""
+    left = due - early - time.perf_counter_ns()
+    if left > 0:
+        time.sleep(1e-9 * left)
+    return left > 0
 
 
 @contextlib.contextmanager

@@ -182,8 +182,10 @@ _GATE = 16.266
 # Smallest diagonal of the Cholesky factor of a correlation matrix that is not singular (chosen): the root of the
 # rounding errors is 1e-8.
 _SINGULAR = 1e-6
-# Transitions that are kept for time steps that occur again; a loop with jitter makes new ones all the time.
-_MAX_TRANSITIONS = 4096
+# Transitions that are kept for time steps that occur again (chosen: more than the entries that a late measurement
+# propagates). A loop with jitter makes new ones all the time; they are dropped one by one, because freeing thousands at
+# once would stop the loop for milliseconds.
+_MAX_TRANSITIONS = 256
 
 
 class PoseObserver:
@@ -334,7 +336,7 @@ class PoseObserver:
         found = self._transitions.get(step)
         if found is None:
             if len(self._transitions) == _MAX_TRANSITIONS:
-                self._transitions.clear()
+                del self._transitions[next(iter(self._transitions))]
             found = self._transitions[step] = self.model.transition(1e-12 * step)
         matrix, command, noise = found
         state = matrix @ self._states[node] + command @ self._commands[node]

@@ -149,6 +149,42 @@ class SensorGeometry:
         by_sheet = ray[:, :, None] * surface[:, None] / steep
         return np.concatenate([np.linalg.norm(points, axis=-1)[:, None, None] * by_camera, by_sheet], axis=2)
 
+    def scale_sigma(self, pixels: npt.ArrayLike) -> tuple[float, float]:
+        """Return the relative standard deviations of the scales of heights and of lateral lengths by the calibration.
+
+        Parameters
+        ----------
+        pixels : array_like
+            (n, 2): measured (column, row) over the calibrated part of the image, such as readings.
+
+        Returns
+        -------
+        height, lateral : float
+            Relative standard deviation of all heights, along the sheet's h axis, and that of lengths over the part such
+            that the relative standard deviation of an area is twice as large. All points share these errors.
+
+        Notes
+        -----
+        The errors of the points by each parameter are fitted by linear functions of G and H; the slopes of the errors
+        of G along G and of H along H are errors of scale. With a measured transport its step scales y. The pitch of the
+        target is taken as exact: its relative error adds to both.
+        """
+        seen = np.asarray(pixels, dtype=np.float64)
+        axes, slopes = np.stack([self.sheet.g_axis, self.sheet.h_axis]), self.derivatives(seen)
+        known = np.isfinite(slopes).all(axis=(1, 2))
+        errors = np.einsum("ij,njp->inp", axes, slopes[known])
+        g, h = self.in_sheet(self.points(seen[known])).T
+        design = np.stack([np.ones_like(g), g, h], axis=1)
+        (_, along_g, _), (_, _, along_h) = (np.linalg.lstsq(design, each, rcond=None)[0] for each in errors)
+        scales = np.zeros((2, len(self.covariance)))
+        scales[0, : len(along_h)] = along_h
+        scales[1, : len(along_g)] = 0.5 * along_g
+        if self.transport is not None:
+            to_sheet = np.stack([self.sheet.g_axis, self.sheet.h_axis, self.sheet.normal])
+            scales[1, -3:] = 0.5 * (to_sheet @ self.transport.direction) / self.step
+        height, lateral = np.sqrt(np.einsum("ip,pq,iq->i", scales, self.covariance, scales))
+        return float(height), float(lateral)
+
     def triangulation(self, size: tuple[int, int], along: Along, pixels: npt.ArrayLike) -> Triangulation:
         """Return the triangulation to the mean plane of the sheet, with the covariance of its parameters.
 

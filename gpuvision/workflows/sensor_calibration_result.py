@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -82,8 +83,18 @@ class SensorCalibration:
         how = "given" if geometry.transport is None else f"+- {self.step_sigma * 1e9:.2g} nm"
         return (
             f"laser line in {used} images, {readings} readings ({sheet.outliers} rejected): residual "
-            f"{sheet.rms_px:.3g} px rms, sheet {shape}; step {geometry.step * 1e6:.6g} um ({how})"
+            f"{sheet.rms_px:.3g} px rms, sheet {shape}; step {geometry.step * 1e6:.6g} um ({how}); relative sigma of "
+            f"heights {self.scale_sigma[0]:.1e}, of x and y {self.scale_sigma[1]:.1e} besides that of the pitch"
         )
+
+    @cached_property
+    def scale_sigma(self) -> tuple[float, float]:
+        """Relative standard deviations of the scales of heights and of lateral lengths by the calibration."""
+        return self.geometry.scale_sigma(self.some_pixels())
+
+    def some_pixels(self) -> Float64:
+        """Return readings of the laser lines, (n, 2), spread over the calibrated part of the image."""
+        return np.concatenate([each.points for each in self.readings])[::_EVERY]
 
     @property
     def step_sigma(self) -> float:
@@ -109,6 +120,7 @@ class SensorCalibration:
             ],
             "transport": None if geometry.transport is None else self._transport_report(geometry.transport),
             "step_m": geometry.step,
+            "scale_sigma": {"height": self.scale_sigma[0], "lateral": self.scale_sigma[1]},
             "cell_m": self.cell,
             "scene": {"axes": geometry.scene_axes.tolist(), "origin": geometry.scene_origin.tolist()},
             "covariance": {"names": list(geometry.names), "matrix": geometry.covariance.tolist()},
@@ -180,7 +192,7 @@ def write_sensor_calibration(
         along=calibration.along,
         channel=calibration.channel,
         cell=calibration.cell,
-        pixels=np.concatenate([each.points for each in calibration.readings])[::_EVERY],
+        pixels=calibration.some_pixels(),
     )
     report = json.dumps(json_tree(calibration.report()), indent=1) + "\n"
     outputs = Outputs("calibrate", inputs=[*images, *inputs], overwrite=overwrite)

@@ -75,6 +75,33 @@ def test_predicted_sigmas_hold_over_seeds(tilt_degrees: float, bend: tuple[float
     check_statistics([height_errors(truth, calibrated(truth, rng), rng) for rng in rngs])
 
 
+def scale_errors(truth: LaserSensor, found: SensorGeometry) -> Float64:
+    """Return the errors of the scales of heights and of x and y, over their predicted sigmas."""
+    exact = truth.surface(FLAT)
+    pixels = truth.project(exact)
+    # Along the true axes: those of the calibrated sheet are turned in the sheet.
+    errors = (found.points(pixels) - exact) @ np.stack([truth.g, truth.h], axis=1)
+    slopes = np.linalg.lstsq(np.column_stack([np.ones(len(FLAT)), FLAT]), errors, rcond=None)[0]
+    assert found.transport is not None
+    step = found.transport.step @ truth.step / STEP**2 - 1.0
+    return np.asarray([slopes[2, 1], 0.5 * (slopes[1, 0] + step)]) / found.scale_sigma(pixels)
+
+
+@pytest.mark.slow
+def test_scales_are_within_their_sigma_over_seeds(truth: LaserSensor) -> None:
+    ratio = np.array([scale_errors(truth, calibrated(truth, np.random.default_rng((21, seed)))) for seed in range(30)])
+    assert np.mean(np.abs(ratio) < 3.0) >= 0.95
+    rms = np.sqrt(np.mean(ratio**2, axis=0))
+    assert np.all((rms > 0.7) & (rms < 1.3))  # 30 draws: 13 %
+
+
+def test_scales_are_within_their_sigma(truth: LaserSensor, found: SensorGeometry) -> None:
+    assert np.abs(scale_errors(truth, found)).max() < 4.0
+    height, lateral = found.scale_sigma(truth.project(truth.surface(FLAT)))
+    # The longer the region, the better its scale; 0.1 px of 100 readings would give about 1e-4.
+    assert 1e-5 < lateral < height < 5e-3
+
+
 def test_exact_readings_give_the_exact_sensor(truth: LaserSensor) -> None:
     found = calibrated(truth, np.random.default_rng(2), sigma=1e-6, line_sigma=1e-6)
     points = found.points(truth.project(truth.surface(FLAT)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 import re
 import shlex
@@ -13,10 +14,12 @@ import numpy.typing as npt
 import pytest
 
 import laser_sensor
+from gpuvision.formats.range_image import read_npz
 from scanning import Ran
 
 Float64 = npt.NDArray[np.float64]
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tutorials" / "box_of_parts_to_volume_map.md"
+NOISE = "[line]\nread_noise = 1.5\n"  # what the page adds to the sensor file
 # Truncated cones of 8 mm and 6.4 mm diameter: place on the stage and height [mm].
 SPOTS = (
     (-20, 10, 2.0), (-6, 12, 2.0), (8, 9, 2.0), (21, 12, 1.0),
@@ -80,10 +83,21 @@ def test_the_commands_of_the_page_measure_the_volumes(
         words = [name for word in shlex.split(each) for name in (shots if "*.png" in word else [word])]
         ran = Ran(capsys, monkeypatch, *words)
         assert ran.code == 0, ran.err
+        if words[0] == "calibrate":
+            assert NOISE in text
+            sensor = Path("sensor.toml")
+            sensor.write_text(sensor.read_text().replace("[line]\n", NOISE))
     with Path("paste", "paste.csv").open() as file:
         rows = list(csv.DictReader(file))
-    volume, sigma = (np.array([float(each[name]) for each in rows]) for name in ("volume_m3", "volume_sigma_m3"))
+    names = ("volume_m3", "volume_sigma_m3", "volume_systematic_sigma_m3")
+    volume, sigma, systematic = (np.array([float(each[name]) for each in rows]) for name in names)
     true = np.array([math.pi * 1e-3 * height / 3 * (4e-3**2 + 4e-3 * 3.2e-3 + 3.2e-3**2) for _, _, height in SPOTS])
-    # 3 random sigmas, and 0.2 % for the calibration from 8 poses.
-    assert np.all(np.abs(volume - true) < 3 * sigma + 2e-3 * true)
+    assert np.all(np.abs(volume - true) < 3 * np.hypot(sigma, systematic))
+    # The systematic sigma of 0.1 % of heights and of lengths, which count twice.
+    np.testing.assert_allclose(systematic, np.abs(volume) * math.hypot(1e-3, 2e-3), rtol=1e-9)
+    # The sigma of the heights is that of the scan, which the noise of the camera gives.
+    report = json.loads(Path("scan", "report.json").read_text())
+    assert report["error_budget"]["measured"]["ratio"] == pytest.approx(1.0, abs=0.1)
+    noise = json.loads(Path("paste", "report.json").read_text())["noise_m"]
+    assert noise == pytest.approx(np.nanmedian(read_npz(Path("scan", "range_image.npz"))[0]["map_sigma"]), rel=0.1)
     assert [each["verdict"] for each in rows] == ["pass"] * 3 + ["low"] + ["pass"] * 3 + ["low"]

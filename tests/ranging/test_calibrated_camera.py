@@ -15,12 +15,10 @@ from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
 from gpuvision.ranging.line import LineReadout
-from gpuvision.ranging.range_image import StraightTransport
-from gpuvision.ranging.sheet import BentSheet, SampleAxes
+from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.reference import camera as camera_reference
 from gpuvision.reference import triangulation as reference
-from gpuvision.simulation.sensors.sensor_view import SensorView
 from gpuvision.status import Status
 
 MATRIX = ((1720.0, 0.0, 655.0), (0.0, 1700.0, 498.0), (0.0, 0.0, 1.0))
@@ -262,12 +260,3 @@ def test_tables_and_errors() -> None:
     assert Triangulation.from_dict(operation.to_dict()) == operation
     with pytest.raises(ValueError, match=r"has a lens and a camera; the camera includes a lens"):
         replace(operation, lens=Lens(k1=1e-9))
-    bent = StraightTransport(bend=BentSheet(terms=(0.1, 0.0, 0.0), pinhole=(0.0, 0.0, 0.3)))
-    with pytest.raises(ValueError, match=r"SensorView.transport has a bent sheet; a simulation takes a flat one"):
-        SensorView(
-            triangulation=operation,
-            transport=bent,
-            lens=(0.0, 0.3, 0.3),
-            u_edges=np.arange(3.0),
-            v_edges=np.arange(3.0),
-        )

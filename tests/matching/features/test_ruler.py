@@ -472,14 +472,14 @@ def test_each_ruler_looks_for_its_edge(variant: Any, rng: np.random.Generator, d
     image = np.full(SHAPE, 60.0)
     for left in range(8, 130, 30):
         image[:, left : left + 11 + left % 3] = 160.0
-    image = np.rint(cv2.GaussianBlur(image, (0, 0), 1.1) + rng.normal(0.0, 2.0, SHAPE)).astype(np.uint8)
+    image = (cv2.GaussianBlur(image, (0, 0), 1.1) + rng.normal(0.0, 2.0, SHAPE)).astype(np.float32)
     count = 48
     angle = rng.uniform(-0.6, 0.6, count) + np.pi * (rng.random(count) < 0.5)
     places = [rng.uniform(35, 115, count), rng.uniform(35, 85, count), np.cos(angle), np.sin(angle)]
     sign, is_pair = np.where(rng.random(count) < 0.5, 1.0, -1.0), rng.random(count) < 0.5
     limits = np.where(is_pair[:, None], (6.0, 24.0), 0.0)
     rulers = np.column_stack([*places, sign, limits]).astype(np.float32)
-    base = RulerEdges(threshold=20.0, length=48, noise=2.0, variant=variant)
+    base = replace(STRONGEST, noise=2.0, variant=variant)  # shares programs with `test_polarity`
     found = replace(base, per_ruler=True)(image, rulers, device=device)
     for polarity, pairs in itertools.product((1.0, -1.0), (False, True)):
         which = (sign == polarity) & (is_pair == pairs)

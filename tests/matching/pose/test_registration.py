@@ -188,15 +188,17 @@ def test_edges_of_a_template_lie_on_its_outline(device: Device, shape: tuple[int
     assert len(crossed & found) > 0.8 * len(crossed)
 
 
+@pytest.mark.parametrize(("dtype", "factor"), [pytest.param(np.uint8, 1.0, marks=pytest.mark.slow), (np.uint16, 200.0)])
 @pytest.mark.parametrize("shape", [(257, 333), pytest.param((480, 222), marks=pytest.mark.slow)])
-def test_images_of_any_size_and_type(artwork: Artwork, device: Device, shape: tuple[int, int]) -> None:
+def test_images_of_any_size_and_type(
+    artwork: Artwork, device: Device, shape: tuple[int, int], dtype: Any, factor: float
+) -> None:
     pose = (0.9e-3, -1.3e-3, -0.05)
-    fix, image = pictured(artwork, shape, pose)
-    for each in (image.clip(0, 255).astype(np.uint8), (image.clip(0) * 200).astype(np.uint16)):
-        scale = 1.0 if each.dtype == np.uint8 else 200.0
-        ruler = RulerEdges(threshold=10.0 * scale, smoothing_px=fix.ruler.smoothing_px)
-        error = off(CoarseRegistration(**{**vars(fix), "ruler": ruler})(each, device=device), pose)
-        assert np.abs(error).max() < 0.1
+    fix, values = pictured(artwork, shape, pose)
+    image = (values.clip(0.0, 255.0) * factor).astype(dtype)
+    ruler = RulerEdges(threshold=10.0 * factor, smoothing_px=fix.ruler.smoothing_px)
+    error = off(CoarseRegistration(**{**vars(fix), "ruler": ruler})(image, device=device), pose)
+    assert np.abs(error).max() < 0.1
 
 
 @cache

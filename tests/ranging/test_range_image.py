@@ -434,6 +434,7 @@ def test_a_wrong_transport_is_refused():
         StraightTransport(direction=(1.0, 0.0, 1.0))
     with pytest.raises(ValueError, match="step is 0"):
         StraightTransport(step=0.0)
+    np.testing.assert_array_equal(StraightTransport(step=-1.0, start=2.0).transport(3), [2.0, 1.0, 0.0])
     with pytest.raises(ValueError, match="has no step; give the encoder's positions"):
         StraightTransport().transport(3)
     with pytest.raises(ValueError, match="has no angle_step; give the encoder's angles"):

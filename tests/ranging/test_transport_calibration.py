@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from gpuvision.camera.views.camera_fit import Pose
@@ -59,3 +60,36 @@ def test_two_views_suffice_and_one_does_not(rng: np.random.Generator) -> None:
         fit_transport(views[:1], [0.0])
     with pytest.raises(ValueError, match="at different profiles"):
         fit_transport(views, [5.0, 5.0])
+
+
+def test_step_is_the_one_of_weighted_least_squares(rng: np.random.Generator) -> None:
+    """Against a search over rotation, middle and step for the least sum of squares of the poses themselves."""
+    profiles = np.array([0.0, 20.0, 50.0, 100.0])
+    views = moved(rng, profiles, 0.1)
+    # Views differ in their uncertainty, or all weights would agree.
+    views = [replace_covariance(each, (1.0 + number) ** 2) for number, each in enumerate(views)]
+    roots = [np.linalg.cholesky(np.linalg.inv(each.covariance)).T for each in views]
+    start = views[2].pose.rotation
+
+    def residuals(values: np.ndarray) -> np.ndarray:
+        turned = Rotation.from_rotvec(values[:3]).as_matrix() @ start
+        found = []
+        for view, root, number in zip(views, roots, profiles, strict=True):
+            turn = Rotation.from_matrix(view.pose.rotation @ turned.T).as_rotvec()
+            # The middle moves with the stage: rotation @ MIDDLE + translation = middle + number step.
+            shift = view.pose.rotation @ MIDDLE + view.pose.translation - values[3:6] - number * values[6:]
+            found.append(root @ np.concatenate([turn, shift - np.cross(turn, view.pose.rotation @ MIDDLE)]))
+        return np.concatenate(found)
+
+    first = np.concatenate([np.zeros(3), views[0].pose.rotation @ MIDDLE + views[0].pose.translation, STEP])
+    best = least_squares(residuals, first, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    found = fit_transport(views, profiles, MIDDLE)
+    sigma = np.sqrt(np.diag(found.covariance(np.zeros((0, 0)))))
+    np.testing.assert_array_less(np.abs(found.step - best.x[6:]), 1e-2 * sigma)
+    predicted = np.linalg.inv(best.jac.T @ best.jac)[6:, 6:] * max(found.view_ratio, 1.0)
+    np.testing.assert_allclose(found.noise_covariance, predicted, rtol=1e-3, atol=1e-3 * predicted.max())
+    assert found.view_ratio == pytest.approx(2.0 * best.cost / (6 * 4 - 9), rel=1e-3)
+
+
+def replace_covariance(view: PoseResponse, factor: float) -> PoseResponse:
+    return PoseResponse(view.pose, factor * view.covariance, view.by_camera)

@@ -100,6 +100,19 @@ def test_noise_belongs_to_the_profile() -> None:
         simulator.frames(stack_profiles([line(view)] * 2), seed=9, first_profile=2), all_frames[2:]
     )
     assert not np.array_equal(all_frames[0], all_frames[1])
+    # Profile 0 by default, also for a reading.
+    np.testing.assert_array_equal(simulator.frames(line(view), seed=9), all_frames[0])
+
+
+def test_a_reading_is_of_profile_0_by_default(device: Device) -> None:
+    view = camera_view()
+    simulator = camera(view, gain=0.5, bits=12)
+    readings = [
+        simulator.read(line(view), seed=9, device=device, **more).position for more in ({}, {"first_profile": 0})
+    ]
+    np.testing.assert_array_equal(*readings)
+    other = simulator.read(line(view), seed=9, first_profile=1, device=device).position
+    assert np.any(other != readings[0])
 
 
 def test_mask_is_a_region_of_interest(device: Device) -> None:

@@ -14,7 +14,7 @@ import scipy.stats
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.fiducials import Fiducials
 from gpuvision.matching.features.imaging import Imaging
@@ -94,7 +94,7 @@ def features() -> FeatureSet:
 
 def bind(features: FeatureSet, device: Device, **more: Any) -> BoundFeatures:
     shape = more.pop("shape", SHAPE)
-    return features.bind(device, shape, np.uint8, copper="bright", threshold=20.0, noise=NOISE, **more)
+    return features.bind(device, shape, np.uint8, **{"copper": "bright", "threshold": 20.0, "noise": NOISE} | more)
 
 
 @pytest.mark.parametrize("model", [CAMERA, LENS], ids=["camera", "lens"])
@@ -132,6 +132,43 @@ def test_every_feature_is_measured_without_bias(
     assert found.status == 0
     assert np.abs(found.residuals).max() < 0.015 * PIXEL
     assert np.abs(found.pose - true)[:2].max() < 0.01 * PIXEL
+
+
+@pytest.mark.parametrize("has_fiducials", [True, False])
+@pytest.mark.parametrize("model", [CAMERA, LENS], ids=["camera", "lens"])
+def test_covariance_refers_to_the_undistorted_image(
+    model: Camera | Lens, has_fiducials: bool, features: FeatureSet, device: Device, rng: np.random.Generator
+) -> None:
+    """Sigmas and covariances in the distorted image, taken to the board by differences of the lens model."""
+    if not has_fiducials:  # discs of another size are not the fiducials
+        wrong = features.fiducials._replace(radius=features.fiducials.radius + 3 * PIXEL)
+        features = replace(features, fiducials=wrong)
+    bound = bind(features, device, model=model, noise=10 * NOISE)
+    found = bound(image(picture(model, NEAR), rng, 0.0), NEAR)
+
+    def jacobian(places: np.ndarray) -> np.ndarray:
+        steps = [undistorted(model, places + e) - undistorted(model, places - e) for e in 0.5 * np.eye(2)]
+        return np.stack(steps, axis=-1)
+
+    outputs = {name: bound.stages[name].outputs for name in ("place", "edges", "matched", "drilled")}
+    rulers = to_numpy(outputs["place"].rulers).astype(np.float64)
+    seen = features.normal * (1, -1)  # the normals in the undistorted image: rows point down
+    slope = np.einsum("ni,nij,nj->n", seen, jacobian(rulers[:, :2]), rulers[:, 2:4])
+    assert slope.max() > 1.1
+    sigma = np.hypot(to_numpy(outputs["edges"].sigma) * slope, 0.02) * PIXEL
+    (x, y), (nx, ny) = (features.point - PLACEMENT).T, features.normal.T
+    rows = np.stack([nx, ny, ny * x - nx * y], axis=1) / sigma[:, None]
+    information = rows.T @ rows
+    for name, which, systematic in (("matched", [0, 1], 0.003), ("drilled", [2], 0.02))[: 2 * has_fiducials]:
+        places = to_numpy(getattr(outputs["place"], name))[:, :2] + to_numpy(outputs[name].shift)
+        bend, found_covariance = jacobian(places.astype(np.float64)), to_numpy(outputs[name].covariance)[:, :2, :2]
+        for each, (px, py) in enumerate(features.fiducials.point[which] - PLACEMENT):
+            covariance = bend[each] @ found_covariance[each] @ bend[each].T + systematic**2 * np.eye(2)
+            axes = np.array([[1, 0, -py], [0, 1, px]]) / PIXEL * np.array([[1], [-1]])
+            information += axes.T @ np.linalg.solve(covariance, axes)
+    expected = np.linalg.inv(information)
+    unit = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found.covariance / unit, expected / unit, atol=5e-3)
 
 
 def test_a_region_of_the_image_gives_the_pose_of_the_image(

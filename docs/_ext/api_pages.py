@@ -67,6 +67,7 @@ PACKAGES = {
 MODULES = (
     "gpuvision.operation",
     "gpuvision.ranging.focus",
+    "gpuvision.ranging.focus_noise",
     "gpuvision.ranging.focus_stack",
     "gpuvision.ranging.polygon",
     "gpuvision.ranging.polygon_scan",

@@ -37,7 +37,7 @@ class FocusReading(NamedTuple):
     width
         Standard deviation of the Gaussian through the intensities [m].
     sigma_image, sigma_object
-        Predicted standard deviations of LI and LO [m]; ``None`` without ``sigma_intensity``.
+        Predicted standard deviations of LI and LO [m]; ``None`` without those of the intensities.
     status
         uint8 `Status` flags: NOT_FINITE; LOW_SIGNAL (fewer than three pinholes are above the minimum); AMBIGUOUS (no
         maximum: equal intensities, or a valley); OUT_OF_RANGE (the peak lies outside the pinholes, or no object in
@@ -98,22 +98,28 @@ class DepthFromFocus:
         if self.sigma_intensity is not None and not finite(self.sigma_intensity, "sigma_intensity") > 0.0:
             raise ValueError(f"DepthFromFocus.sigma_intensity is {self.sigma_intensity}, expected a positive number")
 
-    def __call__(self, intensities: npt.ArrayLike) -> FocusReading:
+    def __call__(self, intensities: npt.ArrayLike, sigma: npt.ArrayLike | None = None) -> FocusReading:
         """Compute the distance of the sharpest focus.
 
         Parameters
         ----------
         intensities
             Intensities behind the pinholes in order, shape (..., K), K >= 3.
+        sigma
+            Standard deviations of the intensities, of the same shape; they err independently. Default:
+            ``sigma_intensity``.
 
         Raises
         ------
         ValueError
-            There are fewer than three pinholes.
+            There are fewer than three pinholes, or ``sigma`` has another shape.
         """
         light = np.asarray(intensities, dtype=np.float64)
         if not light.ndim or light.shape[-1] < 3:
             raise ValueError(f"intensities have shape {light.shape}, expected (..., K) with at least 3 pinholes")
+        deviations = self.sigma_intensity if sigma is None else np.asarray(sigma, dtype=np.float64)
+        if deviations is not None and np.shape(deviations) not in ((), light.shape):
+            raise ValueError(f"sigma has shape {np.shape(deviations)}, expected that of the intensities, {light.shape}")
         count = light.shape[-1]
         known = np.all(np.isfinite(light), axis=-1)
         lit = np.isfinite(light) & (light > self.minimum)
@@ -122,7 +128,7 @@ class DepthFromFocus:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             # Relative to the brightest: a common level would only add roundings, which small weights magnify.
             log = np.log(safe / np.max(np.where(lit, light, 0.0), axis=-1, keepdims=True))
-            peak, curvature, spread = self._peak(log, self._weights(safe, lit), lit, safe)
+            peak, curvature, spread = self._peak(log, self._weights(safe, lit), lit, safe, deviations)
             # In units of the spacing, from the middle of the pinholes.
             image = self.first + self.spacing * (peak + 0.5 * (count - 1))
             width = self.spacing * np.sqrt(-0.5 / curvature)
@@ -152,8 +158,13 @@ class DepthFromFocus:
         brightest = np.max(np.where(lit, light, 0.0), axis=-1, keepdims=True)
         return np.where(lit, (light / np.where(brightest > 0.0, brightest, 1.0)) ** 2, 0.0)
 
+    @staticmethod
     def _peak(
-        self, log: Float64, weights: Float64, lit: npt.NDArray[np.bool_], light: Float64
+        log: Float64,
+        weights: Float64,
+        lit: npt.NDArray[np.bool_],
+        light: Float64,
+        deviations: float | Float64 | None,
     ) -> tuple[Float64, Float64, Float64 | None]:
         """Return peak and curvature of the weighted parabola [spacings], and the standard deviation of the peak.
 
@@ -173,10 +184,10 @@ class DepthFromFocus:
         curvature = np.sum(to_curvature * log, axis=-1, keepdims=True)
         step = -0.5 * slope / curvature
         peak = (middle + 0.5 * skew + step)[..., 0]
-        if self.sigma_intensity is None:
+        if deviations is None:
             return peak, curvature[..., 0], None
         gain = (-0.5 * to_slope - step * to_curvature) / curvature
-        noise = np.where(lit, self.sigma_intensity / light, 0.0)
+        noise = np.where(lit, deviations / light, 0.0)
         return peak, curvature[..., 0], np.sqrt(np.sum((gain * noise) ** 2, axis=-1))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.ndimage
 import tomli_w
 
 from gpuvision.host import Device, to_numpy
@@ -86,9 +87,17 @@ def test_noise_scatters_the_heights_by_their_sigma(
     assert (tmp_path / "out" / "range_image_sigma.tiff").exists()
 
 
-def test_the_noise_of_a_laplacian_is_refused() -> None:
-    with pytest.raises(DescriptionError, match="read_noise has no effect on the measure 'laplacian'"):
-        sensor(measure="laplacian", read_noise=1.0)
+def test_a_laplacian_has_a_sigma_within_the_border(rng: np.random.Generator) -> None:
+    """A texture that is sharpest at frame 2.3: every height within the border has the sigma of the frame."""
+    texture = rng.uniform(0.0, 200.0, (30, 40))
+    frames = np.stack([scipy.ndimage.gaussian_filter(texture, 0.5 + 0.4 * abs(k - 2.3)) for k in range(5)])
+    done = scan(frames.astype(np.float32), sensor(measure="laplacian", read_noise=1.0))
+    assert done.errors is not None
+    known = np.isfinite(done.errors.random.z)
+    assert known[3:-3, 3:-3].mean() > 0.95
+    assert not known[:3].any()
+    assert np.all(done.errors.random.z[known] <= 0.1 * 50e-6)
+    assert done.points.z[known] == pytest.approx(2.3 * 50e-6, abs=10e-6)
 
 
 def test_the_command_writes_what_other_scans_write(

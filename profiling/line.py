@@ -197,8 +197,9 @@ def line_frames(count: int) -> Frames:
 def cases(device: Device) -> Iterator[Case]:
     """Yield both centroids on 1, 16 and 64 frames, the fits, readout along rows, and readout with triangulation.
 
-    The triangulation corrects a lens ("fused"), or a calibrated camera with a tilted sensor ("camera"). The last cases
-    also compute the standard deviation of the position ("sigma").
+    The triangulation corrects a lens ("fused"), or a calibrated camera with a tilted sensor: two radial coefficients
+    ("camera"), or all 14 coefficients ("camera14"). The last cases also compute the standard deviation of the position
+    ("sigma").
     """
     centres: tuple[Method, ...] = ("centroid", "windowed")
     fits: tuple[Method, ...] = ("gauss3", "fir", "ml")
@@ -212,6 +213,7 @@ def cases(device: Device) -> Iterator[Case]:
         for count in (1, 16):
             yield _fused_case(device, method, count, "fused", {"lens": _LENS})
         yield _fused_case(device, method, 16, "camera", {"camera": _CAMERA})
+        yield _fused_case(device, method, 16, "camera14", {"camera": _FULL_CAMERA})
     for method in (*centres, *fits):
         yield _sigma_case(device, method, 16)
 
@@ -252,10 +254,12 @@ def _peers(readout: LineReadout, frames: Frames, across: Frames) -> dict[str, Ca
 
 
 _LENS = Lens(k1=4e-8, k2=1e-14, centre=(COLUMNS / 2.0, ROWS / 2.0))
-# Focal length of 1000 px, sensor tilted by 20 degrees.
-_CAMERA = Camera(
-    matrix=((1000.0, 0.0, COLUMNS / 2.0), (0.0, 1000.0, ROWS / 2.0), (0.0, 0.0, 1.0)),
-    distortion=(-0.1, 0.05, *(0.0,) * 10, math.radians(20.0), 0.0),
+# Focal length of 1000 px, sensor tilted by 20 degrees; and all 14 coefficients.
+_MATRIX = ((1000.0, 0.0, COLUMNS / 2.0), (0.0, 1000.0, ROWS / 2.0), (0.0, 0.0, 1.0))
+_CAMERA = Camera(matrix=_MATRIX, distortion=(-0.1, 0.05, *(0.0,) * 10, math.radians(20.0), 0.0))
+_FULL_CAMERA = Camera(
+    matrix=_MATRIX,
+    distortion=(-0.2, 0.12, 7e-4, -4e-4, 0.05, 0.06, -0.02, 0.01, 3e-4, -5e-4, -2e-4, 4e-4, 0.35, -0.12),
 )
 
 

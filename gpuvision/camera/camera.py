@@ -142,6 +142,7 @@ class Camera:
         pitch: npt.ArrayLike,
         unit: npt.ArrayLike,
         region: Region | None = None,
+        profiles: tuple[float, float] | None = None,
     ) -> npt.NDArray[Any]:
         """Return the table of ``camera_correction`` in ``kernels/common/camera.h`` for other coordinates than pixels.
 
@@ -156,6 +157,9 @@ class Camera:
         region : ((column, column), (row, row)), optional
             Region of the sensor that is measured [px]; positions outside of it take more time. Default: a sensor that
             the principal point halves.
+        profiles : (middle, scale), optional
+            `ProfileCorrection.middle` and ``scale`` instead of the start polynomials, for a kernel with the option
+            CAMERA_PROFILES.
 
         Returns
         -------
@@ -168,12 +172,17 @@ class Camera:
         source[:2] /= pitch[:, None]
         source[:2, 2] -= first / pitch
         target[:2] /= unit[:, None]
+        if profiles is not None:
+            return np.append(self._table(real, "undistort", source, target, None), np.array(profiles, real))
         return self._table(real, "undistort", source, target, region or self._principal_region)
 
     def _table(
-        self, real: npt.DTypeLike, direction: Direction, source: Float64, target: Float64, region: Region
+        self, real: npt.DTypeLike, direction: Direction, source: Float64, target: Float64, region: Region | None
     ) -> npt.NDArray[Any]:
-        """Return the kernels' table from input pixels with the matrix `source` to output pixels with `target`."""
+        """Return the kernels' table from input pixels with the matrix `source` to output pixels with `target`.
+
+        Without a region it ends before the start polynomials.
+        """
         inverse = direction == "undistort"
         focal, target_focal = np.diag(source)[:2], np.diag(target)[:2]
         # Round the centre first and compute the other entries from the rounded value, so that they compensate.
@@ -189,7 +198,9 @@ class Camera:
             (self._invertible_region.safe, self._invertible_region.limit),
         ]
         if inverse:
-            parts += [(min(self._max_distorted_square, _MAX_SQUARE),), _inverse_start(self, region).packed(real)]
+            parts += [(min(self._max_distorted_square, _MAX_SQUARE),)]
+        if inverse and region is not None:
+            parts += [_inverse_start(self, region).packed(real)]
         with np.errstate(over="ignore"):
             return np.concatenate(parts).astype(real)
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
+from gpuvision.camera.profile_correction import ProfileCorrection
 from gpuvision.host import (
     Define,
     Device,
@@ -325,19 +326,23 @@ class LineReadout(VisionOperation[LineReading]):
         else:
             work = WorkSize((round_up(samples, _GROUP), frames), (_GROUP, 1))
         chosen, of_samples = self.outputs or (), (*batch, samples)
+        profiles = None
+        if self.triangulation is not None:
+            profiles = self.triangulation.profile_correction(build.real, self.axes, length, samples)
         return build.launch(
             "line/line.cl",
             "line_readout",
             work=work,
             more_inputs=[(of_samples, build.real)] if self.peak_selection == "nearest" else [],
             outputs=build.outputs({name: of_samples if name in chosen else None for name in LineReading._fields}),
-            defines=self._defines(dtype, length, build.real) | flags(PREFETCH=device.is_cpu),
+            defines=self._defines(dtype, length, build.real, profiles) | flags(PREFETCH=device.is_cpu),
             arguments=[
                 np.int32(rows),
                 np.int32(columns),
                 *self._levels(dtype),
                 self._packed(build.real, dtype, length),
-                None if self.triangulation is None else self.triangulation.packed(build.real, self.axes),
+                None if self.triangulation is None else self.triangulation.packed(build.real, self.axes, profiles),
+                None if profiles is None else profiles.blocks(build.real),
             ],
             passes_once=work.vectors and self.method in ("centroid", "windowed"),
         )
@@ -374,7 +379,9 @@ class LineReadout(VisionOperation[LineReading]):
                 raise ValueError(f"LineReadout.{name} is {level}, expected 0 to {top} for {dtype} frames")
         return [dtype.type(level) for level in (self.threshold, saturation, weakest)]
 
-    def _defines(self, dtype: np.dtype[Any], length: int, real: np.dtype[Any]) -> dict[str, Define]:
+    def _defines(
+        self, dtype: np.dtype[Any], length: int, real: np.dtype[Any], profiles: ProfileCorrection | None
+    ) -> dict[str, Define]:
         bits = 8 * dtype.itemsize
         defines = type_defines("CODE", dtype, 4, 8, 16) | {"CODE_BITS": bits}
         defines |= flags(**{f"METHOD_{self.method.upper()}": True, f"SELECT_{self.peak_selection.upper()}": True})
@@ -386,7 +393,7 @@ class LineReadout(VisionOperation[LineReading]):
         defines |= flags(**{f"WITH_{name.upper()}": True for name in chosen})
         if self.triangulation is not None:
             # Random and systematic errors are separate outputs here.
-            defines |= {"WITH_SHEET": None} | self.triangulation.defines(real)
+            defines |= {"WITH_SHEET": None} | self.triangulation.defines(real, profiles)
             defines.pop("SHEET_COVARIANCE", None)
         return defines | flags(
             ALONG_ROWS=self.along == "rows",

@@ -49,6 +49,8 @@
 #define CAMERA_FIRST 32      // squared length of a virtual step before the first one, relative to q
 #define CAMERA_GUESS 33      // start polynomials of camera_approach, 30 entries
 #define CAMERA_GUESS_TERMS 8
+#define CAMERA_PROFILE_MIDDLE 31  // under CAMERA_PROFILES (sheet.h): position of t = 0, and t of one position; there are no
+#define CAMERA_PROFILE_SCALE 32   // start polynomials then
 #if CAMERA_RADIAL || CAMERA_RATIONAL || defined(CAMERA_DECENTRED)
 #define CAMERA_BENDS         // the lens has distortion terms; otherwise only the sensor is tilted
 #endif
@@ -343,6 +345,7 @@ static inline __attribute__((always_inline)) masks LANED(camera_undistort)(reals
     LANED(camera_move)(column, row, back_x, back_y, camera);
     return folded;
 }
+#endif
 
 // Convert a gradient over ideal normalised coordinates to the gradient over the measured ones: multiply by the
 // transposed Jacobian of the correction, (lens Jacobian)^-1 times the Jacobian of the inverse tilt. (back_x, back_y) is
@@ -372,7 +375,6 @@ static inline void LANED(camera_pull_back)(reals column, reals row, reals back_x
     *slope_y = across_y * per_w;
 #endif
 }
-#endif
 
 #endif
 #endif

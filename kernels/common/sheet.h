@@ -11,7 +11,8 @@
 // kernel's real type before that, so a single-precision result is within a few roundings of the double-precision one.
 // Build options: the distortion: LENS, LENS_K2, LENS_K3, LENS_K4 (lens.h); or CAMERA and its options (camera.h) with
 // SHEET_ROWS where the samples run along the rows axis of the image (positions are columns); or PLANE (the higher terms of
-// plane.h). SHEET_COVARIANCE adds the covariance of the parameters to the sigmas.
+// plane.h). SHEET_COVARIANCE adds the covariance of the parameters to the sigmas. CAMERA_PROFILES: number of terms of the
+// table of sheet_place_in_profile.
 #ifndef SHEET_H
 #define SHEET_H
 
@@ -56,6 +57,7 @@ typedef struct {
 #define SHEET_OF_SAMPLE(entry) entry##_X
 #endif
 
+#ifndef CAMERA_PROFILES
 // Compute the normalised correction of the camera along position and sample; return the mask of positions without one.
 static inline __attribute__((always_inline)) masks sheet_correction(reals position, reals sample,
                                                                     constant SheetTable *sheet, reals *back_position,
@@ -66,6 +68,7 @@ static inline __attribute__((always_inline)) masks sheet_correction(reals positi
     return LANED(camera_correction)(sample, position, sheet->camera, back_sample, back_position);
 #endif
 }
+#endif
 #endif
 
 #ifdef PLANE
@@ -79,63 +82,117 @@ static inline void sheet_plane(reals position, reals sample, constant SheetTable
 #define SHEET_FOLDED STATUS_NOT_INVERTIBLE
 #endif
 
-// Compute the undistorted, scaled place (x, y) of a light position, and the mask of positions without one: beyond the
-// fold of the lens, behind the tilted sensor, or outside of the region of the polynomials. Return the squared distance of
-// the measured place from the centre of the lens, or without a lens from the middle of the sensor region.
-static inline reals sheet_place(reals position, reals sample, constant SheetTable *sheet, reals *x, reals *y,
-                                masks *folded) {
-    *x = (position - sheet->position_origin) * sheet->position_scale;
-    *y = (sample - sheet->sample_origin) * sheet->sample_scale;
+// Light position on the sensor and its undistorted place.
+typedef struct {
+    reals position, sample;  // measured
+    reals x, y;              // undistorted and scaled
+    reals square;            // squared distance of the measured place from the centre of the lens, or without a lens from
+                             // the middle of the sensor region
+    masks folded;            // no undistorted place: beyond the fold of the lens, behind the tilted sensor, or outside of
+                             // the region of the polynomials
+#ifdef CAMERA
+    reals back_position, back_sample;  // normalised correction of the camera
+#endif
+} SheetPlace;
+
+#ifdef CAMERA_PROFILES
+// Compute the undistorted place of light positions by the table of a readout whose samples are whole numbers
+// (gpuvision/ranging/profile_correction.py). Along a profile, at a fixed sample, the correction of the camera is a
+// polynomial of the position: t = (position - middle) scale, correction = c0 + t (c1 + t (c2 + ...)), in the units of x and
+// y. The host has verified that every position of a profile has an undistorted place, and that the dropped terms are below
+// a quarter of a rounding. There are no division, no iteration and no test, and a third of the arithmetic.
+//
+// `sample` is the number of the first lane's profile, a multiple of 16 or samples - 16 k: the last vectors of a frame are
+// moved back. The table `terms` has a block of (CAMERA_PROFILES, 2, 16) numbers for each 16 profiles, which are read in
+// sequence: powers of t from the highest one, position and sample, profile. Blocks from profile samples % 16 on follow for the moved vectors.
+static inline SheetPlace sheet_place_in_profile(reals position, int sample, int samples, global const real *terms,
+                                                constant SheetTable *sheet) {
+#ifdef VECTOR_VARIANT
+    const int moved = sample % 16, block = sample / 16 + (moved ? (samples + 15) / 16 : 0), lane = 0;
+#else
+    const int block = sample / 16, lane = sample % 16;
+#endif
+    SheetPlace at;
+    at.position = position;
+    at.sample = to_reals((ints)sample + LANE_NUMBERS);
+    at.x = (position - sheet->position_origin) * sheet->position_scale;
+    at.y = (at.sample - sheet->sample_origin) * sheet->sample_scale;
+    at.square = at.x * at.x + at.y * at.y;
+    at.folded = 0;
+    const reals t = (position - sheet->camera[CAMERA_PROFILE_MIDDLE]) * sheet->camera[CAMERA_PROFILE_SCALE];
+    global const real *next = terms + (long)block * (32 * CAMERA_PROFILES) + lane;
+    reals move_x = load_reals(next), move_y = load_reals(next + 16);
+    _Pragma("unroll") for (int k = 1; k < CAMERA_PROFILES; k++) {
+        move_x = load_reals(next + 32 * k) + t * move_x;
+        move_y = load_reals(next + 32 * k + 16) + t * move_y;
+    }
+    at.x += move_x;
+    at.y += move_y;
+    at.back_position = move_x / sheet->camera[SHEET_OF_POSITION(CAMERA_FOCAL)];
+    at.back_sample = move_y / sheet->camera[SHEET_OF_SAMPLE(CAMERA_FOCAL)];
+    return at;
+}
+#else
+// Compute the undistorted place of a light position.
+static inline SheetPlace sheet_place(reals position, reals sample, constant SheetTable *sheet) {
+    SheetPlace at;
+    at.position = position;
+    at.sample = sample;
+    at.x = (position - sheet->position_origin) * sheet->position_scale;
+    at.y = (sample - sheet->sample_origin) * sheet->sample_scale;
 #if defined(LENS)
-    const reals square = LANED(lens_straighten)(x, y, sheet->lens);
-    *folded = mask_of(square >= sheet->lens[LENS_FOLD_SQUARE]);
-    return square;
+    at.square = LANED(lens_straighten)(&at.x, &at.y, sheet->lens);
+    at.folded = mask_of(at.square >= sheet->lens[LENS_FOLD_SQUARE]);
 #elif defined(CAMERA)
-    const reals square = *x * *x + *y * *y;
-    reals back_x, back_y;
-    *folded = sheet_correction(position, sample, sheet, &back_x, &back_y);
-    *x += back_x * sheet->camera[SHEET_OF_POSITION(CAMERA_FOCAL)];
-    *y += back_y * sheet->camera[SHEET_OF_SAMPLE(CAMERA_FOCAL)];
-    return square;
+    at.square = at.x * at.x + at.y * at.y;
+    at.folded = sheet_correction(position, sample, sheet, &at.back_position, &at.back_sample);
+    at.x += at.back_position * sheet->camera[SHEET_OF_POSITION(CAMERA_FOCAL)];
+    at.y += at.back_sample * sheet->camera[SHEET_OF_SAMPLE(CAMERA_FOCAL)];
 #elif defined(PLANE)
-    const reals square = *x * *x + *y * *y;
+    at.square = at.x * at.x + at.y * at.y;
     reals c, r;
     sheet_plane(position, sample, sheet, &c, &r);
-    *folded = ~LANED(plane_within)(c, r, PLANE_EDGE);
-    *x += sheet->plane_unit[1] * LANED(plane_bend)(c, r, sheet->plane_terms + 7);
-    *y += sheet->plane_unit[0] * LANED(plane_bend)(c, r, sheet->plane_terms);
-    return square;
+    at.folded = ~LANED(plane_within)(c, r, PLANE_EDGE);
+    at.x += sheet->plane_unit[1] * LANED(plane_bend)(c, r, sheet->plane_terms + 7);
+    at.y += sheet->plane_unit[0] * LANED(plane_bend)(c, r, sheet->plane_terms);
 #else
-    *folded = 0;
-    return *x * *x + *y * *y;
+    at.square = at.x * at.x + at.y * at.y;
+    at.folded = 0;
 #endif
+    return at;
 }
+#endif
 
 // Compute G and H (NaN where the status is not 0) and return the status: NOT_FINITE; NOT_INVERTIBLE: beyond the fold of
 // the lens or behind the tilted sensor; OUT_OF_RANGE: outside of the region of the polynomials; HORIZON: the ray does not
 // meet the sheet in front of the sensor, or meets it too far away.
-static inline bytes sheet_point(reals position, reals sample, constant SheetTable *sheet, reals *g, reals *h) {
+static inline bytes sheet_point_at(const SheetPlace *at, constant SheetTable *sheet, reals *g, reals *h) {
     constant real *in_w = sheet->w_terms, *in_g = sheet->g_terms, *in_h = sheet->h_terms;
-    reals x, y;
-    masks folded;
-    const reals square = sheet_place(position, sample, sheet, &x, &y, &folded);
-    const reals w = 1 + in_w[0] * x + in_w[1] * y;
-    const reals p = x / w, q = y / w;
+    const reals w = 1 + in_w[0] * at->x + in_w[1] * at->y;
+    const reals p = at->x / w, q = at->y / w;
     *g = in_g[0] + (in_g[1] * p + in_g[2] * q);
     *h = in_h[0] + (in_h[1] * p + in_h[2] * q);
-    const masks lost = ~mask_of(square < SHEET_REACH);
+    const masks lost = ~mask_of(at->square < SHEET_REACH);
     const masks hidden = mask_of(w <= sheet->horizon);
-    const masks flagged = lost | hidden | folded;
+    const masks flagged = lost | hidden | at->folded;
     bytes status = STATUS_OK;
     // Flags are rare, and computing them takes half as long as the geometry: skip it where no lane has a flag.
     if (any_lane(flagged)) {
         *g = nan_where(flagged, *g);
         *h = nan_where(flagged, *h);
-        const masks which = (folded & SHEET_FOLDED) | (~folded & hidden & STATUS_HORIZON);
+        const masks which = (at->folded & SHEET_FOLDED) | (~at->folded & hidden & STATUS_HORIZON);
         status = convert_bytes((lost & STATUS_NOT_FINITE) | (~lost & which));
     }
     return status;
 }
+
+#ifndef CAMERA_PROFILES
+// The same for a light position.
+static inline bytes sheet_point(reals position, reals sample, constant SheetTable *sheet, reals *g, reals *h) {
+    const SheetPlace at = sheet_place(position, sample, sheet);
+    return sheet_point_at(&at, sheet, g, h);
+}
+#endif
 
 // Variance of G or H from the covariance C = F F' of its parameters (a0, ax, ay, dx, dy): |F' d|^2 with the gradient
 // d = (1, p, q, -r p, -r q) and r = value - a0. F is lower triangular, column by column in `factor`.
@@ -148,24 +205,22 @@ static inline reals sheet_parameter_variance(constant real *factor, reals p, rea
 }
 
 // Convert a gradient over the undistorted (x, y) to the gradient over the measured (x, y).
-static inline void sheet_pull_back(reals position, reals sample, constant SheetTable *sheet, reals *slope_x,
-                                   reals *slope_y) {
+static inline void sheet_pull_back(const SheetPlace *at, constant SheetTable *sheet, reals *slope_x, reals *slope_y) {
 #if defined(LENS)
-    const reals measured_x = (position - sheet->position_origin) * sheet->position_scale;
-    const reals measured_y = (sample - sheet->sample_origin) * sheet->sample_scale;
+    const reals measured_x = (at->position - sheet->position_origin) * sheet->position_scale;
+    const reals measured_y = (at->sample - sheet->sample_origin) * sheet->sample_scale;
     LANED(lens_pull_back)(measured_x, measured_y, sheet->lens, slope_x, slope_y);
 #elif defined(CAMERA)
     // The gradient over normalised coordinates is the gradient over (x, y) times the focal lengths.
     const real focal_x = sheet->camera[SHEET_OF_POSITION(CAMERA_FOCAL)];
     const real focal_y = sheet->camera[SHEET_OF_SAMPLE(CAMERA_FOCAL)];
-    reals back_x, back_y;
-    sheet_correction(position, sample, sheet, &back_x, &back_y);
+    const reals back_x = at->back_position, back_y = at->back_sample;
     *slope_x *= focal_x;
     *slope_y *= focal_y;
 #ifdef SHEET_ROWS
-    LANED(camera_pull_back)(position, sample, back_x, back_y, sheet->camera, slope_x, slope_y);
+    LANED(camera_pull_back)(at->position, at->sample, back_x, back_y, sheet->camera, slope_x, slope_y);
 #else
-    LANED(camera_pull_back)(sample, position, back_y, back_x, sheet->camera, slope_y, slope_x);
+    LANED(camera_pull_back)(at->sample, at->position, back_y, back_x, sheet->camera, slope_y, slope_x);
 #endif
     *slope_x /= focal_x;
     *slope_y /= focal_y;
@@ -173,7 +228,7 @@ static inline void sheet_pull_back(reals position, reals sample, constant SheetT
     // The displaced place is (x + unit_r b(c, r), y + unit_c a(c, r)) with c = y / unit_c and r = x / unit_r.
     const real ratio = sheet->plane_unit[0] / sheet->plane_unit[1];
     reals c, r, a_c, a_r, b_c, b_r;
-    sheet_plane(position, sample, sheet, &c, &r);
+    sheet_plane(at->position, at->sample, sheet, &c, &r);
     LANED(plane_slopes)(c, r, sheet->plane_terms, &a_c, &a_r);
     LANED(plane_slopes)(c, r, sheet->plane_terms + 7, &b_c, &b_r);
     const reals by_x = *slope_x + *slope_x * b_r + *slope_y * ratio * a_r;
@@ -189,12 +244,12 @@ typedef struct {
 
 // Compute the variance of G or H, given its terms, at (p, q) with denominator w, for the standard deviations sigma_x and
 // sigma_y of the measured x and y.
-static inline reals sheet_noise_of(constant real *terms, reals position, reals sample, reals p, reals q, reals w,
-                                   reals sigma_x, reals sigma_y, constant SheetTable *sheet) {
+static inline reals sheet_noise_of(constant real *terms, const SheetPlace *at, reals p, reals q, reals w, reals sigma_x,
+                                   reals sigma_y, constant SheetTable *sheet) {
     const reals offset = terms[1] * p + terms[2] * q;
     reals slope_x = (terms[1] - offset * sheet->w_terms[0]) / w;
     reals slope_y = (terms[2] - offset * sheet->w_terms[1]) / w;
-    sheet_pull_back(position, sample, sheet, &slope_x, &slope_y);
+    sheet_pull_back(at, sheet, &slope_x, &slope_y);
     slope_x *= sigma_x;
     slope_y *= sigma_y;
     return slope_x * slope_x + slope_y * slope_y;
@@ -202,47 +257,43 @@ static inline reals sheet_noise_of(constant real *terms, reals position, reals s
 
 // Compute the random variances of G and H, to first order, from independent errors of position and sample. The result
 // is meaningless where sheet_point sets a flag.
-static inline SheetVariances sheet_noise(reals position, reals sample, reals sigma_position, reals sigma_sample,
-                                         constant SheetTable *sheet) {
-    reals x, y;
-    masks folded;
-    sheet_place(position, sample, sheet, &x, &y, &folded);
-    const reals w = 1 + sheet->w_terms[0] * x + sheet->w_terms[1] * y;
-    const reals p = x / w, q = y / w;
+static inline SheetVariances sheet_noise_at(const SheetPlace *at, reals sigma_position, reals sigma_sample,
+                                            constant SheetTable *sheet) {
+    const reals w = 1 + sheet->w_terms[0] * at->x + sheet->w_terms[1] * at->y;
+    const reals p = at->x / w, q = at->y / w;
     const reals sigma_x = sigma_position * sheet->position_scale;
     const reals sigma_y = sigma_sample * sheet->sample_scale;
-    const SheetVariances noise = {
-        sheet_noise_of(sheet->g_terms, position, sample, p, q, w, sigma_x, sigma_y, sheet),
-        sheet_noise_of(sheet->h_terms, position, sample, p, q, w, sigma_x, sigma_y, sheet)};
+    const SheetVariances noise = {sheet_noise_of(sheet->g_terms, at, p, q, w, sigma_x, sigma_y, sheet),
+                                  sheet_noise_of(sheet->h_terms, at, p, q, w, sigma_x, sigma_y, sheet)};
     return noise;
 }
 
 // Compute the systematic variances of G and H, to first order, from the covariance of the parameters.
-static inline SheetVariances sheet_systematic(reals position, reals sample, constant SheetTable *sheet) {
+static inline SheetVariances sheet_systematic_at(const SheetPlace *at, constant SheetTable *sheet) {
     constant real *in_g = sheet->g_terms, *in_h = sheet->h_terms;
-    reals x, y;
-    masks folded;
-    sheet_place(position, sample, sheet, &x, &y, &folded);
-    const reals w = 1 + sheet->w_terms[0] * x + sheet->w_terms[1] * y;
-    const reals p = x / w, q = y / w;
+    const reals w = 1 + sheet->w_terms[0] * at->x + sheet->w_terms[1] * at->y;
+    const reals p = at->x / w, q = at->y / w;
     const SheetVariances systematic = {
         sheet_parameter_variance(sheet->factor_g, p, q, in_g[1] * p + in_g[2] * q),
         sheet_parameter_variance(sheet->factor_h, p, q, in_h[1] * p + in_h[2] * q)};
     return systematic;
 }
 
+#ifndef CAMERA_PROFILES
 // Compute the standard deviations of G and H for independent errors of position and sample. Under SHEET_COVARIANCE the
 // systematic variances are added.
 static inline void sheet_sigma(reals position, reals sample, reals sigma_position, reals sigma_sample,
                                constant SheetTable *sheet, reals *sigma_g, reals *sigma_h) {
-    SheetVariances sum = sheet_noise(position, sample, sigma_position, sigma_sample, sheet);
+    const SheetPlace at = sheet_place(position, sample, sheet);
+    SheetVariances sum = sheet_noise_at(&at, sigma_position, sigma_sample, sheet);
 #ifdef SHEET_COVARIANCE
-    const SheetVariances systematic = sheet_systematic(position, sample, sheet);
+    const SheetVariances systematic = sheet_systematic_at(&at, sheet);
     sum.g += systematic.g;
     sum.h += systematic.h;
 #endif
     *sigma_g = sqrt(sum.g);
     *sigma_h = sqrt(sum.h);
 }
+#endif
 
 #endif

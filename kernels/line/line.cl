@@ -12,6 +12,7 @@
 //          previous   (frames, samples) real [px], under SELECT_NEAREST: earlier positions, NaN: unknown
 //          threshold, saturation, minimum  CODE [grey levels]: level of no light, of saturation, smallest peak
 //          table      LineTable;  sheet  SheetTable (common/sheet.h), under WITH_SHEET
+//          correction (blocks, CAMERA_PROFILES, 2, 16) real, under CAMERA_PROFILES (sheet_place_in_profile)
 // Outputs: (frames, samples), each one compiled only under its WITH_... option:
 //          position real [px], peak real [grey levels], width real [px], total real [grey levels], status uchar,
 //          g, h real [m] (under WITH_SHEET), sigma real [px] (standard deviation of the position by the noise of the
@@ -62,6 +63,8 @@ typedef struct {
     global real *g, *h, *sigma, *sigma_g, *sigma_h, *systematic_g, *systematic_h;
     constant SheetTable *sheet;
     constant LineTable *table;
+    global const real *correction;
+    int samples;  // profiles of a frame
 } Outputs;
 
 // Write the readings of LANES profiles, the first of them element `first` of the outputs and profile `sample` of its
@@ -85,8 +88,12 @@ static inline void store_reading(const Outputs *to, ulong first, int sample, rea
 #endif
 #ifdef WITH_SHEET
     reals g, h;
-    const reals samples = to_reals((ints)sample + LANE_NUMBERS);
-    const ints sheet_flags = to_ints(sheet_point(position, samples, to->sheet, &g, &h));
+#ifdef CAMERA_PROFILES
+    const SheetPlace place = sheet_place_in_profile(position, sample, to->samples, to->correction, to->sheet);
+#else
+    const SheetPlace place = sheet_place(position, to_reals((ints)sample + LANE_NUMBERS), to->sheet);
+#endif
+    const ints sheet_flags = to_ints(sheet_point_at(&place, to->sheet, &g, &h));
     flags |= sheet_flags & ~lost;
 #ifdef WITH_G
     store_reals(g, to->g + first);
@@ -95,7 +102,7 @@ static inline void store_reading(const Outputs *to, ulong first, int sample, rea
     store_reals(h, to->h + first);
 #endif
 #if defined(WITH_SIGMA_G) || defined(WITH_SIGMA_H)
-    const SheetVariances noise = sheet_noise(position, samples, sigma, (reals)0, to->sheet);
+    const SheetVariances noise = sheet_noise_at(&place, sigma, (reals)0, to->sheet);
 #endif
 #ifdef WITH_SIGMA_G
     store_reals(nan_where(to_masks(not_finite_lanes(g)), sqrt(noise.g)), to->sigma_g + first);
@@ -104,7 +111,7 @@ static inline void store_reading(const Outputs *to, ulong first, int sample, rea
     store_reals(nan_where(to_masks(not_finite_lanes(h)), sqrt(noise.h)), to->sigma_h + first);
 #endif
 #if defined(WITH_SYSTEMATIC_G) || defined(WITH_SYSTEMATIC_H)
-    const SheetVariances systematic = sheet_systematic(position, samples, to->sheet);
+    const SheetVariances systematic = sheet_systematic_at(&place, to->sheet);
 #endif
 #ifdef WITH_SYSTEMATIC_G
     store_reals(nan_where(to_masks(not_finite_lanes(g)), sqrt(systematic.g)), to->systematic_g + first);
@@ -281,7 +288,7 @@ kernel void line_readout(global const CODE *restrict frames,
                          global real *restrict sigma_h, global real *restrict systematic_g,
                          global real *restrict systematic_h, const int rows, const int columns, const CODE threshold,
                          const CODE saturation, const CODE minimum, constant LineTable *table,
-                         constant SheetTable *sheet) {
+                         constant SheetTable *sheet, global const real *restrict correction) {
 #ifndef SELECT_NEAREST
     global const real *previous = 0;
 #endif
@@ -294,6 +301,7 @@ kernel void line_readout(global const CODE *restrict frames,
     const Profiles frame = {frames + number * rows * columns, stride, lane_stride, length,
                             threshold,                        saturation, minimum};
     const Outputs to = {position, peak,    width,   total,        status,       g,     h,
-                        sigma,    sigma_g, sigma_h, systematic_g, systematic_h, sheet, table};
+                        sigma,    sigma_g, sigma_h, systematic_g, systematic_h, sheet, table,
+                        correction, samples};
     read_frame(&frame, samples, table, &to, number * samples, previous);
 }

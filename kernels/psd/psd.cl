@@ -196,7 +196,8 @@ static inline void read_samples(const int careful, int sample, const Readout *io
     // The number of the strip is the second sensor coordinate.
     const reals strip = to_reals((sample + LANE_NUMBERS) % io->strips);
     reals at_g, at_h;
-    const bytes lost = sheet_point(u, strip, io->sheet, &at_g, &at_h);
+    const SheetPlace place = sheet_place(u, strip, io->sheet);
+    const bytes lost = sheet_point_at(&place, io->sheet, &at_g, &at_h);
     // An invalid reading enters the sheet as NaN; its status is the flag of the reading, not the flag of the sheet.
     flags |= LANED(convert_bits)(lost) & good;
 #ifdef WITH_G
@@ -206,7 +207,7 @@ static inline void read_samples(const int careful, int sample, const Readout *io
     store_reals(at_h, io->h + sample);
 #endif
 #if defined(WITH_SIGMA_G) || defined(WITH_SIGMA_H)
-    const SheetVariances noise = sheet_noise(u, strip, sigma_of(balance, sum, table), (reals)0, io->sheet);
+    const SheetVariances noise = sheet_noise_at(&place, sigma_of(balance, sum, table), (reals)0, io->sheet);
 #endif
 #ifdef WITH_SIGMA_G
     store_reals(nan_where(mask_of(LANED(not_finite)(at_g)), sqrt(noise.g)), io->sigma_g + sample);
@@ -215,7 +216,7 @@ static inline void read_samples(const int careful, int sample, const Readout *io
     store_reals(nan_where(mask_of(LANED(not_finite)(at_h)), sqrt(noise.h)), io->sigma_h + sample);
 #endif
 #if defined(WITH_SYSTEMATIC_G) || defined(WITH_SYSTEMATIC_H)
-    const SheetVariances systematic = sheet_systematic(u, strip, io->sheet);
+    const SheetVariances systematic = sheet_systematic_at(&place, io->sheet);
 #endif
 #ifdef WITH_SYSTEMATIC_G
     store_reals(nan_where(mask_of(LANED(not_finite)(at_g)), sqrt(systematic.g)), io->systematic_g + sample);

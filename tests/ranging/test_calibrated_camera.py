@@ -212,6 +212,60 @@ def test_fused_in_the_readout_with_axes(device: Device, along: Any, rng: np.rand
     np.testing.assert_allclose(reading.h, h, rtol=0, atol=2e-6 * 0.07)
 
 
+@pytest.mark.parametrize(("along", "samples"), [("columns", 1024), ("columns", 211), ("rows", 211)])
+def test_table_of_the_profiles_in_the_readout(
+    device: Device, along: Any, samples: int, rng: np.random.Generator
+) -> None:
+    """All coefficients: within the roundings of a triangulation without a camera, in every column and up to the end."""
+    operation = scanner(CAMERAS["all"], along)
+    assert operation.profile_correction(np.float32, SampleAxes(), 700, samples) is not None
+    rows = rng.integers(10, 690, (2, samples))
+    rows[0, :2], rows[1, -2:] = (10, 689), (689, 10)
+    frames = np.zeros((2, 700, samples), np.uint8)
+    for offset, level in ((-1, 90), (0, 200), (1, 70)):
+        np.put_along_axis(frames, rows[:, None] + offset, level, axis=1)
+    frames = np.ascontiguousarray(np.swapaxes(frames, 1, 2)) if along == "rows" else frames
+    reading = LineReadout(along=along, threshold=50.0, window=4, triangulation=operation)(frames, device=device)
+    v = np.broadcast_to(np.arange(float(samples)), (2, samples))
+    g, h, status = oracle(operation, np.asarray(reading.position, np.float64), v)
+    np.testing.assert_array_equal(reading.status, status)
+    # The homography's roundings, and one of the correction's last sum.
+    atol = 0.5 * np.finfo(np.float32).eps * (ROUNDINGS + 1.0) * np.max(np.abs([g, h]))
+    np.testing.assert_allclose(reading.g, g, rtol=0, atol=atol)
+    np.testing.assert_allclose(reading.h, h, rtol=0, atol=atol)
+
+
+def test_sigmas_in_the_readout_with_the_table_of_the_profiles(device: Device, rng: np.random.Generator) -> None:
+    operation = scanner(CAMERAS["all"], sigma=(0.2, 0.0))
+    frames = rng.integers(0, 20, (1, 64, 64)).astype(np.uint8)
+    frames[:, 30:33] = 200
+    readout = LineReadout(
+        threshold=50.0, window=4, triangulation=operation, outputs=("position", "status", "sigma", "sigma_g", "sigma_h")
+    )
+    reading = readout(frames, device=device)
+    points = np.stack([np.asarray(reading.position, np.float64)[0], np.arange(64.0)], -1)
+    full = operation.covariance_at(points) * (np.asarray(reading.sigma, np.float64)[0] / 0.2)[:, None, None] ** 2
+    rtol = 64.0 * np.finfo(np.float32).eps
+    np.testing.assert_allclose(reading.sigma_g[0], np.sqrt(full[:, 0, 0]), rtol=rtol)
+    np.testing.assert_allclose(reading.sigma_h[0], np.sqrt(full[:, 1, 1]), rtol=rtol)
+
+
+def test_no_table_where_a_pixel_has_no_ideal_position_or_in_double_precision() -> None:
+    operation = scanner(CAMERAS["all"])
+    table = operation.profile_correction(np.float32, SampleAxes(), 1024, 1280)
+    assert table is not None
+    assert operation.defines(np.float32, table)["CAMERA_PROFILES"] == table.terms.shape[1]
+    assert "CAMERA_STEPS" not in operation.defines(np.float32, table)
+    assert operation.profile_correction(np.float64, SampleAxes(), 1024, 1280) is None
+    assert scanner(Camera(matrix=MATRIX)).profile_correction(np.float32, SampleAxes(), 1024, 1280) is None
+    # The image of k1 = -1 folds 654 rows from the centre; near the fold the polynomials do not reach the tolerance.
+    folding = scanner(Camera(matrix=MATRIX, distortion=(-1.0, *(0.0,) * 13)))
+    for first, length in ((498.0, 700), (498.0, 630)):
+        axes = SampleAxes(position_origin=first, sample_origin=645.0)
+        assert folding.profile_correction(np.float32, axes, length, 20) is None
+    assert folding.profile_correction(np.float32, SampleAxes(position_origin=398.0, sample_origin=645.0), 200, 20)
+
+
 def test_only_what_the_camera_has_is_compiled() -> None:
     def options(coefficients: tuple[float, ...]) -> set[str]:
         return set(scanner(Camera(matrix=MATRIX, distortion=coefficients)).defines(np.float32))

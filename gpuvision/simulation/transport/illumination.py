@@ -132,7 +132,7 @@ class LightSheet:
     Notes
     -----
     In a bent sheet (``transport.bend``) light travels along the lines of constant G of the sheet, or from the source
-    along straight lines in (G, H). Lit points lie on their surface and within `sheet_cut.BEND_ERROR` (50 nm) of the
+    along straight lines in (G, H). Lit points lie on their surface and within 50 nm (``sheet_cut.BEND_ERROR``) of the
     sheet. The direction of the light on a surface is that of the mean plane, which is wrong by the slope of the bend.
 
     References
@@ -376,7 +376,7 @@ def _unit_normals(corners: Float64) -> Float64:
 def _on_planes(ends: Float64, corners: Float64) -> Float64:
     """Return the feet of the perpendiculars from points (n, 2, 3) to the planes of triangles (n, 3, 3).
 
-    The lit points of a bent sheet lie up to `BEND_ERROR` beside their triangle, which would occlude them.
+    The lit points of a bent sheet lie up to ``BEND_ERROR`` beside their triangle, which would occlude them.
     """
     normal = _unit_normals(corners)[:, None]
     beside = np.sum((ends - corners[:, :1]) * normal, axis=-1, keepdims=True)

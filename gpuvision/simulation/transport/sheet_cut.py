@@ -4,7 +4,7 @@ A point of the scene is ``origin + G g_axis + H h_axis + L direction``. In these
 is the plane of constant L, and a cut through a triangle is a segment in (G, H).
 
 A bent sheet is flat in other coordinates: ``origin + G g_axis + H h_axis + d(G, H) normal + L direction``. In these
-coordinates a triangle is curved; it is divided until a flat one deviates from it by less than `BEND_ERROR`.
+coordinates a triangle is curved; it is divided until a flat one deviates from it by less than ``BEND_ERROR``.
 """
 
 from __future__ import annotations

@@ -343,8 +343,8 @@ class EstimateFeaturePose(OperationSequence[FeaturePose]):
     k (width^2 - 1) / 24 px, 5e-4 px for 5 lines, k1 = -0.2, f = 220 px and 60 px off the centre. Where a feature lies
     past the fold of the lens, its status is NOT_INVERTIBLE.
 
-    Cost: a `Lens` takes 3 to 5 % of a call with 60 rulers, a `Camera` with k1 8 % (PoCL, medians of alternating calls on
-    a machine with other load; ``gpuvision profile servo`` repeats the measurement with a `Lens`).
+    Cost: a `Lens` takes 3 to 5 % of a call with 60 rulers, a `Camera` with k1 8 % (PoCL, medians of alternating calls
+    on a machine with other load; ``gpuvision profile servo`` repeats the measurement with a `Lens`).
     """
 
     Result: ClassVar[type[Any]] = FeaturePose

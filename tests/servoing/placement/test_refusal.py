@@ -28,8 +28,13 @@ def _artwork(*points: tuple[float, float]) -> Any:
     )
 
 
-def _said(artwork: Any, works: Any, reason: str = "too few edges; use more") -> list[str]:
-    return explain_refusal(reason, artwork, TARGET, CAMERA, MACHINE, works).split("; ")
+def _always(pose: np.ndarray, machine: Machine) -> bool:
+    return True
+
+
+def _said(artwork: Any, works: Any, lands: Any = _always, reason: str = "too few edges; use more") -> list[str]:
+    guidance = SimpleNamespace(works=works, lands=lands)
+    return explain_refusal(reason, artwork, TARGET, CAMERA, MACHINE, guidance).split("; ")
 
 
 def _never(pose: np.ndarray, machine: Machine) -> bool:
@@ -80,3 +85,14 @@ def test_the_smallest_window_that_works() -> None:
     poses = []
     _said(_artwork(), lambda pose, machine: poses.append(pose))
     np.testing.assert_array_equal(poses, [CAMERA] * 2)
+
+
+def test_the_coarse_registration_must_land_too() -> None:
+    """Three targets at which features suffice are tried."""
+    near = [(float(k), 0.0) for k in range(1, 7)]
+    for last, is_found in ((3, True), (4, False)):
+        limit = CAMERA[0] + (last - 0.5) * SIDE
+        lands = lambda pose, machine, limit=limit: bool(pose[0] > limit)  # noqa: E731
+        assert any("nearest target" in each for each in _said(_artwork(*near), _always, lands)) == is_found
+    said = _said(_artwork(), _always, lambda pose, machine: machine.camera.window[0] >= 1024)
+    assert said[3] == "a window of 1024 x 1024 px instead of 512 x 512 px has enough"

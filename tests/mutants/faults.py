@@ -43,8 +43,8 @@ _KERNEL_CHANGES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = 
     (r"(?<![\w.])\d+\.\d+", lambda number: str(1.1 * float(number[0]) or 0.1)),
     (r"(?<![\w.])[1-9](?=[;,)\]])", lambda number: str(int(number[0]) - 1)),
 )
-# Keyword arguments of figures that set only the sizes of panes, text, lines and markers: no statement about data. They
-# are not changed in `gpuvision/plots`; every other number of a figure is.
+# Keyword arguments of figures that set only the sizes of panes, text, lines and markers, or their transparency: no
+# statement about data. They are not changed in `gpuvision/plots`; every other number of a figure is.
 _APPEARANCE = re.compile(
     "figsize|height_ratios|width_ratios|fontsize|labelsize|labelpad|linewidths?|markersize|markeredgewidth|alpha"
 )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import threading
 from collections.abc import Iterator
 
 from gpuvision.validation import integer
@@ -23,7 +24,7 @@ _PERMISSION_HINT = (
 
 @contextlib.contextmanager
 def low_latency(*, core: int | None = None, priority: int = 0) -> Iterator[None]:
-    """Run the body without garbage collection, on request on one core and with real-time priority.
+    """Run the body without garbage collection of the process, on request on one core and with real-time priority.
 
     Parameters
     ----------
@@ -46,8 +47,12 @@ def low_latency(*, core: int | None = None, priority: int = 0) -> Iterator[None]
     Notes
     -----
     Start the devices and bind all operations before: the worker threads of an OpenCL runtime would inherit core and
-    priority. Objects that exist at the start are never searched for garbage inside the body (`gc.freeze`); cyclic
-    garbage that the body makes is freed after it. The settings of before return at the end.
+    priority. Core and priority are those of the calling thread; they return at the end.
+
+    Garbage collection is a setting of the whole process: it is off for all threads while at least one thread is
+    inside, and the last one that leaves restores it. Objects that exist at the start are not searched for garbage
+    inside the body, even by `gc.collect` (`gc.freeze`); cyclic garbage that the body makes is freed after it. Where the
+    caller froze objects before, they stay frozen, and no others are frozen.
 
     A thread with real-time priority must sleep or wait in each frame. If it computes without a pause, Linux stops
     it for 50 ms in each second.
@@ -64,7 +69,7 @@ def low_latency(*, core: int | None = None, priority: int = 0) -> Iterator[None]
     False
     """
     with contextlib.ExitStack() as settings:
-        settings.enter_context(_without_garbage_collection())
+        settings.enter_context(_COLLECTION_PAUSE)
         if core is not None:
             settings.enter_context(_on_core(integer(core, "core", minimum=0)))
         if integer(priority, "priority", minimum=0, maximum=99):
@@ -81,18 +86,35 @@ def real_time_is_allowed() -> bool:
         return False
 
 
-@contextlib.contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    was_enabled = gc.isenabled()
-    gc.collect()
-    gc.disable()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-        if was_enabled:
-            gc.enable()
+class _CollectionPause:
+    """Pause of the garbage collection of the process: from the first user that enters to the last one that leaves."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = 0
+        self._was_enabled = self._has_frozen = False
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._users == 0:
+                self._was_enabled, self._has_frozen = gc.isenabled(), gc.get_freeze_count() == 0
+                gc.collect()
+                gc.disable()
+                if self._has_frozen:
+                    gc.freeze()
+            self._users += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                if self._has_frozen:
+                    gc.unfreeze()
+                if self._was_enabled:
+                    gc.enable()
+
+
+_COLLECTION_PAUSE = _CollectionPause()
 
 
 @contextlib.contextmanager

@@ -5,11 +5,20 @@ from __future__ import annotations
 import gc
 import os
 import threading
+from collections.abc import Iterator
 
 import pytest
 
 from gpuvision.servoing import low_latency as module
 from gpuvision.servoing.low_latency import low_latency, real_time_is_allowed
+
+
+@pytest.fixture(autouse=True)
+def without_frozen_objects() -> Iterator[None]:
+    """Start without the objects that the test session froze (`conftest.py`)."""
+    gc.unfreeze()
+    yield
+    gc.freeze()
 
 
 def test_no_garbage_collection_inside() -> None:
@@ -30,6 +39,42 @@ def test_disabled_collection_stays_disabled() -> None:
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_objects_that_the_caller_froze_stay_frozen() -> None:
+    gc.freeze()
+    try:
+        before = gc.get_freeze_count()
+        assert before > 0
+        with low_latency():
+            assert not gc.isenabled()
+        # Frozen objects whose last reference goes are freed, so that a few may be missing.
+        assert 0.99 * before < gc.get_freeze_count() <= before
+    finally:
+        gc.unfreeze()
+
+
+def test_collection_stays_off_until_the_last_thread_leaves() -> None:
+    entered, left = threading.Event(), threading.Event()
+    inside: list[bool] = []
+
+    def first() -> None:
+        with low_latency():
+            entered.set()
+            assert second_inside.wait(10)
+        left.set()
+
+    second_inside, thread = threading.Event(), threading.Thread(target=first)
+    thread.start()
+    assert entered.wait(10)
+    with low_latency():
+        second_inside.set()
+        assert left.wait(10)
+        inside += [gc.isenabled(), gc.get_freeze_count() > 0]
+    thread.join()
+    assert inside == [False, True]
+    assert gc.isenabled()
+    assert gc.get_freeze_count() == 0
 
 
 def test_the_thread_runs_on_its_core_and_others_do_not() -> None:

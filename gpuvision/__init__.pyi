@@ -300,12 +300,6 @@ from .ranging.range_image import (
 from .ranging.range_image import (
     RangePoints as RangePoints,
 )
-from .ranging.range_image import (
-    RotatingSheet as RotatingSheet,
-)
-from .ranging.range_image import (
-    StraightTransport as StraightTransport,
-)
 from .ranging.regrid import (
     Grid as Grid,
 )
@@ -335,6 +329,12 @@ from .ranging.sheet_calibration import (
 )
 from .ranging.sheet_from_points import (
     sheet_from_points as sheet_from_points,
+)
+from .ranging.sheet_motion import (
+    RotatingSheet as RotatingSheet,
+)
+from .ranging.sheet_motion import (
+    StraightTransport as StraightTransport,
 )
 from .ranging.sheet_readings import (
     LaserLine as LaserLine,

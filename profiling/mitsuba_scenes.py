@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from gpuvision.host import Device, Precision, to_numpy
 from gpuvision.profiling.occluded_irradiance import Board
-from gpuvision.ranging.range_image import Vector
+from gpuvision.ranging.sheet_motion import Vector
 from gpuvision.simulation.scene.rays import ClosestHit
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.view_rays import unit_normals

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from gpuvision.host import Device, to_numpy
 from gpuvision.profiling import regrid
 from gpuvision.profiling.harness import Case
-from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
+from gpuvision.ranging.range_image import RangeImage, RangePoints
+from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport
 
 Array = NDArray[Any]
 

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from gpuvision.ranging.range_image import RotatingSheet
+from gpuvision.ranging.sheet_motion import RotatingSheet
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gpuvision.camera.lens import Lens
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert

@@ -7,8 +7,8 @@ from scipy.special import ndtr
 
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
-from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.sheet import SampleAxes
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.simulation.sensors.camera_simulator import CameraSimulator
 from gpuvision.simulation.sensors.psd_simulator import PsdSimulator

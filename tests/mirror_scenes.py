@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gpuvision.host import Device
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.scene import Scene

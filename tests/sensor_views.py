@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from gpuvision.camera.lens import Lens
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.simulation.sensors.sensor_view import SensorView
 

@@ -12,9 +12,9 @@ from gpuvision.matching.pose import board_pose, feature_pose, pose
 from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.ranging.line import LineTable
 from gpuvision.ranging.psd import PsdTable
-from gpuvision.ranging.range_image import BentTable, RotatingTable, StraightTable
 from gpuvision.ranging.regrid import RegridCounts, RegridTable
 from gpuvision.ranging.sheet import SheetTable
+from gpuvision.ranging.sheet_motion import BentTable, RotatingTable, StraightTable
 from gpuvision.simulation.transport.mirror_points import MirrorPoints, TriangleBlocks
 from gpuvision.simulation.transport.patches import Patches, PatchTriangle
 

@@ -12,7 +12,8 @@ import scipy.ndimage
 
 from gpuvision.ranging.focus import DepthFromFocus, conjugate_distance
 from gpuvision.ranging.focus_noise import BEND, laplacian_variance
-from gpuvision.ranging.range_image import Limits, RangePoints, StraightTransport
+from gpuvision.ranging.range_image import Limits, RangePoints
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.status import Status
 from gpuvision.validation import finite, integer
 

@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.ranging.polygon import PolygonMirror
-from gpuvision.ranging.range_image import Limits, RangeImage, RangePoints, StraightTransport
+from gpuvision.ranging.range_image import Limits, RangeImage, RangePoints
 from gpuvision.ranging.sheet import SheetPoints
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.status import Status
 from gpuvision.validation import finite
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from gpuvision.ranging.range_image import RotatingSheet, Vector
+from gpuvision.ranging.sheet_motion import RotatingSheet, Vector
 from gpuvision.validation import finite
 
 Float64 = npt.NDArray[np.float64]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gpuvision.ranging.focus_stack import MEASURES, FocusStack, LensFocus, StageFocus
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.schema import Section
 
 FOCUS_PLACE = StraightTransport(direction=(0.0, -1.0, 0.0))

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gpuvision.ranging.range_image import Vector
+from gpuvision.ranging.sheet_motion import Vector
 from gpuvision.schema import Section
 
 

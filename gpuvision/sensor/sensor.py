@@ -50,9 +50,10 @@ from gpuvision.ranging.focus_stack import FocusStack
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.polygon_scan import PolygonScan
 from gpuvision.ranging.psd import PsdReadout
-from gpuvision.ranging.range_image import Limits, StraightTransport
+from gpuvision.ranging.range_image import Limits
 from gpuvision.ranging.rotating_sigma import RotatingSheetSigma
 from gpuvision.ranging.sheet import SampleAxes
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.ranging.triangulation import Along
 from gpuvision.schema import DescriptionError, Section, preset_names, read_preset
 from gpuvision.sensor.focus import FOCUS_PLACE, read_focus

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gpuvision.ranging.focus_stack import FocusStack
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import ELECTRON, PsdReadout
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.sensor.light_source import Light
 from gpuvision.sensor.sensor import Sensor

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from gpuvision.formats.encoder_file import read_encoder
 from gpuvision.ranging.encoder import EncoderStatistics, not_advancing, unwrapped_counts
-from gpuvision.ranging.range_image import RotatingSheet, StraightTransport, Vector
 from gpuvision.ranging.rotating_sigma import RotatingSheetSigma
+from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport, Vector
 from gpuvision.ranging.triangulation import Along
 from gpuvision.schema import Section
 from gpuvision.sensor.optics import Optics

@@ -19,7 +19,8 @@ from gpuvision.host import Device, to_numpy
 from gpuvision.normal_distribution import MAD_TO_SIGMA
 from gpuvision.ranging.focus_stack import FocusPeak, FocusStack
 from gpuvision.ranging.polygon_scan import PolygonScan
-from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
+from gpuvision.ranging.range_image import RangeImage, RangePoints
+from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.transports import Transport
 

@@ -22,8 +22,9 @@ from gpuvision.host.outputs import Outputs
 from gpuvision.host.report import StreamReport
 from gpuvision.plots.range_image import draw_height_map, draw_scan, height_span
 from gpuvision.ranging.line import LineReadout
-from gpuvision.ranging.range_image import RangePoints, RotatingSheet
+from gpuvision.ranging.range_image import RangePoints
 from gpuvision.ranging.regrid import MAX_MAP_CELLS, Grid, HeightMap
+from gpuvision.ranging.sheet_motion import RotatingSheet
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.workflows.scan_errors import ScanErrors, error_budget

@@ -25,8 +25,9 @@ from gpuvision.host.trace import Trace
 from gpuvision.ranging.focus_stack import FocusStack
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
-from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
+from gpuvision.ranging.range_image import RangeImage, RangePoints
 from gpuvision.ranging.regrid import Direction, Grid, HeightMap, Regrid
+from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.workflows.focus_frames import read_focus_peak

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
-from gpuvision.ranging.range_image import RangePoints, StraightTransport
+from gpuvision.ranging.range_image import RangePoints
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.simulated import make_sensor_view, make_simulator, require_light
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution, attribute_errors

@@ -1,6 +1,6 @@
 // Range image: profiles over a moving sheet of light -> point (x, y, z) per (profile, sample) in the scene [m].
 //
-// Two geometries (RangeImage in gpuvision/ranging/range_image.py):
+// Two geometries (gpuvision/ranging/sheet_motion.py):
 //     straight transport:  point = origin + G e1 + H e2 + L e3     (G, H in the sheet, L travelled along e3)
 // SHEET_BENT:              the same for light at the distance d = f(G, H) from the plane of G and H (bent, below)
 // GEOMETRY_ROTATING:   the ray r = (a, b, 1) of a camera at rest meets the sheet n.(X - p) = e, whose normal n turns
@@ -30,7 +30,7 @@
 #define STATUS_INFORMS (STATUS_SATURATED | STATUS_AMBIGUOUS)
 #define STATUS_WITHHOLDS (~STATUS_INFORMS & 0xff)
 
-// Parameters, in the order of RangeTable in range_image.py.
+// Parameters, in the order of the tables in sheet_motion.py.
 typedef struct {
     real low[3], high[3];             // limits of x, y, z [m]
     real origin[3];                   // of the points

@@ -10,8 +10,8 @@ import numpy as np
 from gpuvision.camera.camera import Camera
 from gpuvision.formats.sensor_file import sensor_text
 from gpuvision.ranging.line import LineReadout
-from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.sensor_geometry import SensorGeometry
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.ranging.sheet_result import SheetFit
 from gpuvision.ranging.transport_calibration import TransportFit
 from gpuvision.sensor.sensor import Sensor

@@ -12,8 +12,9 @@ import scipy.optimize
 from conftest import DATA
 from gpuvision import Status
 from gpuvision.ranging.line import LineReading, LineReadout
-from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet
+from gpuvision.ranging.range_image import RangeImage, RangePoints
 from gpuvision.ranging.regrid import Grid, Regrid
+from gpuvision.ranging.sheet_motion import RotatingSheet
 
 pytestmark = pytest.mark.realdata
 

@@ -10,7 +10,7 @@ import pytest
 import scipy.ndimage
 
 from gpuvision.ranging.focus_stack import FocusPeak, FocusSearch, FocusStack, LensFocus, StageFocus
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.status import Status
 
 ANYWHERE = ((-math.inf, math.inf),) * 3

@@ -12,7 +12,7 @@ import pytest
 from gpuvision.host import Device, to_numpy
 from gpuvision.ranging.polygon import PolygonMirror
 from gpuvision.ranging.polygon_scan import PolygonScan
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.status import Status
 
 ANYWHERE = ((-math.inf, math.inf),) * 3

@@ -15,8 +15,9 @@ from hypothesis.extra import numpy as hnp
 from gpuvision import Device, Status
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
-from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
+from gpuvision.ranging.range_image import RangeImage, RangePoints
 from gpuvision.ranging.sheet import BentSheet, check_orthonormal
+from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport
 from gpuvision.reference import range_image as reference
 
 VARIANTS = ("vector", "work_item")

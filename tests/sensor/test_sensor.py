@@ -21,7 +21,7 @@ from gpuvision.camera.polynomial import PlanePolynomial
 from gpuvision.formats.camera_file import write_lens
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
-from gpuvision.ranging.range_image import RotatingSheet, StraightTransport
+from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.schema import DescriptionError, Section, read_preset
 from gpuvision.sensor.sensor import Sensor

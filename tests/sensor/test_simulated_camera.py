@@ -14,7 +14,7 @@ import trimesh
 
 from gpuvision.camera.polynomial import PlanePolynomial
 from gpuvision.host import Device
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.schema import Section
 from gpuvision.sensor.sensor import Sensor

@@ -15,8 +15,9 @@ import tifffile
 from gpuvision.camera.camera import Camera
 from gpuvision.formats.range_image import read_ply
 from gpuvision.host import Device, to_numpy
-from gpuvision.ranging.range_image import RangeImage, StraightTransport
+from gpuvision.ranging.range_image import RangeImage
 from gpuvision.ranging.rotating_sigma import RotatingSheetSigma
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.reference.line import pixel_gaussian
 from gpuvision.schema import DescriptionError, read_toml
 from gpuvision.sensor.sensor import Sensor

@@ -20,6 +20,7 @@ import numpy as np
 import scipy.optimize
 
 from gpuvision.camera.lines.line_families import Float64, PackedLines
+from gpuvision.camera.lines.normal_equations import normal_equations, residual_jacobian
 from gpuvision.camera.lines.straightness import (
     LineSet,
     Parameters,
@@ -28,8 +29,6 @@ from gpuvision.camera.lines.straightness import (
     fit_lines,
     inner_products,
     moments,
-    normal_equations,
-    residual_jacobian,
     undistort,
 )
 from gpuvision.camera.lines.variable_projection import Minimum

@@ -33,7 +33,7 @@ from numpy.polynomial import legendre
 
 from gpuvision.camera.lines.line_families import Float64, Index, PackedLines
 from gpuvision.camera.lines.line_statistics import image_normals, p_value_of_gain
-from gpuvision.camera.lines.straightness import ResidualJacobian, line_coefficients, projected_columns
+from gpuvision.camera.lines.normal_equations import ResidualJacobian, line_coefficients, projected_columns
 from gpuvision.camera.lines.variable_projection import Minimum
 from gpuvision.camera.smooth_field import LackOfFit, mode_variances, not_below
 from gpuvision.jackknife import cluster_jackknife

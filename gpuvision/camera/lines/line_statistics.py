@@ -10,7 +10,8 @@ import numpy.typing as npt
 import scipy.special
 
 from gpuvision.camera.lines.line_families import Float64, PackedLines
-from gpuvision.camera.lines.straightness import Parameters, constrained_lines, inner_products, projected_columns
+from gpuvision.camera.lines.normal_equations import projected_columns
+from gpuvision.camera.lines.straightness import Parameters, constrained_lines, inner_products
 from gpuvision.camera.lines.variable_projection import Minimum, linear_start, minimise
 from gpuvision.normal_distribution import MAD_TO_SIGMA
 

@@ -15,18 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from gpuvision.camera.lines.line_families import Float64, PackedLines
-from gpuvision.camera.lines.straightness import (
-    Evaluation,
-    LineSet,
+from gpuvision.camera.lines.normal_equations import (
     NormalEquations,
-    Parameters,
     ResidualJacobian,
-    evaluate,
-    is_monotonic,
     normal_equations,
-    pencil_basis,
     residual_jacobian,
 )
+from gpuvision.camera.lines.straightness import Evaluation, LineSet, Parameters, evaluate, is_monotonic, pencil_basis
 
 _ROUNDING = 64.0 * float(np.finfo(np.float64).eps) ** 2
 """Squared residual at rounding level. Derived from double precision."""

@@ -2,39 +2,38 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import fdtrc
 
 from gpuvision.camera.tilted_projection import Floats, tilt_matrix
 from gpuvision.camera.views.bundle_adjustment import FitState, PackedViews, RobustLoss, adjust, residuals, robust_scale
+from gpuvision.camera.views.calibration_candidates import (
+    CalibrationTask,
+    Candidate,
+    alternative_of,
+    calibration_result,
+    p_value_against,
+    parse_model,
+)
 from gpuvision.camera.views.camera_fit import (
-    CameraAlternative,
     CameraFit,
     camera_from_parameters,
-    covariances,
-    free_covariance,
-    poses_in_lens_frame,
     residual_sigma,
-    residual_variance_factor,
 )
-from gpuvision.camera.views.correlated_errors import MIN_VIEWS, CorrelatedErrors, correlated_errors
-from gpuvision.camera.views.diagnosis import DEFAULT_LIMITS, CalibrationLimits, determines_focal_length, diagnose
+from gpuvision.camera.views.diagnosis import DEFAULT_LIMITS, CalibrationLimits
 from gpuvision.camera.views.initialization import (
-    UndistortedHomographies,
     fit_homographies,
     poses_from_homographies,
     tilt_closed_form,
     zhang_closed_form,
 )
 from gpuvision.camera.views.parameters import COEFFICIENTS, FIT_PARAMETERS, FreeParameters, internal_parameters
-from gpuvision.camera.views.target_views import Mask, pack
+from gpuvision.camera.views.target_views import pack
 from gpuvision.validation import finite, numbers
 
 LossName = Literal["squared", "huber", "tukey"]
@@ -50,51 +49,6 @@ _SAME_SCALE = 0.01
 _SINGULAR = 1e-9
 # Residuals [px] at rounding level, which cannot distinguish models.
 _EXACT_PX = 1e-6
-
-
-@dataclass(frozen=True)
-class _Task:
-    """Inputs of one call of `fit_camera`, checked and packed."""
-
-    views: PackedViews
-    masks: tuple[Mask, ...]
-    size: tuple[int, int]
-    homography_fit: UndistortedHomographies
-    origin: Floats
-    radius: float
-    loss: RobustLoss
-    sigma: float | None
-    aspect: bool
-    focal_length: float | None
-    centre_is_known: bool
-    limits: CalibrationLimits
-
-    def free_parameters(self, model: str) -> FreeParameters:
-        """Return the free parameters of a model."""
-        tilt, coefficients = _parse_model(model)
-        return FreeParameters(
-            coefficients=coefficients,
-            tilt=tilt,
-            aspect=self.aspect,
-            focal_length=self.focal_length,
-            centre=not self.centre_is_known,
-        )
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """Fit of one model."""
-
-    views: PackedViews
-    model: str
-    free_parameters: FreeParameters
-    state: FitState
-    loss: RobustLoss
-
-    @functools.cached_property
-    def correlated(self) -> CorrelatedErrors:
-        """Tests of the residuals for correlation."""
-        return correlated_errors(self.views, self.free_parameters, self.state, self.loss)
 
 
 def fit_camera(
@@ -158,7 +112,7 @@ def fit_camera(
     if sigma is not None and not sigma > 0.0:
         raise ValueError(f"sigma is {sigma}, expected a number of pixels above 0")
     models = list(AUTOMATIC_MODELS) if model == "auto" else [model]
-    _parse_model(model if model != "auto" else "none")
+    parse_model(model if model != "auto" else "none")
     task = _prepare(views, image_size, focal_length, centre, loss, sigma, free_aspect, limits)
     models = _check_enough(task, models)
     largest = _fit_from_starts(task, models[-1])
@@ -168,26 +122,32 @@ def fit_camera(
     return _smallest_accepted(task, candidates, loss)
 
 
-def _with_further_terms(task: _Task, models: list[str], largest: _Candidate) -> tuple[list[str], _Candidate]:
+def _with_further_terms(task: CalibrationTask, models: list[str], largest: Candidate) -> tuple[list[str], Candidate]:
     """Add models with further coefficients as long as the test rejects the largest one; return models and largest."""
     for further in FURTHER_MODELS:
         free_parameters = task.free_parameters(further[-1])
         if free_parameters.count + 6 * len(task.masks) > task.views.coordinates:
             break
         state = adjust(task.views, free_parameters, largest.state, largest.loss)
-        larger = _Candidate(task.views, further[-1], free_parameters, state, largest.loss)
+        larger = Candidate(
+            views=task.views,
+            model=further[-1],
+            free_parameters=free_parameters,
+            state=state,
+            loss=largest.loss,
+        )
         if not state.converged or not _is_invertible(task, state):
             break
-        if _p_value(task, largest, larger) >= task.limits.significance:
+        if p_value_against(task, largest, larger) >= task.limits.significance:
             break
         models, largest = [*models, *further], larger
     return models, largest
 
 
-def _smallest_accepted(task: _Task, candidates: list[_Candidate], loss: LossName) -> CameraFit:
+def _smallest_accepted(task: CalibrationTask, candidates: list[Candidate], loss: LossName) -> CameraFit:
     """Return the smallest model that the F test accepts against the last one, with the others as alternatives."""
     largest = candidates[-1]
-    p_values = [_p_value(task, each, largest) for each in candidates]
+    p_values = [p_value_against(task, each, largest) for each in candidates]
     compared = next(
         each
         for each, p in zip(candidates, p_values, strict=True)
@@ -195,11 +155,11 @@ def _smallest_accepted(task: _Task, candidates: list[_Candidate], loss: LossName
     )
     chosen = _fit_tukey(task, compared) if loss == "tukey" else compared
     alternatives = tuple(
-        _alternative(task, each, p, chosen.state)
+        alternative_of(task, each, p, chosen.state)
         for each, p in zip(candidates, p_values, strict=True)
         if each is not compared
     )
-    return _result(task, chosen, alternatives)
+    return calibration_result(task, chosen, alternatives)
 
 
 def _prepare(
@@ -211,7 +171,7 @@ def _prepare(
     sigma: float | None,
     free_aspect: bool,
     limits: CalibrationLimits,
-) -> _Task:
+) -> CalibrationTask:
     """Check and pack the inputs, and fit the homographies."""
     packed, masks = pack(views)
     size = (int(image_size[0]), int(image_size[1]))
@@ -220,7 +180,7 @@ def _prepare(
     origin = 0.5 * (np.array(size) - 1.0) if known is None else np.array(known)
     radius = 0.5 * math.hypot(*size)
     homography_fit = fit_homographies(packed, origin, radius, robust=loss != "squared")
-    return _Task(
+    return CalibrationTask(
         views=packed,
         masks=masks,
         size=size,
@@ -254,24 +214,7 @@ def _positive(value: float, name: str) -> float:
     return number
 
 
-def _parse_model(model: str) -> tuple[bool, tuple[str, ...]]:
-    """Return whether a model has a tilt, and its free distortion coefficients."""
-    if model == "tilt":
-        return True, ("k1", "k2")
-    names = [] if model == "none" else [name.strip() for name in model.split(",")]
-    for name in names:
-        if name not in ("tilt", *COEFFICIENTS):
-            raise ValueError(
-                f"model: unknown term {name!r}, expected some of tilt, {', '.join(COEFFICIENTS)}, or auto, or none"
-            )
-    if "tilt" in names and ("p1" in names or "p2" in names):
-        raise ValueError(
-            "model: the effects of p1 and p2 and of a tilt cannot be separated; leave out p1 and p2, or the tilt"
-        )
-    return "tilt" in names, tuple(name for name in COEFFICIENTS if name in names)
-
-
-def _check_enough(task: _Task, models: Sequence[str]) -> list[str]:
+def _check_enough(task: CalibrationTask, models: Sequence[str]) -> list[str]:
     """Return the models for which the number of points suffices."""
     needed = {model: task.free_parameters(model).count + 6 * len(task.masks) for model in models}
     enough = [model for model in models if needed[model] <= task.views.coordinates]
@@ -291,7 +234,7 @@ def _check_enough(task: _Task, models: Sequence[str]) -> list[str]:
     return enough
 
 
-def _starting_states(task: _Task, free_parameters: FreeParameters) -> Iterator[FitState]:
+def _starting_states(task: CalibrationTask, free_parameters: FreeParameters) -> Iterator[FitState]:
     """Yield starting states, the most likely first."""
     homography_fit = task.homography_fit
     if free_parameters.tilt and task.focal_length is not None:
@@ -311,7 +254,9 @@ def _starting_states(task: _Task, free_parameters: FreeParameters) -> Iterator[F
                 yield _starting_state(task, free_parameters, scale * math.cos(alpha), 1.0, v)
 
 
-def _starting_state(task: _Task, free_parameters: FreeParameters, f: float, aspect: float, v: Floats) -> FitState:
+def _starting_state(
+    task: CalibrationTask, free_parameters: FreeParameters, f: float, aspect: float, v: Floats
+) -> FitState:
     """Return the state of a virtual camera in units of the image's radius, about its middle or the known centre."""
     rotations, translations = poses_from_homographies(task.homography_fit.homographies, f, aspect, v)
     square = f * f + float(v @ v)
@@ -327,12 +272,15 @@ def _starting_state(task: _Task, free_parameters: FreeParameters, f: float, aspe
     return FitState(values, rotations, translations)
 
 
-def _fit_from_starts(task: _Task, model: str) -> _Candidate:
+def _fit_from_starts(task: CalibrationTask, model: str) -> Candidate:
     """Fit a model; try further starts until the residual is close to the residual of free homographies."""
     free_parameters = task.free_parameters(model)
-    best: _Candidate | None = None
+    best: Candidate | None = None
     for start in _starting_states(task, free_parameters):
-        tried = _minimise_loss(task, _Candidate(task.views, model, free_parameters, start, task.loss))
+        candidate = Candidate(
+            views=task.views, model=model, free_parameters=free_parameters, state=start, loss=task.loss
+        )
+        tried = _minimise_loss(task, candidate)
         if not np.isfinite(tried.state.cost) or not _is_invertible(task, tried.state):
             continue
         if best is None or tried.state.cost < best.state.cost:
@@ -347,7 +295,7 @@ def _fit_from_starts(task: _Task, model: str) -> _Candidate:
     return best
 
 
-def _minimise_loss(task: _Task, candidate: _Candidate) -> _Candidate:
+def _minimise_loss(task: CalibrationTask, candidate: Candidate) -> Candidate:
     """Minimise the loss; re-estimate the scale of a robust loss from its residuals."""
     state, loss = candidate.state, candidate.loss
     for _ in range(1 if loss.kind == "squared" or task.sigma is not None else _MAX_RESCALINGS):
@@ -362,7 +310,7 @@ def _minimise_loss(task: _Task, candidate: _Candidate) -> _Candidate:
     return replace(candidate, state=state, loss=used)
 
 
-def _fit_tukey(task: _Task, candidate: _Candidate) -> _Candidate:
+def _fit_tukey(task: CalibrationTask, candidate: Candidate) -> Candidate:
     """Continue from Huber's minimum to the nearest minimum of Tukey's loss, which gives outliers no weight."""
     loss = candidate.loss._replace(kind="tukey")
     length = np.linalg.norm(residuals(task.views, candidate.state), axis=1)
@@ -374,14 +322,14 @@ def _fit_tukey(task: _Task, candidate: _Candidate) -> _Candidate:
     return _minimise_loss(task, replace(candidate, loss=loss))
 
 
-def _is_invertible(task: _Task, state: FitState) -> bool:
+def _is_invertible(task: CalibrationTask, state: FitState) -> bool:
     """Return whether every target point lies within the invertible region of the lens."""
     back = tilt_matrix(*internal_parameters(state.values)[0][4:6]).T
     before = back @ (state.rotations @ task.views.target + state.translations[..., None])
     return bool(np.isfinite(camera_from_parameters(state.values).project(np.swapaxes(before, 1, 2))).all())
 
 
-def _fit_smaller_model(task: _Task, model: str, largest: _Candidate) -> _Candidate:
+def _fit_smaller_model(task: CalibrationTask, model: str, largest: Candidate) -> Candidate:
     """Fit a smaller model, starting from the largest one; if that does not converge, from the closed form."""
     free_parameters = task.free_parameters(model)
     reduced = largest.state.values.copy()
@@ -395,126 +343,4 @@ def _fit_smaller_model(task: _Task, model: str, largest: _Candidate) -> _Candida
     if not state.converged:
         cold = adjust(task.views, free_parameters, next(_starting_states(task, free_parameters)), largest.loss)
         state = min(state, cold, key=lambda end: end.cost)
-    return _Candidate(task.views, model, free_parameters, state, largest.loss)
-
-
-def _result(task: _Task, chosen: _Candidate, alternatives: tuple[CameraAlternative, ...]) -> CameraFit:
-    """Return the result of the chosen fit, with covariances and warnings."""
-    state, free_parameters = chosen.state, chosen.free_parameters
-    noise = residual_sigma(task.views, free_parameters, state, chosen.loss)
-    correlated = chosen.correlated
-    is_correlated = correlated.is_correlated(task.limits.lack_of_fit_significance)
-    covariance, pose_covariance, focus = covariances(
-        task.views, free_parameters, state, chosen.loss, task.sigma, correlated if is_correlated else None
-    )
-    if task.focal_length is not None:
-        focus = 0.0
-    errors = residuals(task.views, state)
-    fit = CameraFit(
-        camera=camera_from_parameters(state.values),
-        model=chosen.model,
-        poses=poses_in_lens_frame(state),
-        names=free_parameters.names,
-        covariance=covariance,
-        pose_covariance=pose_covariance,
-        rms_px=_rms(task, state),
-        sigma_px=noise if task.sigma is None else task.sigma,
-        residuals=_unpacked(task, errors),
-        iterations=state.iterations,
-        lack_of_fit=correlated.lack_of_fit,
-        view_p_value=correlated.view_p_value,
-        error_model="correlated" if is_correlated else "independent",
-        alternatives=alternatives,
-    )
-    if not determines_focal_length(fit, focus, converged=state.converged, limits=task.limits):
-        raise ValueError(
-            "the views do not determine the focal length: add views at other angles to the camera, or give "
-            "focal_length="
-        )
-    doubtful = np.linalg.norm(errors, axis=1) > task.limits.outlier_sigmas * robust_scale(task.views, state)
-    warnings = diagnose(
-        fit,
-        task.size,
-        focus=focus,
-        converged=state.converged,
-        noise=noise,
-        outliers=int(doubtful.sum()) if chosen.loss.kind == "squared" else 0,
-        mirrored=bool((np.linalg.det(task.homography_fit.homographies) < 0.0).all()),
-        limits=task.limits,
-    )
-    return replace(fit, warnings=warnings)
-
-
-def _rms(task: _Task, state: FitState) -> float:
-    """Return the root mean square distance between measured and projected points [px]."""
-    return math.sqrt(2.0 * float(np.sum(residuals(task.views, state) ** 2)) / task.views.coordinates)
-
-
-def _unpacked(task: _Task, errors: Floats) -> tuple[Floats, ...]:
-    """Return the residuals of each view in the order of its points, NaN for missing points."""
-    result = []
-    for mask, error in zip(task.masks, errors, strict=True):
-        unpacked = np.full((len(mask), 2), np.nan)
-        unpacked[mask] = error.T[: np.count_nonzero(mask)]
-        result.append(unpacked)
-    return tuple(result)
-
-
-def _p_value(task: _Task, small: _Candidate, large: _Candidate) -> float:
-    """Return the p-value of a model against a larger one.
-
-    The F test assumes independent errors. If the residuals of the larger model are correlated, Wald's test compares
-    its further parameters with their covariance for correlated errors. The F test is also used for the comparison with
-    the model "none", and if there are too few views for a covariance by view.
-    """
-    additional = large.free_parameters.count - small.free_parameters.count
-    if additional == 0:
-        return 1.0
-    by_view = len(task.masks) >= MIN_VIEWS and bool(small.free_parameters.coefficients)
-    if by_view and large.correlated.is_correlated(task.limits.lack_of_fit_significance):
-        return _wald_p_value(task, small, large)
-    free = task.views.coordinates - large.free_parameters.count - 6 * len(task.masks)
-    if free <= 0:
-        return 1.0
-    rise = max(small.state.cost - large.state.cost, 0.0) / additional
-    noise = residual_variance_factor(task.views, large.free_parameters, large.state, large.loss)
-    return float(fdtrc(additional, free, rise / max(noise, _EXACT_PX**2)))
-
-
-def _wald_p_value(task: _Task, small: _Candidate, large: _Candidate) -> float:
-    """Return the p-value of Wald's test of the further parameters of the larger model, with errors by view.
-
-    The smooth field in the image is not part of these errors: further terms of the lens may describe it.
-    """
-    free_parameters = large.free_parameters
-    covariance = free_covariance(task.views, free_parameters, large.state, large.loss, task.sigma, large.correlated)
-    values = large.state.values.copy()
-    derivative, of_small = free_parameters.derivative(values), small.free_parameters.derivative(values)
-    # A tilt moves v away from the centre; a known f' makes f follow from both.
-    values[2:4] -= values[4:6]
-    values[4:6] = 0.0
-    if task.focal_length is not None:
-        derivative[0] = of_small[0] = 0.0
-    # Directions of the coordinates that the larger model can move and the smaller one cannot.
-    basis = np.linalg.qr(of_small)[0]
-    vectors, sizes, _ = np.linalg.svd(derivative - basis @ (basis.T @ derivative))
-    further = vectors[:, : np.count_nonzero(sizes > _SINGULAR * sizes[0])].T
-    effect = further @ derivative
-    shift = further @ values
-    statistic = float(shift @ np.linalg.solve(effect @ covariance @ effect.T, shift)) / len(further)
-    return float(fdtrc(len(further), len(task.masks) - 1, statistic))
-
-
-def _alternative(task: _Task, other: _Candidate, p_value: float, chosen: FitState) -> CameraAlternative:
-    parameters = other.free_parameters.count + 6 * len(task.masks)
-    cost = max(other.state.cost / task.views.coordinates, _EXACT_PX**2)
-    centre = other.state.values[4:6]
-    return CameraAlternative(
-        model=other.model,
-        rms_px=_rms(task, other.state),
-        parameters=other.free_parameters.count,
-        p_value=p_value,
-        aic=task.views.coordinates * math.log(cost) + 2.0 * parameters,
-        centre=(float(centre[0]), float(centre[1])),
-        centre_distance_px=float(np.linalg.norm(centre - chosen.values[4:6])),
-    )
+    return Candidate(views=task.views, model=model, free_parameters=free_parameters, state=state, loss=largest.loss)

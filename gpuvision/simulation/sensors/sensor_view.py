@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from gpuvision.ranging.range_image import StraightTransport, Vector
+from gpuvision.ranging.sheet_motion import StraightTransport, Vector
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.validation import finite, numbers
 

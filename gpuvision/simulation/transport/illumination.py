@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.envelope import Pieces, upper_envelope
 from gpuvision.simulation.transport.sheet_cut import Cuts, SheetIndex, bend_of, concatenated_ranges

@@ -19,8 +19,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.sheet import BentSheet
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.simulation.scene.scene import Scene
 
 Float64 = npt.NDArray[np.float64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gpuvision.camera.lines import straightness
+from gpuvision.camera.lines import normal_equations, straightness
 from gpuvision.camera.lines.line_families import PackedLines, grid_lines, pack
 from gpuvision.camera.lines.straightness import LineSet, Parameters
 from gpuvision.camera.lines.variable_projection import apply_step, farthest_corner_square
@@ -47,7 +47,7 @@ def distances(packed: PackedLines, k: np.ndarray, centre: np.ndarray, lines: Lin
 def test_slopes_are_those_of_the_distances(packed: PackedLines, anywhere: Parameters, free: bool) -> None:
     parameters = anywhere._replace(vanishing=None) if free else anywhere
     evaluation = straightness.evaluate(packed, parameters)
-    slopes = straightness.residual_jacobian(2, evaluation)
+    slopes = normal_equations.residual_jacobian(2, evaluation)
     np.testing.assert_allclose(
         evaluation.residual, distances(packed, parameters.k, parameters.centre, evaluation.lines), atol=1e-14
     )
@@ -78,7 +78,7 @@ def test_slopes_of_a_lens_of_four_coefficients(packed: PackedLines) -> None:
 
     evaluation = straightness.evaluate(packed, Parameters(k, centre, None))
     np.testing.assert_allclose(evaluation.residual, residual(np.zeros(6), evaluation.lines), atol=1e-14)
-    slopes = straightness.residual_jacobian(4, evaluation)
+    slopes = normal_equations.residual_jacobian(4, evaluation)
     for number, column in enumerate(slopes.lens[:6]):
         change = STEP * np.eye(6)[number]
         difference = (residual(change, evaluation.lines) - residual(-change, evaluation.lines)) / (2.0 * STEP)
@@ -88,7 +88,7 @@ def test_slopes_of_a_lens_of_four_coefficients(packed: PackedLines) -> None:
 def test_lines_move_with_their_points(packed: PackedLines, anywhere: Parameters) -> None:
     """The derivatives of a line by its vanishing point keep the line in the pencil of the point."""
     lines = straightness.evaluate(packed, anywhere).lines
-    change = straightness.pencil_changes(anywhere.vanishing, packed.family, lines)
+    change = normal_equations.pencil_changes(anywhere.vanishing, packed.family, lines)
     for axis in (0, 1):
         step = np.zeros(2 + 2 + 8)
         step[4 + axis :: 2] = STEP
@@ -107,12 +107,12 @@ def test_lines_are_projected_out(packed: PackedLines, anywhere: Parameters, free
     """The reduced normal equations agree with the full Jacobian that has columns for the parameters of each line."""
     parameters = anywhere._replace(vanishing=None) if free else anywhere
     evaluation = straightness.evaluate(packed, parameters)
-    slopes = straightness.residual_jacobian(2, evaluation)
-    normal = straightness.normal_equations(packed, parameters, evaluation, slopes)
+    slopes = normal_equations.residual_jacobian(2, evaluation)
+    normal = normal_equations.normal_equations(packed, parameters, evaluation, slopes)
     count_lens_parameters, line_columns = list(slopes.lens[:4]), []
     change = np.zeros((2, 3, len(packed.counts)))
     if not free:
-        change = straightness.pencil_changes(parameters.vanishing, packed.family, evaluation.lines)
+        change = normal_equations.pencil_changes(parameters.vanishing, packed.family, evaluation.lines)
         for family in range(4):
             inside = packed.family[packed.line] == family
             for axis in (1, 2):
@@ -127,14 +127,14 @@ def test_lines_are_projected_out(packed: PackedLines, anywhere: Parameters, free
     scale = np.max(np.abs(normal.matrix))
     np.testing.assert_allclose(normal.matrix, expected.T @ expected, atol=1e-13 * scale)
     np.testing.assert_allclose(normal.gradient, expected.T @ evaluation.residual, atol=1e-13 * scale)
-    columns = straightness.projected_columns(packed, parameters, evaluation, slopes, normal.line_coefficients)
+    columns = normal_equations.projected_columns(packed, parameters, evaluation, slopes, normal.line_coefficients)
     np.testing.assert_allclose(columns, expected.T, atol=1e-12 * np.sqrt(scale))
 
 
 def test_pencil_lines_are_the_best(packed: PackedLines, anywhere: Parameters) -> None:
     """No line through the vanishing point, at infinity or not, has a smaller sum of squares."""
     lines = straightness.evaluate(packed, anywhere._replace(k=np.empty(0))).lines
-    change = straightness.pencil_changes(anywhere.vanishing, packed.family, lines)
+    change = normal_equations.pencil_changes(anywhere.vanishing, packed.family, lines)
 
     def cost(turn: float) -> np.ndarray:
         angle = np.arctan2(lines.ny, lines.nx) + change[1, 0] * turn

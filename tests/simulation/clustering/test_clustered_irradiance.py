@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gpuvision.host import Device
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.reference import light_clustering as reference
 from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance, estimate_facing_pairs
 from gpuvision.simulation.errors.range_error import StripErrorModel

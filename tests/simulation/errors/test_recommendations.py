@@ -10,7 +10,7 @@ from scipy.special import ndtr
 
 from gpuvision.host import Device
 from gpuvision.ranging.psd import PsdNoise
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.simulation.errors.error_attribution import attribute_errors
 from gpuvision.simulation.errors.recommendations import compare_peak_selections, rank_candidates
 from gpuvision.simulation.errors.resampling import resample_reading

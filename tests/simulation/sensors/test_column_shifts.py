@@ -17,8 +17,8 @@ from scipy.special import ndtr
 from gpuvision.host import Device
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
-from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.sheet import SampleAxes
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert

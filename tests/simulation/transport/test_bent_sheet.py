@@ -11,8 +11,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from gpuvision.host import Device
-from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.sheet import BentSheet
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene

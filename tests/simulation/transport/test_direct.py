@@ -11,7 +11,7 @@ import trimesh
 
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.reference.rays import occluded
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.rays import AnyHit

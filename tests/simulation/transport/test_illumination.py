@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.reference.sheet import first_hits
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.envelope import upper_envelope

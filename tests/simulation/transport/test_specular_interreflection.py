@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from gpuvision.host import Device
-from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.rays import ClosestHit
 from gpuvision.simulation.scene.reflectance import Lambert

@@ -183,6 +183,8 @@ def simulate(
     loaded = _load_part(part, unit, materials, albedo, described)
     light = {"paths": names, "tolerance": tolerance, "patch_size": patch_size}
     task, other = _prepare(*loaded, described, second_sensor, light, profiles)
+    if recording:
+        _check_recordings([task] if other is None else [task, other], described_by)
     made: dict[str, Any] = {
         "mask": before,
         "seed": (1 if seed is None else seed) if noise else None,
@@ -226,6 +228,14 @@ def _prepare(
     if second is None:
         return task, None
     return task, prepare_simulation(scene, materials, second, transports=task.transports, **light)
+
+
+def _check_recordings(tasks: Sequence[SimulationTask], sensor_files: Sequence[str]) -> None:
+    """Refuse sensors whose recordings no sensor file describes, before any light is computed."""
+    from gpuvision.workflows.simulated_recording import recording_sensor
+
+    for task, file in zip(tasks, sensor_files, strict=True):
+        recording_sensor(task, file)
 
 
 def _names(paths: str) -> tuple[str, ...]:

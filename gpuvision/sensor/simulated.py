@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -194,6 +195,7 @@ def make_simulator(sensor: Sensor, view: SensorView, mask: Mask | None = None) -
     Returns
     -------
     PsdSimulator or CameraSimulator
+        A camera without a noise model in ``[line]`` reads its frames with the noise model of `line_noise`.
 
     Raises
     ------
@@ -213,7 +215,7 @@ def make_simulator(sensor: Sensor, view: SensorView, mask: Mask | None = None) -
         )
     return CameraSimulator(
         view=view,
-        readout=readout,
+        readout=readout if sensor.noise_known else replace(readout, **line_noise(sensor)),
         exposure_time=light.exposure,
         responsivity=light.responsivity,
         gain=_MAX_GREY_LEVEL / light.full_well,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ import tomli_w
 from gpuvision.host import Device
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
-from gpuvision.schema import read_preset
-from gpuvision.sensor.sensor import BACKGROUNDS
+from gpuvision.ranging.line import LineReadout
+from gpuvision.schema import Section, read_preset
+from gpuvision.sensor.sensor import BACKGROUNDS, Sensor
 from gpuvision.sensor.simulated import line_noise, make_sensor_view, make_simulator
 from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
@@ -27,6 +29,7 @@ RECORDING_FILES = ("recording.npy", "recording.toml")
 # Largest difference of a transport from even steps, in steps. Chosen: far above rounding, far below what a scan shows.
 _EVEN = 1e-6
 _PAIRS = ("dark_after", "dark_before")
+_ENCODER_KEYS = ("encoder", "encoder_key", "encoder_bits")
 
 _HEADER = (
     "# Written by gpuvision simulate --recording: the sensor file of the simulation, with the transport of the first\n"
@@ -133,15 +136,20 @@ def recording_sensor(task: SimulationTask, sensor_file: str | Path, *, noise: bo
     -------
     str
         The table of ``sensor_file`` with these changes: ``[transport] start`` and ``step`` are those of the simulated
-        profiles; without a noise model in ``[line]``, that of the simulated camera is added, so that the scan predicts
-        its errors; ``[recording] background`` is removed, because the frames show no background; names of files are
-        absolute. Comments are lost.
+        profiles, and the keys of an encoder file are removed; without a noise model in ``[line]``, the noise of the
+        simulated camera is added, so that the scan predicts its errors; ``[recording] background`` is removed, because
+        the frames show no background; names of files are absolute. Comments are lost.
 
     Raises
     ------
     ValueError
         The transports of the profiles are not evenly spaced, or the sensor file expects pairs of frames with and
         without light.
+
+    Notes
+    -----
+    The method ``"ml"`` weighs samples by the noise model. The simulation reads its frames with the noise model of the
+    camera, so the file has it for this method without noise too.
     """
     opened = read_preset(sensor_file, "sensors", "sensor")
     table = opened.to_dict()
@@ -154,17 +162,29 @@ def recording_sensor(task: SimulationTask, sensor_file: str | Path, *, noise: bo
     for name in ("lens", "camera"):
         if "file" in table.get(name, {}):
             table[name]["file"] = str(opened.section(name).file("file").resolve())
-    table["transport"] |= _start_and_step(task)
-    if noise and task.sensor.kind == "camera" and not task.sensor.noise_known:
+    table["transport"] = _even_transport(task, table["transport"])
+    readout = task.sensor.readout
+    if isinstance(readout, LineReadout) and not task.sensor.noise_known and (noise or readout.method == "ml"):
         table["line"] |= line_noise(task.sensor)
-    return _HEADER + tomli_w.dumps(table)
+    text = _HEADER + tomli_w.dumps(table)
+    Sensor.from_section(Section(tomllib.loads(text), str(sensor_file)))  # refuses a file that a scan would refuse
+    return text
 
 
-def _start_and_step(task: SimulationTask) -> dict[str, float]:
-    """Return start and step [m] of the transports; the step of the sensor for a single profile."""
+def _even_transport(task: SimulationTask, table: dict[str, Any]) -> dict[str, Any]:
+    """Return the table ``[transport]`` with the start and step of the task, without an encoder file.
+
+    A single profile has the step of the table, or the size of a count of its encoder.
+    """
+    kept = {key: value for key, value in table.items() if key not in _ENCODER_KEYS}
+    return {**kept, **_start_and_step(task, kept["step"] if "step" in kept else kept["metres_per_count"])}
+
+
+def _start_and_step(task: SimulationTask, single_step: float) -> dict[str, float]:
+    """Return start and step [m] of the transports; ``single_step`` for a single profile."""
     places = task.transports
     if len(places) < 2:
-        return {"start": float(places[0])}
+        return {"start": float(places[0]), "step": float(single_step)}
     step = float(places[-1] - places[0]) / (len(places) - 1)
     if np.max(np.abs(places - places[0] - step * np.arange(len(places)))) > _EVEN * abs(step):
         raise ValueError("the transports of the profiles are not evenly spaced; no sensor file describes the recording")

@@ -15,6 +15,8 @@ import trimesh
 
 import laser_sensor
 from gpuvision.formats.range_image import read_npz
+from gpuvision.ranging.line import METHODS
+from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.simulated_recording import recording_sensor
 from gpuvision.workflows.simulating import load_part, prepare_simulation
@@ -167,6 +169,47 @@ def test_the_sensor_file_of_a_recording(commands: Commands) -> None:
     commands.write("sensor.toml", table)
     with pytest.raises(ValueError, match="needs frames without light"):
         recording_sensor(task, path)
+
+
+def test_a_sensor_without_a_recording_is_refused_before_the_work(commands: Commands) -> None:
+    commands.write("second.toml", commands.table | {"recording": {"background": "dark_before"}})
+    ran = commands.simulate("--profiles", 2, "--second", commands.folder / "sensor" / "second.toml")
+    check_refused(ran, r"second\.toml: .* needs frames without light")
+    assert not (commands.folder / "sim" / "light").exists()
+
+
+@pytest.mark.parametrize("profiles", [1, 5])
+def test_the_sensor_file_of_a_sensor_with_an_encoder(commands: Commands, profiles: int) -> None:
+    folder = commands.folder / "sensor"
+    (folder / "counts.txt").write_text("0\n7\n15\n")
+    moving = commands.table["transport"] | {"encoder": "counts.txt", "encoder_bits": 16, "metres_per_count": 2e-6}
+    del moving["step"]
+    commands.write("second.toml", commands.table | {"transport": moving})
+    scene, materials = load_part(commands.folder / "part.stl", 1e-3, None, 0.5)
+    places = 1e-3 + 0.3e-3 * np.arange(profiles)
+    task = prepare_simulation(scene, materials, Sensor.load(folder / "second.toml"), transports=places)
+    (commands.folder / "recording.toml").write_text(recording_sensor(task, folder / "second.toml"))
+    read = Sensor.load(commands.folder / "recording.toml")
+    assert read.encoder is None
+    assert isinstance(read.transport, StraightTransport)
+    assert read.transport.start == pytest.approx(1e-3)
+    assert read.transport.step == pytest.approx(0.3e-3 if profiles > 1 else 2e-6)
+
+
+@pytest.mark.parametrize(
+    "method", [pytest.param(name, marks=[] if name == "ml" else pytest.mark.slow) for name in METHODS]
+)
+@pytest.mark.parametrize("noise", ["--noise", "--no-noise"])
+def test_a_scan_has_the_readings_of_the_simulation(commands: Commands, method: str, noise: str) -> None:
+    commands.table["line"] |= {"method": method}
+    commands.write("sensor.toml", commands.table)
+    ran = commands.simulate("--profiles", 2, noise)
+    assert ran.code == 0, ran.err
+    scanned = commands.scan(commands.folder / "sim")
+    simulated, _ = read_npz(commands.folder / "sim" / "simulation.npz")
+    assert np.isfinite(scanned["z"]).mean() > 0.9
+    for name in ("x", "y", "z"):
+        np.testing.assert_array_equal(scanned[name], simulated[name])
 
 
 def test_a_recording_does_not_outlive_its_simulation(commands: Commands) -> None:

@@ -192,7 +192,8 @@ class Machine:
     Raises
     ------
     ValueError
-        A frame or a number is wrong, the frame does not fit into its period, or the gain makes the loop unstable.
+        A frame or a number is wrong, the frame does not fit into its period, the gain makes the loop unstable, or an
+        axis of a machine with the observer "smith" has a lag.
     """
 
     camera: PlacementCamera
@@ -224,6 +225,8 @@ class Machine:
         for axis, swing in zip(self.axes, self.swing, strict=True):
             if finite(swing, "swing", minimum=0.0) and not axis.resonance:
                 raise ValueError("swing needs an axis with a resonance")
+        if self.lag and self.control.observer == "smith":
+            raise ValueError('the Smith predictor knows no lag of the axes; use observer = "kalman"')
         self._check_stability()
 
     def _check_stability(self) -> None:
@@ -285,8 +288,8 @@ class Machine:
     def control_delay(self) -> float:
         """Delay in frames that the controller sees: the part of `response_frames` that the observer does not predict.
 
-        The Smith predictor counts the lag as a delay and predicts all of it. The Kalman filter predicts the delay by
-        the time stamps, and the lag remains.
+        The Smith predictor predicts the delay of axes without a lag. The Kalman filter predicts the delay by the time
+        stamps, and the lag remains.
         """
         if self.control.observer == "latest":
             return self.response_frames

@@ -295,6 +295,24 @@ def test_release_rules_that_cannot_work_are_refused(given: dict[str, Any], messa
         Settling(**given)
 
 
+@pytest.mark.parametrize("lag", [0.3e-3, 3e-3])
+@pytest.mark.parametrize("control", [CONTROLS[0], CONTROLS[5]], ids=lambda each: each.observer)
+def test_frames_of_axes_with_a_lag_are_those_of_theory(control: Control, lag: float) -> None:
+    axes = (Axis(lag=lag),) * 3
+    machine = dataclasses.replace(PRESET, control=dataclasses.replace(control, gain=None), axes=axes)
+    error = _free_run(machine, np.array([50e-6, 0.0, 0.0]), 200, axes=axes)[:, 0] / 50e-6
+    settled = int(np.flatnonzero(np.abs(error) > 0.02)[-1]) + 1
+    # The theory takes the lag as a delay: 22 frames of the Kalman filter at 3 ms are 20 by theory.
+    assert settled == pytest.approx(machine.frames_to(0.02), rel=0.15)
+
+
+@pytest.mark.parametrize("controller", ["p", "pi", "pid"])
+def test_a_smith_predictor_with_axes_that_lag_is_refused(controller: Any) -> None:
+    axes = (Axis(), Axis(lag=0.3e-3), Axis())
+    with pytest.raises(ValueError, match='knows no lag of the axes; use observer = "kalman"'):
+        dataclasses.replace(PRESET, control=Control(observer="smith", controller=controller), axes=axes)
+
+
 def test_an_unstable_controller_and_a_swing_without_a_resonance_are_refused() -> None:
     with pytest.raises(ValueError, match=r"controller pi with gain 0.7, integral .* is not stable"):
         dataclasses.replace(PRESET, control=Control(controller="pi", gain=0.7, integral=3e-3))

@@ -136,6 +136,16 @@ def test_the_measured_pose_of_a_head_at_rest_scatters_as_predicted(
     np.testing.assert_allclose(steps, np.sqrt(2.0), rtol=0.25)
 
 
+def test_the_covariance_of_a_measured_pose_is_the_planned_one(
+    artwork: Artwork, machine: Machine, device: Device
+) -> None:
+    result = simulate_placements(artwork, TARGET, machine, count=1, device=device)
+    reported = result.placements[0].measurements[-1].covariance
+    ratio = np.sqrt(np.diag(reported) / np.diag(result.plan.reported))
+    # Noise and residuals of one frame scale the reported covariance.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.15)
+
+
 @pytest.mark.parametrize("observer", ["smith", pytest.param("kalman", marks=pytest.mark.slow)])
 def test_a_predictor_places_in_two_frames_with_the_same_error(
     artwork: Artwork, machine: Machine, device: Device, observer: Literal["smith", "kalman"]

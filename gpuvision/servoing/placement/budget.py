@@ -21,7 +21,7 @@ import numpy.typing as npt
 from gpuvision.servoing.delay import closed_loop
 from gpuvision.servoing.margins import margins, observer_tolerance, predictor_tolerance
 from gpuvision.servoing.placement.machine import Machine
-from gpuvision.servoing.placement.placing import REMAINDER, predicted_frames
+from gpuvision.servoing.placement.placing import REMAINDER, predicted_frames, swing_limit
 from gpuvision.servoing.placement.plan import PlacementPlan
 
 Float64 = npt.NDArray[np.float64]
@@ -159,7 +159,7 @@ def model_tolerance(machine: Machine, plan: PlacementPlan) -> ModelTolerance | N
     if machine.control.motion_sigma is None:
         predictor = predictor_tolerance(gain, machine.response_frames)
         return ModelTolerance(predictor.plant_gain, predictor.longer * period)
-    ratio = np.array(machine.control.motion_sigma) / np.sqrt(np.diag(plan.vision))
+    ratio = np.array(machine.control.motion_sigma) / np.sqrt(np.diag(plan.reported))
     each = [observer_tolerance(gain, delay, lag=machine.lag / period, noise_ratio=float(one)) for one in ratio]
     return ModelTolerance(min(one.plant_gain for one in each), min(one.longer for one in each) * period)
 
@@ -181,16 +181,18 @@ def predict_budget(machine: Machine, plan: PlacementPlan, frames: npt.ArrayLike 
     -----
     Calibration, etch bias and drift are common to all frames of a placement. "vision" is the motion by the errors of
     the measured poses, which the loop follows: it averages the noise from frame to frame (`noise_covariance`), but not
-    the differences between the pixels, which are the same in all frames of a head at rest. "servo" is the rest of the
-    step response that `ReleaseRule` allows, evenly distributed, and the step of the encoder. With the rule "vibration"
-    an axis that swings adds a swing at a random phase, with the largest amplitude that the rule allows. With the
-    rule "fixed" the rest is that of start errors in the landing zone after the fixed time; a vibration is not included.
+    the differences between the pixels, which are the same in all frames of a head at rest. The Kalman filter weights
+    the frames by `PlacementPlan.reported`. The error of the bilinear sampling is not in the budget. "servo" is the
+    rest of the step response that `ReleaseRule` allows, evenly distributed, and the step of the encoder. With the
+    rule "vibration" an axis that swings adds a swing at a random phase, with the largest amplitude that the rule
+    allows. With the rule "fixed" the rest is that of start errors in the landing zone after the fixed time; a vibration
+    is not included.
     """
     turn, tolerance = plan.camera_to_board, machine.tolerance
     zone = np.array([tolerance.landing_zone] * 2 + [tolerance.landing_angle])
     counts = [predicted_frames(machine, zone)] if frames is None else np.asarray(frames, np.int64).tolist()
     temporal = (1.0 - plan.fixed_pattern) * plan.vision
-    moved = np.mean([noise_covariance(machine, plan.vision, temporal, each) for each in counts], axis=0)
+    moved = np.mean([noise_covariance(machine, plan.reported, temporal, each) for each in counts], axis=0)
     steps = np.array([axis.encoder for axis in machine.axes])
     sources = {
         "calibration": turn @ machine.pipette_in_camera.pose_covariance @ turn.T,
@@ -211,4 +213,4 @@ def _servo_variance(machine: Machine) -> Float64:
         left = machine.error_after(math.ceil(settling.wait * machine.rate) + 1)[-1]
         return np.asarray((left * zone) ** 2 / 3.0)
     swings = np.array(settling.frequency or (0.0, 0.0, 0.0)) > 0.0
-    return np.asarray((REMAINDER * limit) ** 2 / 3.0 + np.where(swings, limit**2 * [0.25, 0.25, 0.5], 0.0))
+    return np.asarray((REMAINDER * limit) ** 2 / 3.0 + np.where(swings, swing_limit(machine) ** 2 / 2.0, 0.0))

@@ -122,13 +122,11 @@ class ReleaseRule:
 
 
 def _vibration_rule(machine: Machine) -> VibrationSettling:
-    settling, tolerance = machine.settling, machine.tolerance
+    settling = machine.settling
     if settling.frequency is None or settling.damping is None:
         raise ValueError("settling.frequency and settling.damping are missing; find them by vibration_of_loop")
-    # Where x and y swing, both at this limit are at the largest distance.
-    side = tolerance.position / math.sqrt(2.0 if min(settling.frequency[:2]) > 0.0 else 1.0)
     return VibrationSettling(
-        (side, side, tolerance.angle),
+        swing_limit(machine),
         frequency=settling.frequency,
         damping=settling.damping,
         miss_probability=settling.miss_probability,
@@ -136,6 +134,16 @@ def _vibration_rule(machine: Machine) -> VibrationSettling:
         lead=settling.lead,
         is_filtered=machine.control.observer == "kalman",
     )
+
+
+def swing_limit(machine: Machine) -> Float64:
+    """Return the largest amplitudes (3,) of x, y [m] and theta [rad] at which the rule "vibration" releases.
+
+    Where both x and y swing, amplitudes at their limits reach the largest distance together.
+    """
+    x, y, _ = machine.settling.frequency or (0.0, 0.0, 0.0)
+    side = machine.tolerance.position / math.sqrt(2.0 if min(x, y) > 0.0 else 1.0)
+    return np.array([side, side, machine.tolerance.angle])
 
 
 def _frames_of_rule(machine: Machine, error: Float64) -> int:

@@ -20,7 +20,9 @@ from gpuvision.matching.artwork.board_reflectance import BoardReflectance
 from gpuvision.matching.board.view_features import select_features_in_view
 from gpuvision.matching.features.exposure import sensor_imaging
 from gpuvision.matching.features.feature_set import FeatureSet
+from gpuvision.matching.features.fiducials import FiducialLimits
 from gpuvision.matching.features.imaging import Imaging
+from gpuvision.matching.features.ruler import SAMPLING_SIGMA_PX
 from gpuvision.matching.pose.motion import rotation
 from gpuvision.matching.pose.pose import SolvePose
 from gpuvision.matching.pose.registration import CoarseRegistration, prepare_board_registration
@@ -60,6 +62,10 @@ class PlacementPlan:
     fixed_pattern : float
         Part of the variance of ``vision`` by the differences between the pixels, 0 to 1: frames of a head at rest have
         this error in common.
+    reported : numpy.ndarray
+        (3, 3): predicted covariance of the pose of the nozzle that a measurement reports to the observer. It adds to
+        ``vision`` the error of the bilinear sampling along rulers and the error that fiducials have without noise:
+        common to the frames of a head at rest, different from place to place.
     etch_bias : numpy.ndarray
         (3, 3): predicted covariance of the pose of the nozzle by the etch bias of the board, common to all frames.
     """
@@ -72,6 +78,7 @@ class PlacementPlan:
     noise: float
     vision: Float64
     fixed_pattern: float
+    reported: Float64
     etch_bias: Float64
 
     @property
@@ -154,6 +161,7 @@ def plan_placement(
         noise=total * sensor.gain,
         vision=move_covariance(noise, camera_pose, calibrated),
         fixed_pattern=1.0 - (temporal / total) ** 2,
+        reported=move_covariance(_reported_covariance(features), camera_pose, calibrated),
         etch_bias=move_covariance(etch_bias, camera_pose, calibrated),
     )
 
@@ -299,6 +307,19 @@ def _split_covariance(features: FeatureSet) -> tuple[Float64, Float64]:
     covariance = np.linalg.inv(information + prior)
     noise, common = (covariance @ each @ covariance for each in (information, prior))
     return noise[:3, :3], common[:3, :3]
+
+
+def _reported_covariance(features: FeatureSet) -> Float64:
+    """Return the covariance (3, 3) of the pose as `FeatureSet.bind` reports it: noise and sampling of the features."""
+    marks, pixel, limits = features.fiducials, features.imaging.pixel, FiducialLimits()
+    without_noise = np.where(marks.hole > 0.0, limits.edges_sigma_px, limits.matched_sigma_px) * pixel
+    sampled = replace(
+        features,
+        sigma=np.hypot(features.sigma, SAMPLING_SIGMA_PX * pixel),
+        fiducials=marks._replace(sigma=np.hypot(marks.sigma, without_noise)),
+    )
+    rows, prior = _weighted_rows(sampled)
+    return np.asarray(np.linalg.inv(rows.T @ rows + prior)[:3, :3])
 
 
 def _largest_leverage(features: FeatureSet) -> float:

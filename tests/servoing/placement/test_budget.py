@@ -1,11 +1,77 @@
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from gpuvision.servoing.placement.budget import noise_gain
+from gpuvision.formats.machine_file import read_machine
+from gpuvision.servoing.axis import Axis
+from gpuvision.servoing.margins import observer_matrix
+from gpuvision.servoing.placement.budget import model_tolerance, noise_gain, predict_budget
+from gpuvision.servoing.placement.control import Control, Settling
+from gpuvision.servoing.placement.placing import REMAINDER
+from gpuvision.servoing.placement.plan import PlacementPlan
+
+PRESET = read_machine("look_while_place")
+# Measured poses scatter by the noise; the observer gets a covariance with the error of the sampling in addition.
+NOISE, REPORTED, MOTION = (np.diag([each * 1e-6, each * 1e-6, each * 1e-3]) ** 2 for each in (0.1, 0.2, 0.05))
+KALMAN = Control(observer="kalman", gain=1.0, motion_sigma=(0.05e-6, 0.05e-6, 0.05e-3))
+
+
+def _plan() -> PlacementPlan:
+    """Return a plan that has covariances only."""
+    return PlacementPlan(
+        target=np.zeros(3),
+        camera_pose=np.zeros(3),
+        features=cast(Any, None),
+        landing=None,
+        threshold=1.0,
+        noise=1.0,
+        vision=NOISE,
+        fixed_pattern=0.0,
+        reported=REPORTED,
+        etch_bias=np.zeros((3, 3)),
+    )
+
+
+def test_noise_of_a_kalman_filter_follows_the_covariance_that_it_gets() -> None:
+    machine = dataclasses.replace(PRESET, control=KALMAN)
+    found = predict_budget(machine, _plan(), [300]).sources["vision"]
+    # Random walk of variance q, measurements of variance r: the constant gain of the steady state, Riccati equation.
+    q, r = np.diag(MOTION), np.diag(REPORTED)
+    predicted = (q + np.sqrt(q**2 + 4.0 * q * r)) / 2.0
+    gain = predicted / (predicted + r)
+    np.testing.assert_allclose(np.diag(found), gain / (2.0 - gain) * np.diag(NOISE), rtol=1e-6)
+
+
+def test_a_kalman_filter_is_stable_up_to_the_tolerated_errors_of_its_model() -> None:
+    machine = dataclasses.replace(PRESET, control=KALMAN)
+    tolerated = model_tolerance(machine, _plan())
+    assert tolerated is not None
+    delay, ratio = machine.delay.frames, math.sqrt(MOTION[0, 0] / REPORTED[0, 0])
+    longer = tolerated.longer_delay / machine.period
+    for factor, is_stable in ((0.99, True), (1.01, False)):
+        slow = observer_matrix(1.0, delay, noise_ratio=ratio, plant_delay=delay + factor * longer)
+        fast = observer_matrix(1.0, delay, noise_ratio=ratio, plant_gain=1.0 + factor * (tolerated.plant_gain - 1.0))
+        for matrix in (slow, fast):
+            assert (np.abs(np.linalg.eigvals(matrix)).max() < 1.0) == is_stable
+
+
+@pytest.mark.parametrize("frequency", [(150.0, 0.0, 0.0), (150.0, 120.0, 80.0)])
+def test_servo_variance_is_that_of_swings_at_the_limit(frequency: tuple[float, float, float]) -> None:
+    rule = Settling(rule="vibration", frequency=frequency, damping=(0.02,) * 3)
+    tolerance = PRESET.tolerance
+    found = predict_budget(dataclasses.replace(PRESET, settling=rule, axes=(Axis(),) * 3), _plan()).sources["servo"]
+    rest = (REMAINDER * np.array([tolerance.position, tolerance.position, tolerance.angle])) ** 2 / 3.0
+    # The largest amplitude leaves the distance, x and y together, and the angle at their limits.
+    amplitude = np.sqrt(2.0 * (np.diag(found) - rest))
+    assert np.hypot(*amplitude[:2]) == pytest.approx(tolerance.position)
+    np.testing.assert_allclose(amplitude > 1e-12, np.array(frequency) > 0.0)
+    if frequency[2]:
+        assert amplitude[2] == pytest.approx(tolerance.angle)
 
 
 @pytest.mark.parametrize("gain", [0.1, 0.5, 1.0])

@@ -160,10 +160,10 @@ def vibration_of_loop(record: LoopRecord, since: float) -> ResidualVibration:
     Notes
     -----
     `fit_vibration` fits each axis. An axis swings if an F test of the fit against a constant is significant at 0.001,
-    divided by the number of independent frequencies (Bonferroni), and if its damping is below the largest one that the
-    fit looks for. The fit sees the vibration of the steered head: a stop of the loop ends the last command, which
-    excites the free axis again. The rule sees the swing in the estimate of the observer. A model without the resonance
-    makes it smaller there, by 10 to 15 % at 83 Hz and 1 kHz in
+    divided by the number of independent frequencies (Bonferroni), and if its damping is below 0.34: above, the
+    amplitude falls to less than a tenth within a period. The fit sees the vibration of the steered head: a stop of the
+    loop ends the last command, which excites the free axis again. The rule sees the swing in the estimate of the
+    observer. A model without the resonance makes it smaller there, by 10 to 15 % at 83 Hz and 1 kHz in
     ``tests/servoing/test_settling.py``: give the rule a smaller tolerance by this part.
     """
     taken = [each for each, verdict in record.measurements if verdict is Verdict.ACCEPTED and each.exposed >= since]

@@ -39,7 +39,7 @@ def explain_refusal(
     reason : str
         Reason of the selection of the features; the part before the first semicolon is used.
     artwork : Artwork
-        Top side of the board.
+        Side of the board that the camera sees.
     target, camera_pose : numpy.ndarray
         (3,): refused pose of the nozzle on the board, and pose of the camera, x, y [m], theta [rad].
     machine : Machine

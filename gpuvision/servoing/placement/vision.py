@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.board.edge_measurement import move_view
 from gpuvision.servoing.frames import compose_poses, invert_pose, move_covariance
-from gpuvision.servoing.observer import PoseMeasurement
+from gpuvision.servoing.observer import SAME_TIME, PoseMeasurement
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.plan import PlacementPlan
 from gpuvision.simulation.board_image.board_image import RenderBoard
@@ -20,8 +20,6 @@ from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
 
 Float64 = npt.NDArray[np.float64]
 
-# Times of a simulation that differ by less than this are equal [s]: rounding of multiples of the frame time.
-_SAME_TIME = 1e-9
 # Poses during an exposure that are averaged: motion of up to 1.5 px in an exposure is smooth (`RenderBoard`).
 _SUBPOSES = 3
 
@@ -113,7 +111,7 @@ class SimulatedCamera:
     def __call__(self, time: float) -> list[Frame]:
         """Return the frames that arrived since the last call, up to a time [s]."""
         frames = []
-        while (arrived := (self._frame - self._first) * self._period) <= time + _SAME_TIME:
+        while (arrived := (self._frame - self._first) * self._period) <= time + SAME_TIME:
             frames.append(self._render(arrived))
             self._frame += 1
         return frames
@@ -176,7 +174,7 @@ class BoardPoseSensor:
 
     def __call__(self, time: float) -> list[PoseMeasurement]:
         """Return the measurements that arrived since the last call, up to a time [s]."""
-        frames = (frame for frame in self.camera(time) if frame.arrived >= self._ready - _SAME_TIME)
+        frames = (frame for frame in self.camera(time) if frame.arrived >= self._ready - SAME_TIME)
         found = [self._measure(frame) if self._has_landed else self._land(frame) for frame in frames]
         return [each for each in found if each is not None]
 

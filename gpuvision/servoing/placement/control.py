@@ -107,9 +107,10 @@ class Settling:
         `gpuvision.servoing.settling.vibration_of_loop`. Default: a simulation finds them in a move of its own; a real
         machine needs them.
     miss_probability : float
-        Largest probability that the head leaves the tolerance after the release. Default 0.0027 (3 sigma).
+        Largest probability that the head leaves the tolerance after the release, for the rule "vibration". Default
+        0.0027 (3 sigma).
     window : int
-        Number of the last errors to which the vibration is fitted, 4 or more. Default 24.
+        Number of the last errors to which the rule "vibration" fits the vibration, 4 or more. Default 24.
     lead : float
         Time from the release to the contact of the part with the board [s], 0 or more. Default 0.
 
@@ -143,4 +144,9 @@ class Settling:
             finite(each, "damping", minimum=0.0, maximum=0.7)
         finite(self.miss_probability, "miss_probability", above=0.0, maximum=1.0)
         integer(self.window, "window", minimum=4)
+        if self.rule != "vibration" and (self.miss_probability, self.window) != (
+            Settling.miss_probability,
+            Settling.window,
+        ):
+            raise ValueError('miss_probability and window belong to the rule "vibration"')
         finite(self.lead, "lead", minimum=0.0)

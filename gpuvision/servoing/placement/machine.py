@@ -227,6 +227,9 @@ class Machine:
                 raise ValueError("swing needs an axis with a resonance")
         if self.lag and self.control.observer == "smith":
             raise ValueError('the Smith predictor knows no lag of the axes; use observer = "kalman"')
+        wait, most = self.settling.wait, self.tolerance.max_time
+        if wait is not None and wait >= most:
+            raise ValueError(f"settling.wait is {wait} s, expected less than tolerance.max_time, {most} s")
         self._check_stability()
 
     def _check_stability(self) -> None:

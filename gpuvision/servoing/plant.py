@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
 
@@ -110,10 +111,10 @@ class SimulatedPlant:
 
     def _pose(self, time: float) -> list[float]:
         ticks = max(_ticks(time), 0)
-        found = next((each for each in reversed(self._segments) if each[0] <= ticks), None)
-        if found is None:
+        found = bisect_right(self._segments, ticks, key=lambda each: each[0]) - 1
+        if found < 0:
             raise ValueError(f"the time {time:.6f} s is before the history of the plant; enlarge history")
-        start, states = found
+        start, states = self._segments[found]
         moved = self._advance(states, ticks - start)
         return [
             float(state[Q] if axis.resonance else state[P] + state[S])

@@ -19,7 +19,7 @@ from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.servoing.loop import SimulatedClock
 from gpuvision.servoing.placement.control import Settling
 from gpuvision.servoing.placement.machine import Machine
-from gpuvision.servoing.placement.placing import Placement, error_share, place_part, predicted_frames
+from gpuvision.servoing.placement.placing import Placement, count_commands, error_share, place_part, predicted_frames
 from gpuvision.servoing.placement.plan import PlacementPlan
 from gpuvision.servoing.placement.vision import BoardPoseSensor, SimulatedCamera
 from gpuvision.servoing.plant import SimulatedPlant
@@ -102,8 +102,7 @@ class PlacementCell:
         placement, _ = self._steer(moved, start, np.array(machine.swing), machine.pipette_in_camera.pose)
         if not placement.released:
             raise ValueError(f"the vibration of the head cannot be identified: {placement.reason}")
-        since = min(each.arrived for each in placement.measurements) + response
-        found = vibration_of_loop(placement.record, since)
+        found = vibration_of_loop(placement.record, placement.first_pose + response)
         (fx, fy, ft), (dx, dy, dt) = (each.tolist() for each in found)
         settling = replace(machine.settling, frequency=(fx, fy, ft), damping=(dx, dy, dt))
         self.machine = replace(machine, settling=settling)
@@ -124,7 +123,11 @@ class PlacementCell:
         """Run the loop for a part and return the run and the plant."""
         target = self._plan.target
         plant = SimulatedPlant(
-            machine.axes, start=target + start, swing=swing, watchdog=machine.control.watchdog * machine.period
+            machine.axes,
+            start=target + start,
+            history=count_commands(machine),
+            watchdog=machine.control.watchdog * machine.period,
+            swing=swing,
         )
         self._camera.follow(plant.pose, true)
         self._sensor.reset()

@@ -283,15 +283,9 @@ def simulate_placements(
     released = [each.released for each in placements]
     error = np.where(np.array(released)[:, None], np.array([each[-1] for each in motions]), np.nan)
     sources["vision and servo"] = error - sources["calibration"] - sources["drift"]
-    frames = [_counted(each) for each in placements if each.released] or None
+    frames = [each.steered_frames for each in placements if each.released] or None
     predicted = predict_budget(cell.machine, plan, frames)
     return PlacementResult(plan, cell.machine, predicted, placements, error, motions, sources, np.array(reach))
-
-
-def _counted(placement: Placement) -> int:
-    """Return the number of frames from the first measured pose to the release."""
-    first = min(each.arrived for each in placement.measurements)
-    return int(np.count_nonzero(placement.record.time > first))
 
 
 def _normal(rng: np.random.Generator, covariance: Float64, count: int) -> Float64:

@@ -34,6 +34,7 @@ from gpuvision.servoing.placement.plan import placement_imaging, plan_placement
 from gpuvision.servoing.placement.vision import BoardPoseSensor, Frame, SimulatedCamera
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
+from gpuvision.workflows import placement_cell
 from gpuvision.workflows.placement_cell import measure_repeatability
 from gpuvision.workflows.placing import PlacementResult, simulate_placements
 
@@ -119,6 +120,18 @@ def test_parts_land_where_and_when_the_prediction_says(artwork: Artwork, machine
     assert list(report["measured_rms"]["total"].values()) == pytest.approx(np.sqrt(np.mean(result.error**2, axis=0)))
     assert len(report["placements"]) == 6
     assert "6 of 6 parts placed" in result.summary()
+
+
+def test_the_simulated_machine_keeps_all_commands_of_a_placement(
+    artwork: Artwork, machine: Machine, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A short default history of the plant changes nothing."""
+    monkeypatch.setattr(
+        placement_cell, "SimulatedPlant", lambda *given, **more: SimulatedPlant(*given, **{"history": 6} | more)
+    )
+    result = simulate_placements(artwork, TARGET, machine, count=1, device=device)
+    assert result.placements[0].frames > 7
+    assert result.motion[0].shape == (result.placements[0].frames, 3)
 
 
 def test_the_measured_pose_of_a_head_at_rest_scatters_as_predicted(

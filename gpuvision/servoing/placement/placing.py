@@ -17,7 +17,7 @@ import numpy.typing as npt
 from gpuvision.servoing.controllers import PidController, SmithPredictor
 from gpuvision.servoing.guard import LoopLimits, Outcome
 from gpuvision.servoing.loop import Clock, LoopRecord, Plant, PoseSensor, ServoLoop
-from gpuvision.servoing.observer import LatestPose, MotionModel, PoseMeasurement, PoseObserver
+from gpuvision.servoing.observer import LatestPose, MotionModel, PoseMeasurement, PoseObserver, Verdict
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.settling import VibrationSettling
 
@@ -191,6 +191,12 @@ def predicted_settling(machine: Machine, start: Float64, band: Float64) -> int:
     return machine.frames_to(1.0 / share) if share > 1.0 else 0
 
 
+def count_commands(machine: Machine) -> int:
+    """Return the largest number of commands of a run: ``history`` of a `SimulatedPlant` that keeps all poses."""
+    # One command a frame, the start, and the stop at the end.
+    return math.ceil(machine.tolerance.max_time * machine.rate) + 2
+
+
 class Placement(NamedTuple):
     """Run of the loop for one part.
 
@@ -224,6 +230,17 @@ class Placement(NamedTuple):
     def measurements(self) -> tuple[PoseMeasurement, ...]:
         """Measured poses in the order of arrival."""
         return tuple(measurement for measurement, _ in self.record.measurements)
+
+    @property
+    def first_pose(self) -> float:
+        """Arrival of the first accepted pose [s]; infinite without one. A refused coarse registration is no pose."""
+        accepted = (each.arrived for each, verdict in self.record.measurements if verdict is Verdict.ACCEPTED)
+        return min(accepted, default=math.inf)
+
+    @property
+    def steered_frames(self) -> int:
+        """Number of frames after the one of the first accepted pose."""
+        return int(np.count_nonzero(self.record.time > self.first_pose))
 
 
 def place_part(

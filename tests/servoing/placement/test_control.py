@@ -13,12 +13,15 @@ from gpuvision.formats.machine_file import read_machine
 from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.controllers import PidController
 from gpuvision.servoing.loop import ServoLoop, SimulatedClock
+from gpuvision.servoing.observer import PoseMeasurement
+from gpuvision.servoing.placement import rehearsal
 from gpuvision.servoing.placement.budget import noise_covariance
 from gpuvision.servoing.placement.control import Control, Settling
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.placing import (
     Placement,
     ReleaseRule,
+    count_commands,
     make_observer,
     place_part,
     predicted_settling,
@@ -28,6 +31,7 @@ from gpuvision.servoing.placement.rehearsal import check_resonances
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.servoing.settling import vibration_of_loop
 from gpuvision.servoing.simulated_sensor import SimulatedPoseSensor
+from gpuvision.status import Status
 
 PRESET = read_machine("look_while_place")
 COVARIANCE = np.diag([0.2e-6, 0.2e-6, 1e-4]) ** 2
@@ -217,6 +221,33 @@ def test_a_loop_that_makes_a_resonance_swing_up_is_refused_with_a_gain_that_sett
     check_resonances(PRESET)
 
 
+def test_a_slow_resonance_is_checked_for_all_of_its_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plant keeps every command of the run, which is longer than a short default history."""
+    monkeypatch.setattr(
+        rehearsal, "SimulatedPlant", lambda *given, **more: SimulatedPlant(*given, **{"history": 16} | more)
+    )
+    x = Axis(resonance=2.0 * math.pi * 120.0, damping=0.3)
+    check_resonances(dataclasses.replace(PRESET, control=Control(gain=0.1), axes=(x, Axis(), Axis())))
+    slow = dataclasses.replace(PRESET, axes=(Axis(resonance=2.0 * math.pi * 0.4, damping=0.05), Axis(), Axis()))
+    with pytest.raises(ValueError, match=r"slowest resonance, 0\.4 Hz, takes 250\d\d frames, more than 20000"):
+        check_resonances(slow)
+
+
+def test_the_plant_keeps_all_commands_of_the_longest_run() -> None:
+    limits = dataclasses.replace(PRESET.tolerance, max_time=0.0205, max_refused=100)
+    machine = dataclasses.replace(PRESET, tolerance=limits)
+    for missing, is_kept in ((0, True), (1, False)):
+        clock = SimulatedClock()
+        clock.wait_until(0.005)
+        plant = SimulatedPlant(start=(1.0, 0.0, 0.0), history=count_commands(machine) - missing)
+        assert place_part(machine, np.zeros(3), plant, lambda _: [], clock).frames == 21
+        if is_kept:
+            assert plant.pose(0.0)[0] == 1.0
+        else:
+            with pytest.raises(ValueError, match="before the history"):
+                plant.pose(0.0)
+
+
 def test_a_fixed_wait_releases_after_its_time() -> None:
     machine = dataclasses.replace(PRESET, settling=Settling(rule="fixed", wait=5e-3))
     placement, _ = _place(machine, np.array([90e-6, 0.0, 0.0]), (Axis(),) * 3)
@@ -287,6 +318,8 @@ def test_controls_that_cannot_work_are_refused(given: dict[str, Any], message: s
         ({"wait": 0.1}, "wait belongs to the rule"),
         ({"rule": "vibration", "frequency": (90.0, 0.0, 0.0)}, "belong together"),
         ({"frequency": (90.0, 0.0, 0.0), "damping": (0.02,) * 3}, 'belong to the rule "vibration"'),
+        ({"miss_probability": 1e-6}, 'miss_probability and window belong to the rule "vibration"'),
+        ({"rule": "fixed", "wait": 0.1, "window": 50}, 'miss_probability and window belong to the rule "vibration"'),
         ({"rule": "vibration", "frequency": (90.0, 0.0, 0.0), "damping": (0.8,) * 3}, "damping is 0.8"),
     ],
 )
@@ -311,6 +344,34 @@ def test_a_smith_predictor_with_axes_that_lag_is_refused(controller: Any) -> Non
     axes = (Axis(), Axis(lag=0.3e-3), Axis())
     with pytest.raises(ValueError, match='knows no lag of the axes; use observer = "kalman"'):
         dataclasses.replace(PRESET, control=Control(observer="smith", controller=controller), axes=axes)
+
+
+def test_a_fixed_wait_beyond_the_longest_time_is_refused() -> None:
+    for wait in (1.0, 2.0):
+        with pytest.raises(
+            ValueError, match=rf"settling.wait is {wait} s, expected less than tolerance.max_time, 1.0 s"
+        ):
+            dataclasses.replace(PRESET, settling=Settling(rule="fixed", wait=wait))
+    dataclasses.replace(PRESET, settling=Settling(rule="fixed", wait=0.999))
+
+
+def test_refused_poses_are_not_counted_as_the_first_pose() -> None:
+    """Three frames are refused, as by the coarse registration: the steered frames are those of a run without them."""
+    plant = SimulatedPlant(start=(80e-6, 0.0, 0.0))
+    sensor = _sensor(plant, PRESET, is_noisy=False)
+    nothing = np.full((3, 3), np.nan)
+
+    def late(time: float) -> list[PoseMeasurement]:
+        found = sensor(time)
+        return found if time > 2.5e-3 else [PoseMeasurement(time, time, nothing[0], nothing, int(Status.AMBIGUOUS))]
+
+    placement = place_part(PRESET, np.zeros(3), plant, late, SimulatedClock())
+    assert placement.released
+    assert [each.status == 0 for each in placement.measurements[:4]] == [False, False, False, True]
+    assert placement.first_pose == pytest.approx(3e-3, abs=1e-9)
+    assert placement.steered_frames == placement.frames - 4 == placement.predicted_frames
+    blind = place_part(PRESET, np.zeros(3), SimulatedPlant(), lambda _: [], SimulatedClock())
+    assert (blind.first_pose, blind.steered_frames) == (math.inf, 0)
 
 
 def test_an_unstable_controller_and_a_swing_without_a_resonance_are_refused() -> None:

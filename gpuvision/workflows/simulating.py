@@ -29,6 +29,7 @@ from gpuvision.simulation.sensors.masks import Mask, optimise_mask
 from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
 from gpuvision.simulation.sensors.readings import PATHS, GroundTruth, Reading
 from gpuvision.simulation.sensors.sensor_view import Exposure
+from gpuvision.simulation.transport.sheet_cut import SheetIndex
 from gpuvision.status import Status
 from gpuvision.workflows.light_cache import LightBlock, LightStore, Progress, SimulationTask, compute_missing_blocks
 from gpuvision.workflows.scan_result import ScanLimits
@@ -96,7 +97,8 @@ def prepare_simulation(
     Raises
     ------
     ValueError
-        The sensor cannot be simulated, a parameter lies outside its range, or no profile meets the part.
+        The sensor cannot be simulated, a parameter lies outside its range, no profile meets the part, or the sheet is
+        bent too much for the part, see `SheetIndex.of`.
     """
     require_light(sensor)
     transport = sensor.transport
@@ -235,12 +237,9 @@ def _transports_over(part: Scene, transport: StraightTransport, profiles: int | 
     """Return the transports [m] at which the sheet meets a part."""
     if transport.step is None:
         raise ValueError("a simulation needs [transport] step: metres per profile")
-    corners = part.corners.reshape(-1, 3)
-    corners = corners[np.isfinite(corners).all(axis=1)]
-    if not len(corners):
+    places = _corner_transports(part, transport)
+    if not len(places):
         raise ValueError("the part has no triangle")
-    axes = np.array([transport.g_axis, transport.h_axis, transport.direction])
-    places = (corners - transport.origin) @ np.linalg.inv(axes)[:, 2]
     steps = (np.array([places.min(), places.max()]) - transport.start) / transport.step
     first, last = int(np.ceil(steps.min() + 1e-9)), int(np.floor(steps.max() - 1e-9))
     if profiles is not None and profiles < last + 1 - first:
@@ -249,6 +248,16 @@ def _transports_over(part: Scene, transport: StraightTransport, profiles: int | 
     if last < first:
         raise ValueError("no profile meets the part: it is shorter than a step of the transport")
     return transport.start + transport.step * np.arange(first, last + 1, dtype=np.float64)
+
+
+def _corner_transports(part: Scene, transport: StraightTransport) -> Array:
+    """Return the transports [m] at which the sheet meets corners of the part; of its division by a bent sheet."""
+    if transport.bend is not None:
+        return SheetIndex.of(part, transport).corners[..., 2].ravel()
+    corners = part.corners.reshape(-1, 3)
+    corners = corners[np.isfinite(corners).all(axis=1)]
+    axes = np.array([transport.g_axis, transport.h_axis, transport.direction])
+    return np.asarray((corners - transport.origin) @ np.linalg.inv(axes)[:, 2])
 
 
 def _all_light(store: LightStore, bins: int, max_bins: int) -> tuple[dict[str, Exposure], GroundTruth]:

@@ -19,6 +19,8 @@ from gpuvision.cli import main as cli
 from gpuvision.formats.range_image import read_npz
 from gpuvision.host import Device
 from gpuvision.host.errors import RecordingError
+from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.sheet import BentSheet
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.material import Material
@@ -71,6 +73,19 @@ def test_a_part_is_scanned_from_end_to_end(part_file: Path) -> None:
     # 20 mm of the plate at 0.25 mm a profile; profiles that only touch its ends do not count.
     assert len(task.transports) == 79
     np.testing.assert_allclose(task.transports[[0, -1]], [-9.75 * MM, 9.75 * MM], atol=1e-12)
+
+
+@pytest.mark.parametrize("bend", [0.4, -0.4])
+def test_a_bent_sheet_scans_the_whole_part(bend: float) -> None:
+    part = Scene.of(trimesh.creation.box((120 * MM, 10 * MM, 2 * MM)))
+    sensor = Sensor.load("camera_line")
+    assert isinstance(sensor.transport, StraightTransport)
+    sheet = BentSheet(terms=(bend, 0.0, 0.0), pinhole=(0.0, 0.15, 0.08))
+    sensor = dataclasses.replace(sensor, transport=dataclasses.replace(sensor.transport, bend=sheet))
+    task = prepare_simulation(part, [Material(diffuse=Lambert(albedo=0.5))], sensor)
+    # L = y + 0.4/m x^2, with -5 mm < y < 5 mm and x up to 60 mm: 1.44 mm more on one side, at 0.25 mm a profile.
+    expected = [-4.75 * MM, 6.25 * MM] if bend > 0.0 else [-6.25 * MM, 4.75 * MM]
+    np.testing.assert_allclose(task.transports[[0, -1]], expected, atol=1e-12)
 
 
 def test_what_is_read_is_told_apart_by_cause(part_file: Path, light: Path, tmp_path: Path) -> None:

@@ -27,7 +27,8 @@ from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.bvh import MIN_STACK_SIZE
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import Irradiance
-from gpuvision.simulation.transport.patch_meshing import MeshingLimits, bisect_triangles, mesh_scene
+from gpuvision.simulation.transport.patch_meshing import MeshingLimits, mesh_scene
+from gpuvision.simulation.transport.triangle_division import bisect_triangles
 
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]

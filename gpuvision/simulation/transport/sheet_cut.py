@@ -22,6 +22,7 @@ import numpy.typing as npt
 from gpuvision.ranging.sheet import BentSheet
 from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.transport.triangle_division import longest_edges, subdivide_to
 
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -41,9 +42,14 @@ BEND_ERROR = 5e-8
 # most s, by up to c s^2 / 6 (the triangle fits into a circle of radius s / sqrt(3)), and a curve in it from a chord by
 # up to c s^2 / 8; both together have this factor.
 _DEVIATION = 1.0 / 6.0 + 1.0 / 8.0
+MAX_PIECES = 1 << 20
+"""Largest value of the lower bound of the number of triangles into which a bent sheet divides a scene. The division has
+up to 3.5 times as many. Chosen: bounds the memory, about 1.5 GB."""
 # Fixed-point steps for the coordinates of a bent sheet; the error of the start value is multiplied each time by the
-# slope of the sheet, below 0.1, times the direction of its normal.
-_BEND_STEPS = 16
+# slope of the sheet times the component of its normal across the transport. Chosen: enough for a factor of 0.8.
+_BEND_STEPS = 160
+# Largest last step, in parts of the largest coordinate. Chosen: rounding.
+_BEND_ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 _INDEX_CACHE: WeakKeyDictionary[Scene, dict[tuple[object, ...], SheetIndex]] = WeakKeyDictionary()
 
 
@@ -98,7 +104,14 @@ class SheetIndex:
 
     @classmethod
     def of(cls, scene: Scene, transport: StraightTransport) -> SheetIndex:
-        """Return the index of a scene for a transport. It is built at the first use and kept as long as the scene."""
+        """Return the index of a scene for a transport. It is built at the first use and kept as long as the scene.
+
+        Raises
+        ------
+        ValueError
+            The sheet is bent too much for the scene: the division has more than `MAX_PIECES` triangles, or the sheet is
+            nearly parallel to the transport.
+        """
         mine = _INDEX_CACHE.setdefault(scene, {})
         key = (transport.origin, transport.g_axis, transport.h_axis, transport.direction, transport.bend)
         if key not in mine:
@@ -112,7 +125,8 @@ class SheetIndex:
         triangle, corners = np.arange(len(good)), np.where(good[:, None, None], scene.corners, 0.0)
         if transport.bend is not None:
             longest_edge = math.sqrt(BEND_ERROR / (_DEVIATION * max(_curvature(transport.bend), 1e-300)))
-            corners, triangle = _divided_triangles(corners, longest_edge)
+            _check_pieces(corners, longest_edge)
+            corners, triangle = subdivide_to(corners, triangle, longest_edge)
             good = good[triangle]
         corners = _sheet_coordinates(corners, transport)
         start, end = corners[..., 2].min(axis=1), corners[..., 2].max(axis=1)
@@ -221,27 +235,17 @@ def _curvature(sheet: BentSheet) -> float:
     return abs(gg + hh) + math.hypot(gg - hh, gh)
 
 
-def _divided_triangles(corners: Float64, longest_edge: float) -> tuple[Float64, Integers]:
-    """Divide triangles (n, 3, 3) until no edge is longer; return the parts and the index of each part's triangle.
-
-    The longest edge of a triangle is halved each time. Whether an edge is halved depends on its ends alone, so that the
-    parts of two triangles meet at bit-equal points of a common edge.
-    """
-    number = np.arange(len(corners))
-    done, of = [], []
-    while len(corners):
-        edges = np.roll(corners, -1, axis=1) - corners
-        length = np.sqrt(edges[..., 0] ** 2 + edges[..., 1] ** 2 + edges[..., 2] ** 2)
-        short = ~(length > longest_edge).any(axis=1)
-        done.append(corners[short])
-        of.append(number[short])
-        corners, number, first = corners[~short], number[~short], np.argmax(length[~short], axis=1)
-        each = np.arange(len(corners))
-        a, b, c = (corners[each, (first + n) % 3] for n in range(3))
-        middle = 0.5 * (a + b)
-        corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-        number = np.concatenate([number, number])
-    return np.concatenate([*done, corners]), np.concatenate([*of, number])
+def _check_pieces(corners: Float64, longest_edge: float) -> None:
+    """Refuse triangles (n, 3, 3), all finite, that have to be divided into more than `MAX_PIECES`."""
+    edges = np.roll(corners, -1, axis=1) - corners
+    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    # No piece is larger than an equilateral triangle.
+    least = np.maximum(area / (0.25 * math.sqrt(3.0) * longest_edge**2), longest_edges(corners)[0] / longest_edge)
+    if least.sum() > MAX_PIECES:
+        raise ValueError(
+            f"the bent sheet of light divides the part into at least {least.sum():.3g} triangles, expected at most "
+            f"{MAX_PIECES}; their edges are at most {1e3 * longest_edge:.3g} mm. Simulate a smaller part"
+        )
 
 
 def _sheet_coordinates(points: Float64, transport: StraightTransport) -> Float64:
@@ -253,12 +257,26 @@ def _sheet_coordinates(points: Float64, transport: StraightTransport) -> Float64
     if transport.bend is not None:
         # The normal has components along all three axes: G and H of the sheet follow by a fixed point.
         normal = np.cross(transport.g_axis, transport.h_axis) @ axes
-        flat = G, H
-        for _ in range(_BEND_STEPS):
-            distance = bend_of(transport.bend, G, H)
-            G, H = flat[0] - normal[0] * distance, flat[1] - normal[1] * distance
+        G, H = _bent_place(G, H, transport.bend, normal)
         L = L - normal[2] * bend_of(transport.bend, G, H)
     return np.stack([G, H, L], axis=-1)
+
+
+def _bent_place(flat_g: Float64, flat_h: Float64, sheet: BentSheet, normal: Float64) -> tuple[Float64, Float64]:
+    """Return (G, H) for which ``(G, H) + normal[:2] d(G, H)`` are given places; all take the same number of steps."""
+    G, H = flat_g, flat_h
+    rounding = _BEND_ROUNDING * max(np.abs(flat_g).max(initial=0.0), np.abs(flat_h).max(initial=0.0))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_BEND_STEPS):
+            distance = bend_of(sheet, G, H)
+            before = G, H
+            G, H = flat_g - normal[0] * distance, flat_h - normal[1] * distance
+            if max(np.abs(G - before[0]).max(initial=0.0), np.abs(H - before[1]).max(initial=0.0)) <= rounding:
+                return G, H
+    raise ValueError(
+        "the bent sheet of light is nearly parallel to the transport on a part of the scene; expected [transport] "
+        "direction farther from the sheet, or a smaller part"
+    )
 
 
 def concatenated_ranges(begin: Integers, count: Integers) -> Integers:

@@ -18,7 +18,7 @@ from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet
-from gpuvision.simulation.transport.sheet_cut import BEND_ERROR
+from gpuvision.simulation.transport.sheet_cut import BEND_ERROR, SheetIndex
 from sensor_views import sensor_view
 
 Float64 = npt.NDArray[np.float64]
@@ -122,6 +122,48 @@ def test_lit_points_are_not_hidden_by_their_own_triangle(device: Device) -> None
         found[terms] = direct.exposures(0.0)["direct"].power.sum(axis=-1)
     # The distance to the lens changes by the bend, below 1 mm of 170 mm in view.
     np.testing.assert_allclose(found[TERMS], found[0.0, 0.0, 0.0], rtol=0.02)
+
+
+def oblique(degrees: float) -> StraightTransport:
+    """Return a strongly bent sheet at an angle to the transport."""
+    angle = np.radians(degrees)
+    bend = BentSheet(terms=(1.0, 0.0, 1.0), pinhole=PINHOLE)
+    return StraightTransport(direction=(0.0, -np.sin(angle), np.cos(angle)), bend=bend)
+
+
+def small_triangles(rng: np.random.Generator) -> Float64:
+    """Return 50 triangles of 0.2 mm, up to 50 mm from the origin in each direction."""
+    return np.asarray(rng.uniform(-0.05, 0.05, (50, 1, 3)) + rng.uniform(-1e-4, 1e-4, (50, 3, 3)))
+
+
+@pytest.mark.parametrize("degrees", [90.0, 45.0, 30.0])
+def test_coordinates_of_an_oblique_sheet_give_the_point(degrees: float, rng: np.random.Generator) -> None:
+    move, corners = oblique(degrees), small_triangles(rng)
+    index = SheetIndex.of(Scene(corners), move)
+    g, h, L = np.moveaxis(index.corners, -1, 0)[..., None]
+    normal = np.cross(move.g_axis, move.h_axis)
+    found = g * move.g_axis + h * move.h_axis + (g * g + h * h) * normal + L * move.direction
+    for points, triangle in zip(found, index.triangle, strict=True):
+        # All pieces are in the plane of their triangle, and inside it: its corners are within 0.5 mm.
+        a, b, c = corners[triangle]
+        beside = (points - a) @ np.cross(b - a, c - a) / np.linalg.norm(np.cross(b - a, c - a))
+        assert np.abs(beside).max() < 1e-14
+        assert np.abs(points - a).max() < 5e-4
+    assert set(index.triangle) == set(range(50))
+
+
+def test_a_sheet_along_the_transport_is_refused(rng: np.random.Generator) -> None:
+    with pytest.raises(ValueError, match="nearly parallel to the transport"):
+        SheetIndex.of(Scene(small_triangles(rng)), oblique(10.0))
+
+
+def test_a_part_with_too_many_pieces_is_refused() -> None:
+    # A plate of 0.4 m has about 1.3 million triangles at least; a strip of 300 m has few by its area.
+    for size in ((0.5, 0.3, 0.0), (300.0, 1e-9, 0.0)):
+        x, y, z = size
+        plate = np.array([[[-x, -y, z], [x, -y, z], [x, y, z]], [[-x, -y, z], [x, y, z], [-x, y, z]]])
+        with pytest.raises(ValueError, match=r"divides the part into at least .* triangles"):
+            SheetIndex.of(Scene(plate), transport())
 
 
 def test_mirrors_are_refused(device: Device) -> None:

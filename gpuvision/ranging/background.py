@@ -108,8 +108,7 @@ class PreviousSubtracted(_Subtracted):
     Notes
     -----
     The first frame has no previous frame: it becomes 0. Where the line overlaps its previous place the position is
-    biased. The standard deviation of a pixel is ``sqrt(2)`` times its standard
-    deviation in a frame.
+    biased. The standard deviation of a pixel is ``sqrt(2)`` times its standard deviation in a frame.
     """
 
     def __init__(self, source: Source, *, saturation: float | None = None) -> None:

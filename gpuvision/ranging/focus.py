@@ -37,7 +37,7 @@ class FocusReading(NamedTuple):
     width
         Standard deviation of the Gaussian through the intensities [m].
     sigma_image, sigma_object
-        Predicted standard deviations of LI and LO [m]; ``None`` without those of the intensities.
+        Predicted standard deviations of LI and LO [m]; ``None`` if the intensities have none.
     status
         uint8 `Status` flags: NOT_FINITE; LOW_SIGNAL (fewer than three pinholes are above the minimum); AMBIGUOUS (no
         maximum: equal intensities, or a valley); OUT_OF_RANGE (the peak lies outside the pinholes, or no object in

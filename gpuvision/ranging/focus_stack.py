@@ -26,7 +26,7 @@ MEASURES: tuple[Measure, ...] = get_args(Measure)
 # height), so that noise on the flank of a peak is not a second maximum.
 _VALLEY = 0.5
 # Largest standard deviation of the sharpest frame by the noise of a Laplacian that is stated [frames]. Measured: the
-# scatter is 0.93 to 1.05 of the prediction below it, and 1.15 to 1.6 above it, where the fit is no longer linear.
+# scatter is 0.91 to 1.05 of the prediction below it, and 1.1 to 1.6 above it, where the fit is no longer linear.
 _MOST_SIGMA = 0.1
 _BLOCK_PIXELS = 1 << 18  # fitted at a time; bounds the memory of the fit to some 50 MB
 
@@ -127,7 +127,8 @@ class FocusPeak(NamedTuple):
     sigma
         Standard deviation of ``frame`` by the noise of the stack; None if the stack gives no noise. With the measure
         "laplacian" it is NaN where it would exceed 0.1 frames, since it is too small there by up to 1.6, and in the
-        ``window + 1`` outermost rows and columns.
+        ``window + 1`` outermost rows and columns. `gpuvision.merge_height_maps` leaves out heights without a finite
+        standard deviation.
     """
 
     frame: Float64
@@ -177,9 +178,9 @@ class FocusStack:
     the memory does not grow with the number of frames.
 
     Standard deviation: the noise of the measures in the fitted frames, which err independently, propagated to the peak
-    to first order. The noise of an intensity is that of a pixel; that of a Laplacian depends on the texture
-    (`gpuvision.ranging.focus_noise.laplacian_variance`); its computation takes some 0.3 s per megapixel and frame,
-    nearly twenty times as long as that of the measure. The measures of pixels less than ``2 window + 3`` apart share
+    to first order. An intensity has the noise of a pixel. The noise of a Laplacian depends on the texture
+    (`gpuvision.ranging.focus_noise.laplacian_variance`): computing it takes some 0.3 s per megapixel and frame, nearly
+    twenty times the time of the measure. The measures of pixels less than ``2 window + 3`` apart share
     noise. The standard deviation does not contain the error by the texture itself: the measure is no exact Gaussian of
     the frame number.
 

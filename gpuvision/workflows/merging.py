@@ -42,6 +42,8 @@ SIGMA_FILE = "range_image_sigma.tiff"
 _OFFSET = 0.5
 # Share of the common cells that disagree from which a warning asks for a larger tolerance. Chosen.
 _MANY = 0.1
+# Share of the heights without a standard deviation above which a warning is given. Chosen: more than a border.
+_MANY_WITHOUT_SIGMA = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +62,9 @@ class HeightMapMerge:
         Second minus first height [m] in the cells in which both maps have a height, see `common_differences`.
     settings : dict
         Parameters of the merge.
+    without_sigma : tuple of float
+        Share of the heights of each map that have no finite standard deviation above 0 and are therefore missing in the
+        merge; 0 if the merge does not use standard deviations. Default 0.
     """
 
     names: tuple[str, str]
@@ -67,6 +72,7 @@ class HeightMapMerge:
     grid: Grid
     differences: npt.NDArray[np.float64]
     settings: dict[str, Any]
+    without_sigma: tuple[float, float] = (0.0, 0.0)
 
     def counts(self) -> dict[str, int]:
         """Return the number of cells by source; ``disagrees`` counts cells where the maps disagree."""
@@ -89,11 +95,16 @@ class HeightMapMerge:
         return middle, MAD_TO_SIGMA * float(np.median(np.abs(self.differences - middle)))
 
     def advice(self) -> tuple[str, ...]:
-        """Return what to check: no common cells, an offset of the two frames, or many cells that disagree."""
+        """Return what to check: heights without a standard deviation, no common cells, an offset, disagreement."""
         counts, (middle, spread) = self.counts(), self.offset()
+        found = [
+            f"{name}: {100.0 * share:.0f} % of the heights have no standard deviation and are left out; a sensor file "
+            "without a noise model, with --tolerance, keeps them"
+            for name, share in zip(self.names, self.without_sigma, strict=True)
+            if share > _MANY_WITHOUT_SIGMA
+        ]
         if not counts["common"]:
-            return ("the two maps have no common cell: are both in one frame?",)
-        found = []
+            return (*found, "the two maps have no common cell: are both in one frame?")
         if abs(middle) > _OFFSET * max(spread, np.finfo(np.float64).tiny):
             found.append(
                 f"the second map lies {1e6 * middle:+.3g} um from the first one (median; robust deviation "
@@ -260,4 +271,12 @@ def merge_scans(
         grid=grid,
         differences=common_differences(*maps, merged, grid),
         settings={"max_sigmas": max_sigmas, "tolerance": tolerance, "disagreement": disagreement},
+        without_sigma=(0.0, 0.0) if merged.sigma is None else (_share_missing(maps[0][0]), _share_missing(maps[1][0])),
     )
+
+
+def _share_missing(heights: HeightMap) -> float:
+    """Return the share of the heights that have no finite standard deviation above 0."""
+    valid, sigma = np.isfinite(to_numpy(heights.z)), to_numpy(heights.sigma)
+    known = valid & np.isfinite(sigma) & (sigma > 0.0)
+    return 1.0 - float(np.count_nonzero(known)) / max(int(np.count_nonzero(valid)), 1) if valid.any() else 0.0

@@ -134,6 +134,19 @@ def test_common_cells_are_those_of_the_merge(rng: np.random.Generator, tmp_path:
     np.testing.assert_array_equal(found.differences, 0.0)
 
 
+def test_heights_without_sigma_are_reported(rng: np.random.Generator, tmp_path: Path, run: Run) -> None:
+    """A focus stack gives a part of its heights no standard deviation."""
+    first, second = (write_scan(tmp_path / name, step(rng, slice(0, 0))) for name in ("first", "second"))
+    arrays, units = read_npz(second / "range_image.npz")
+    arrays["map_sigma"][:10] = math.nan
+    write_npz(second / "range_image.npz", arrays, units, overwrite=True)
+    code, _, err = run("merge", first, second, "--out", tmp_path / "out")
+    assert code == 0
+    assert f"{second}: 25 % of the heights have no standard deviation" in err.replace("\n", " ")
+    assert err.count("no standard deviation") == 1
+    assert merge_scans(first, second).without_sigma == (0.0, 0.25)
+
+
 def test_files_of_sigma_do_not_outlive_their_merge(scans: tuple[Path, Path], tmp_path: Path) -> None:
     merged = merge_scans(*scans)
     merged.write(tmp_path / "out")

@@ -213,9 +213,12 @@ def make_simulator(sensor: Sensor, view: SensorView, mask: Mask | None = None) -
             mask=mask,
             quantised=readout.ampere != 1.0,
         )
+    if not sensor.noise_known:
+        noise = line_noise(sensor)
+        readout = replace(readout, read_noise=noise["read_noise"], gain=noise["gain"])
     return CameraSimulator(
         view=view,
-        readout=readout if sensor.noise_known else replace(readout, **line_noise(sensor)),
+        readout=readout,
         exposure_time=light.exposure,
         responsivity=light.responsivity,
         gain=_MAX_GREY_LEVEL / light.full_well,

@@ -84,7 +84,7 @@ class SensorCalibration:
         return (
             f"laser line in {used} images, {readings} readings ({sheet.outliers} rejected): residual "
             f"{sheet.rms_px:.3g} px rms, sheet {shape}; step {geometry.step * 1e6:.6g} um ({how}); relative sigma of "
-            f"heights {self.scale_sigma[0]:.1e}, of x and y {self.scale_sigma[1]:.1e} besides that of the pitch"
+            f"heights {self.scale_sigma[0]:.1e}, of x and y {self.scale_sigma[1]:.1e} without the error of the pitch"
         )
 
     @cached_property

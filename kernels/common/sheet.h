@@ -97,14 +97,16 @@ typedef struct {
 
 #ifdef CAMERA_PROFILES
 // Compute the undistorted place of light positions by the table of a readout whose samples are whole numbers
-// (gpuvision/ranging/profile_correction.py). Along a profile, at a fixed sample, the correction of the camera is a
-// polynomial of the position: t = (position - middle) scale, correction = c0 + t (c1 + t (c2 + ...)), in the units of x and
-// y. The host has verified that every position of a profile has an undistorted place, and that the dropped terms are below
-// a quarter of a rounding. There are no division, no iteration and no test, and a third of the arithmetic.
+// (gpuvision/camera/profile_correction.py). Along a profile, at a fixed sample, the correction of the camera is a
+// polynomial of the position: t = (position - middle) scale, correction = c0 + t (c1 + t (c2 + ...)), in the units of x
+// and y. The host makes the table only if all 24 x 24 nodes of a Chebyshev series over the frame have undistorted
+// places, and the dropped terms of the series are below a quarter of a rounding. There are no division, no iteration
+// and no test, and a third of the arithmetic.
 //
 // `sample` is the number of the first lane's profile, a multiple of 16 or samples - 16 k: the last vectors of a frame are
 // moved back. The table `terms` has a block of (CAMERA_PROFILES, 2, 16) numbers for each 16 profiles, which are read in
-// sequence: powers of t from the highest one, position and sample, profile. Blocks from profile samples % 16 on follow for the moved vectors.
+// sequence: powers of t from the highest one, position and sample, profile. Blocks from profile samples % 16 on follow
+// for the moved vectors.
 static inline SheetPlace sheet_place_in_profile(reals position, int sample, int samples, global const real *terms,
                                                 constant SheetTable *sheet) {
 #ifdef VECTOR_VARIANT

@@ -19,14 +19,13 @@
 //          samples), and under WITH_SHEET sigma_g, sigma_h real [m] (the same of g and h) and systematic_g,
 //          systematic_h real [m] (standard deviation by the covariance of the triangulation)
 // Build options: CODE, CODE4, CODE8, CODE16, CODE_BITS (type of the samples), REAL_IS_DOUBLE, ALONG_ROWS, RADIUS and
-// REACH
-// (window that counts, and window that is read), FIR_HALF, CANDIDATES with SELECT_... (line_peak.h), AMBIGUITY,
+//          REACH (window that counts, and window that is read), FIR_HALF, CANDIDATES with SELECT_... (line_peak.h), AMBIGUITY,
 //          WIDTH_LIMITS, COUNT_WIDTH, LONG_MOMENT, PREFETCH, NOISE (compute variances: any of the sigmas is an output),
 //          WITH_POSITION/PEAK/WIDTH/TOTAL/STATUS/SHEET/G/H/SIGMA/SIGMA_G/SIGMA_H/SYSTEMATIC_G/SYSTEMATIC_H, LENS,
-//          LENS_K2, LENS_K3, LENS_K4, PAST_CACHES, VECTOR_VARIANT.
+//          LENS_K2, LENS_K3, LENS_K4, CAMERA, CAMERA_PROFILES (terms of the table of corrections), PAST_CACHES,
+//          VECTOR_VARIANT.
 // Work:    global size (work-items of a frame, frames). Vector variant: a work-item reads a strip of columns, or 16
-// rows;
-//          under CANDIDATES 16 profiles. Otherwise: one work-item per profile, padded to whole work-groups.
+//          rows; under CANDIDATES 16 profiles. Otherwise: one work-item per profile, padded to whole work-groups.
 #include "line/line_profiles.h"
 #include "common/sheet.h"
 

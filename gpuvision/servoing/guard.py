@@ -52,6 +52,9 @@ class LoopLimits:
     margin_sigmas : float
         Largest travel beyond the error of a measured pose [standard deviations of this pose].
         Default 3.
+    overshoot : tuple of float
+        Travel beyond the error of a measured pose by the overshoot of the step response [m], [m], [rad]. Default 0: a
+        controller with an integral part is slower then, because the guard cuts the overshoot that empties this part.
     lag : tuple of float
         Time constants with which the axes follow the commanded velocity [s]. The travel includes the motion that
         remains from the velocity at the exposure. Default 0.
@@ -73,6 +76,7 @@ class LoopLimits:
     abort_after: float = 0.1
     gated: int = 10
     margin_sigmas: float = 3.0
+    overshoot: tuple[float, float, float] = (0.0, 0.0, 0.0)
     lag: tuple[float, float, float] = (0.0, 0.0, 0.0)
     watchdog: float = math.inf
     encoder_error: tuple[float, float, float] = (math.inf, math.inf, math.inf)
@@ -85,8 +89,9 @@ class LoopLimits:
         finite(self.margin_sigmas, "margin_sigmas", minimum=0.0)
         if not self.watchdog > 0.0:
             raise ValueError(f"watchdog is {self.watchdog}, expected a time > 0, or infinity for none")
-        for each in numbers(self.lag, (3,), "lag"):
-            finite(each, "lag", minimum=0.0)
+        for name in ("overshoot", "lag"):
+            for each in numbers(getattr(self, name), (3,), name):
+                finite(each, name, minimum=0.0)
         for name in ("gated", "readings", "missed"):
             integer(getattr(self, name), name, minimum=1)
         if len(self.encoder_error) != 3 or not all(each > 0.0 for each in self.encoder_error):
@@ -102,19 +107,28 @@ class TravelGuard:
         Largest motion beyond the error of the measured pose [standard deviations of this pose].
     lag : array_like
         (3,) time constants with which the axes follow the commanded velocity [s]. Default 0.
+    overshoot : array_like
+        (3,) motion beyond the error of the measured pose by the overshoot of the step response. Default 0.
 
     Notes
     -----
     Without a new pose each axis moves at most by the distance of the last trusted pose from the target, plus the
-    margin. The guard bounds the integral of the commands since the exposure plus lag times the velocity at the
-    exposure: the position at which an axis with this lag comes to rest. The swing of a resonance is not included.
+    margin and the overshoot. The guard bounds the integral of the commands since the exposure plus lag times the
+    velocity at the exposure: the position at which an axis with this lag comes to rest. The swing of a resonance is not
+    included.
 
     The bound holds for frames that begin in time. Before a late frame the last command lasts longer: n periods move an
     axis by up to n times the bound, unless a watchdog of one period stops the plant (`LoopLimits.watchdog`).
     """
 
-    def __init__(self, margin_sigmas: float, lag: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
+    def __init__(
+        self,
+        margin_sigmas: float,
+        lag: npt.ArrayLike = (0.0, 0.0, 0.0),
+        overshoot: npt.ArrayLike = (0.0, 0.0, 0.0),
+    ) -> None:
         self._sigmas, self._lag = margin_sigmas, np.array(lag, np.float64)
+        self._overshoot = np.array(overshoot, np.float64)
         # Time, commanded velocity, and velocity of the axes at this time.
         self._commands: deque[tuple[float, Float64, Float64]] = deque()
         self._exposed: float = -math.inf
@@ -131,7 +145,7 @@ class TravelGuard:
         if measurement.exposed <= self._exposed:
             return
         self._exposed, self._pose = measurement.exposed, measurement.pose.copy()
-        self._margin = self._sigmas * np.sqrt(np.diagonal(measurement.covariance))
+        self._margin = self._sigmas * np.sqrt(np.diagonal(measurement.covariance)) + self._overshoot
         while len(self._commands) > 1 and self._commands[1][0] <= self._exposed:
             self._commands.popleft()
 

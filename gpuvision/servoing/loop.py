@@ -252,7 +252,7 @@ class _Run:
     def __init__(self, loop: ServoLoop, goal: Target, settling: SettlingRule | None, duration: float) -> None:
         self.loop, self.goal, self.settling = loop, goal, settling
         self.limits = loop.limits or LoopLimits()
-        self.guard = TravelGuard(self.limits.margin_sigmas, self.limits.lag)
+        self.guard = TravelGuard(self.limits.margin_sigmas, self.limits.lag, self.limits.overshoot)
         self.faults = FaultCounter(self.limits)
         loop.controller.reset()
         self.start = loop.clock.now()

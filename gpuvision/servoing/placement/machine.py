@@ -25,6 +25,8 @@ Float64 = npt.NDArray[np.float64]
 
 # Smallest gain (chosen): the error then falls by a factor of e in 10 000 frames.
 _MIN_GAIN = 1e-4
+# Error after which no larger overshoot follows, as a fraction of the start error (chosen).
+_SETTLED = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,6 +334,13 @@ class Machine:
     def frames_to(self, fraction: float) -> int:
         """Return the number of frames after which a start error of 1 stays within a fraction, by theory."""
         return settling_frames(self.control_delay, self.loop_gain, fraction, **self.time_constants)
+
+    @property
+    def overshoot(self) -> float:
+        """Overshoot of the step response as a fraction of the start error, by theory; 0 without oscillation."""
+        if self.control.controller == "p" and self.loop_gain <= non_oscillating_gain(self.control_delay):
+            return 0.0
+        return max(-float(self.error_after(self.frames_to(_SETTLED) + 1).min()), 0.0)
 
     @property
     def time_constants(self) -> dict[str, float]:

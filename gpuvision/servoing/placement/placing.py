@@ -268,8 +268,17 @@ def place_part(
     Placement
         The part is not released if no pose is valid for `Tolerance.max_refused` frames, if the loop gives up, or after
         `Tolerance.max_time`; ``reason`` says why.
+
+    Notes
+    -----
+    A guard bounds the travel since the newest measured pose by the error of this pose, three standard deviations, and
+    the overshoot of the step response from the edge of the landing zone: from a start in the zone the loop follows the
+    theory (`Machine.error_after`). With an integral part, and with a gain that oscillates, the head may so travel by
+    `Machine.overshoot` times the landing zone beyond the target while poses are missing.
     """
     x, y, theta = (axis.lag for axis in machine.axes)
+    side = machine.overshoot * machine.tolerance.landing_zone
+    overshoot = (side, side, machine.overshoot * machine.tolerance.landing_angle)
     goal = np.asarray(target, np.float64)
     observer = make_observer(machine, goal, clock.now())
     blind = landing + machine.delay.latency + machine.tolerance.max_refused * machine.period
@@ -281,7 +290,11 @@ def place_part(
         clock,
         period=machine.period,
         limits=LoopLimits(
-            hold_after=blind, abort_after=blind, lag=(x, y, theta), watchdog=machine.control.watchdog * machine.period
+            hold_after=blind,
+            abort_after=blind,
+            overshoot=overshoot,
+            lag=(x, y, theta),
+            watchdog=machine.control.watchdog * machine.period,
         ),
     )
     rule = ReleaseRule(machine, observer)

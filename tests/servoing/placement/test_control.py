@@ -119,7 +119,7 @@ def _place(machine: Machine, start: np.ndarray, axes: tuple[Axis, Axis, Axis], *
     return place_part(machine, np.zeros(3), plant, sensor, SimulatedClock()), plant
 
 
-@pytest.mark.parametrize("control", [CONTROLS[0], CONTROLS[2], CONTROLS[5]], ids=lambda each: each.observer)
+@pytest.mark.parametrize("control", CONTROLS, ids=lambda each: f"{each.observer}-{each.controller}")
 def test_true_error_settles_in_the_frames_of_theory(control: Control) -> None:
     """The count of the true error is apart from the release rule: a machine that is slower shows it."""
     machine, start = dataclasses.replace(PRESET, control=control), np.array([70e-6, -40e-6, 3e-3])
@@ -131,6 +131,21 @@ def test_true_error_settles_in_the_frames_of_theory(control: Control) -> None:
     assert counted[0.0] is not None
     assert abs(counted[0.0] - expected) <= 1
     assert counted[2e-3] is None or counted[2e-3] >= expected + 3
+
+
+@pytest.mark.parametrize(
+    "control", [*CONTROLS[1:5:2], CONTROLS[6], Control(gain=0.4)], ids=lambda each: f"{each.observer}-{each.controller}"
+)
+@pytest.mark.parametrize("start", [40e-6, -90e-6])
+def test_guards_do_not_cut_the_overshoot_of_theory(control: Control, start: float) -> None:
+    machine = dataclasses.replace(PRESET, control=control, settling=Settling(rule="fixed", wait=0.06))
+    plant = SimulatedPlant(start=(start, 0.0, 0.0))
+    sensor = _sensor(plant, machine, is_noisy=False)
+    placement = place_part(machine, np.zeros(3), plant, sensor, SimulatedClock())
+    error = plant.pose(placement.record.time)[:, 0] / start
+    np.testing.assert_allclose(error, machine.error_after(len(error)), atol=1e-6)
+    assert machine.overshoot == pytest.approx(-error.min(), abs=1e-6)
+    assert machine.overshoot > 0.05
 
 
 def test_settled_frames_count_from_the_last_error_outside_the_band() -> None:
@@ -274,7 +289,9 @@ class _HangingClock(SimulatedClock):
 
 @pytest.mark.parametrize("watchdog", [1.5, math.inf])
 def test_the_watchdog_stops_the_head_while_the_computer_hangs(watchdog: float) -> None:
-    machine = dataclasses.replace(PRESET, control=Control(gain=0.3, watchdog=watchdog))
+    # A gain without oscillation: the step response itself does not go beyond the target.
+    machine = dataclasses.replace(PRESET, control=Control(gain=0.2, watchdog=watchdog))
+    assert machine.overshoot == 0.0
     plant = SimulatedPlant(start=(80e-6, 0.0, 0.0), watchdog=watchdog * machine.period)
     place_part(machine, np.zeros(3), plant, _sensor(plant, machine, is_noisy=False), _HangingClock())
     lowest = plant.pose(np.linspace(0.0, 0.02, 200))[:, 0].min()

@@ -140,7 +140,7 @@ def _render(name: str, published: Any, size: int, label: str, core: int | None, 
             pose = pose + step * shared.velocity
             shared.velocity[:] = 0.0  # a command holds for one frame: without a new one the camera stands still
             # A camera has a clock and is never late. After a late frame of this process the clock starts again, so
-            # that no two frames follow each other faster than those of a camera.
+            # that frames never follow each other faster than a camera would take them.
             period = round(1e9 * step)
             number, due = number + 1, due + period if now - due < period // 4 else now + period
     shared.close()

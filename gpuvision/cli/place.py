@@ -69,8 +69,8 @@ def place(
     """Simulate placements of a part: the camera of the head steers the nozzle to its place on a rendered board.
 
     Every frame is rendered, measured by calipers (rulers), and answered by the controller after the delay of the
-    machine. The report has the error at the release and its prediction, and the frames in which the true error settles
-    beside those of theory. The machine file chooses observer, controller and release rule.
+    machine. The report has the error at the release and its prediction, and the number of frames in which the true
+    error settles, with its value by theory. The machine file chooses observer, controller and release rule.
     """
     from gpuvision.formats.json import json_tree
     from gpuvision.formats.machine_file import named_files, read_machine

@@ -160,7 +160,7 @@ def simulate(
     """Predict the range image that a sensor makes of a PART, its errors, and their causes.
 
     The light of each profile is stored in DIR. A stopped run continues there; a run with another --mask, --seed or
-    --noise reuses the stored light. With --recording, gpuvision scan reads what the sensor would record.
+    --noise reuses the stored light. With --recording, gpuvision scan can read the simulated frames.
     """
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs

@@ -119,7 +119,9 @@ class DepthFromFocus:
             raise ValueError(f"intensities have shape {light.shape}, expected (..., K) with at least 3 pinholes")
         deviations = self.sigma_intensity if sigma is None else np.asarray(sigma, dtype=np.float64)
         if deviations is not None and np.shape(deviations) not in ((), light.shape):
-            raise ValueError(f"sigma has shape {np.shape(deviations)}, expected that of the intensities, {light.shape}")
+            raise ValueError(
+                f"sigma has shape {np.shape(deviations)}, expected the shape of the intensities, {light.shape}"
+            )
         count = light.shape[-1]
         known = np.all(np.isfinite(light), axis=-1)
         lit = np.isfinite(light) & (light > self.minimum)

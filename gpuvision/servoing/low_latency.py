@@ -47,7 +47,7 @@ def low_latency(*, core: int | None = None, priority: int = 0) -> Iterator[None]
     Notes
     -----
     Start the devices and bind all operations before: the worker threads of an OpenCL runtime would inherit core and
-    priority. Core and priority are those of the calling thread; they return at the end.
+    priority. Core and priority change for the calling thread only, until the end of the body.
 
     Garbage collection is a setting of the whole process: it is off for all threads while at least one thread is
     inside, and the last one that leaves restores it. Objects that exist at the start are not searched for garbage

@@ -100,7 +100,7 @@ class DelayAnalysis:
         found = []
         if self.measured is None:
             if self.delay == 0.0:
-                found.append("the delay is 0: no part of it is given; the gains are those of a loop without delay")
+                found.append("the delay is 0: no part of it is given; the gains hold for a loop without delay")
             return tuple(found)
         if abs(self.measured.scale - 1.0) > _SCALE_ERROR:
             found.append(

@@ -106,7 +106,7 @@ class PlacementResult(NamedTuple):
 
     @property
     def predicted_settling(self) -> list[int]:
-        """Frames to `settling_band` by theory, from the true start errors, with those of the coarse registration."""
+        """Frames to `settling_band` by theory from the true start errors; the coarse registration included."""
         counts = [predicted_settling(self.machine, each[0], self.settling_band) for each in self._servo_motion]
         return [self._landing_frames + each if each else 0 for each in counts]
 

@@ -26,7 +26,7 @@ Array = npt.NDArray[Any]
 
 RECORDING_FILES = ("recording.npy", "recording.toml")
 """Names of the files that `write_recording` writes."""
-# Largest difference of a transport from even steps, in steps. Chosen: far above rounding, far below what a scan shows.
+# Largest difference of a transport from even steps, in steps (chosen): far above rounding, below the noise of a scan.
 _EVEN = 1e-6
 _PAIRS = ("dark_after", "dark_before")
 _ENCODER_KEYS = ("encoder", "encoder_key", "encoder_bits")
@@ -78,7 +78,7 @@ def write_recording(
     """Write the simulated recording ``recording.npy``, and ``recording.toml``, with which a scan reads it.
 
     ``gpuvision scan FOLDER/recording.npy --sensor FOLDER/recording.toml --out DIR`` then has the same readings as the
-    simulation. The memory is that of a block of profiles.
+    simulation. The memory holds one block of profiles.
 
     Parameters
     ----------
@@ -135,8 +135,8 @@ def recording_sensor(task: SimulationTask, sensor_file: str | Path, *, noise: bo
     Returns
     -------
     str
-        The table of ``sensor_file`` with these changes: ``[transport] start`` and ``step`` are those of the simulated
-        profiles, and the keys of an encoder file are removed; without a noise model in ``[line]``, the noise of the
+        The table of ``sensor_file`` with these changes: ``[transport] start`` and ``step`` describe the simulated
+        profiles; the keys of an encoder file are removed; without a noise model in ``[line]``, the noise of the
         simulated camera is added, so that the scan predicts its errors; ``[recording] background`` is removed, because
         the frames show no background; names of files are absolute. Comments are lost.
 

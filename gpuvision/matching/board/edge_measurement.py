@@ -351,7 +351,7 @@ def _reason_of(fit: BoardPose, found: int, limits: MeasurementLimits) -> str:
 
 
 def _covariance_of(fit: BoardPose) -> Float64:
-    """Return the covariance of a pose. Small residuals do not reduce it: those of few edges may be small by chance."""
+    """Return the covariance of a pose; small residuals, which few edges may have by chance, do not reduce it."""
     # fmin: the residual scale is NaN without degrees of freedom, where the covariance follows from the sigmas alone.
     factor = np.fmin(float(to_numpy(fit.residual_scale)), 1.0)
     return np.asarray(np.asarray(to_numpy(fit.covariance), np.float64) / factor**2)

@@ -185,8 +185,8 @@ def predict_budget(machine: Machine, plan: PlacementPlan, frames: npt.ArrayLike 
     the frames by `PlacementPlan.reported`. The error of the bilinear sampling is not in the budget. "servo" is the
     rest of the step response that `ReleaseRule` allows, evenly distributed, and the step of the encoder. With the
     rule "vibration" an axis that swings adds a swing at a random phase, with the largest amplitude that the rule
-    allows. With the rule "fixed" the rest is that of start errors in the landing zone after the fixed time; a vibration
-    is not included.
+    allows. With the rule "fixed" the rest is the error that a start in the landing zone leaves after the
+    fixed time; a vibration is not included.
     """
     turn, tolerance = plan.camera_to_board, machine.tolerance
     zone = np.array([tolerance.landing_zone] * 2 + [tolerance.landing_angle])

@@ -104,7 +104,7 @@ class Settling:
     frequency, damping : (float, float, float), optional
         Frequencies [Hz] and damping ratios of the residual vibration of the steered head in x, y and theta, for the
         rule "vibration"; frequency 0 for an axis that does not swing. Take them from
-        `gpuvision.servoing.settling.vibration_of_loop`. Default: a simulation finds them in a move of its own; a real
+        `gpuvision.servoing.settling.vibration_of_loop`. Default: a simulation makes an extra move to find them; a real
         machine needs them.
     miss_probability : float
         Largest probability that the head leaves the tolerance after the release, for the rule "vibration". Default

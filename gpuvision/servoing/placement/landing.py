@@ -10,8 +10,8 @@ from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.artwork.board_reflectance import BoardReflectance
 from gpuvision.matching.pose.coarse_registration import CoarseRegistration
 from gpuvision.servoing.frames import compose_poses, invert_pose
+from gpuvision.servoing.placement.board_renderer import board_renderer
 from gpuvision.servoing.placement.machine import Machine
-from gpuvision.simulation.board_image.board_image import RenderBoard
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
 from gpuvision.status import Status
 
@@ -77,15 +77,7 @@ def refused_starts(
         nodes_per_pixel=_NODES,
         reflectance=reflectance,
     )
-    render = RenderBoard(
-        board=board,
-        shape=camera.window,
-        mirrored=camera.mirrored,
-        sensor=camera.sensor,
-        electrons=camera.white_electrons,
-        exposure=camera.exposure,
-        noise=False,
-    )
+    render = board_renderer(board, camera, noise=False)
     images = to_numpy(render(poses[:, None], np.zeros(len(poses), np.uint32), device=device).image)
     found = [landing(image, device=device).status for image in images]
     return [Status(each) for each in found if each]

@@ -269,7 +269,7 @@ class Machine:
         """
         camera = self.camera
         timing = camera.sensor.timing(camera.window, exposure=camera.exposure)
-        # The sensor counts its buffers at its highest rate, the machine reads it at its own.
+        # The buffers delay by frame times: the sensor counts its shortest frame time, the machine runs at `period`.
         buffers = camera.sensor.readout.buffers * (self.period - timing.period)
         return DelayBudget(
             period=self.period,

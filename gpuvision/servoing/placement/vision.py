@@ -13,9 +13,9 @@ from gpuvision.host import Device, to_numpy
 from gpuvision.matching.board.edge_measurement import move_view
 from gpuvision.servoing.frames import compose_poses, invert_pose, move_covariance
 from gpuvision.servoing.observer import SAME_TIME, PoseMeasurement
+from gpuvision.servoing.placement.board_renderer import board_renderer
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.plan import PlacementPlan
-from gpuvision.simulation.board_image.board_image import RenderBoard
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
 
 Float64 = npt.NDArray[np.float64]
@@ -82,16 +82,7 @@ class SimulatedCamera:
         device: Device | None = None,
         seed: int = 0,
     ) -> None:
-        camera = machine.camera
-        render = RenderBoard(
-            board=board,
-            shape=camera.window,
-            mirrored=camera.mirrored,
-            sensor=camera.sensor,
-            electrons=camera.white_electrons,
-            exposure=camera.exposure,
-            seed=seed,
-        )
+        render = board_renderer(board, machine.camera, seed=seed)
         self._bound = render.bind(Device.best() if device is None else device, (1, _SUBPOSES, 3), np.dtype(np.float64))
         delay = machine.delay
         self._period, self._latency, self._exposure = machine.period, delay.latency, delay.exposure

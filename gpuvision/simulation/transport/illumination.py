@@ -133,7 +133,7 @@ class LightSheet:
     -----
     In a bent sheet (``transport.bend``) light travels along the lines of constant G of the sheet, or from the source
     along straight lines in (G, H). Lit points lie on their surface and within 50 nm (``sheet_cut.BEND_ERROR``) of the
-    sheet. The direction of the light on a surface is that of the mean plane, which is wrong by the slope of the bend.
+    sheet. The light reaches a surface along the mean plane: its direction is wrong by the slope of the bend.
 
     References
     ----------

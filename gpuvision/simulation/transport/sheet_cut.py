@@ -76,8 +76,8 @@ class SheetIndex:
     """Triangles of a scene in the transport's coordinates, sorted so that a sheet's cuts are found quickly.
 
     A triangle with a corner in the sheet is cut as if the sheet were just before the corner. A triangle that lies in
-    the sheet is not cut. Instances are compared by identity. For a bent sheet the triangles are parts of those of the
-    scene.
+    the sheet is not cut. Instances are compared by identity. For a bent sheet each triangle is a part of a triangle of
+    the scene.
 
     Attributes
     ----------

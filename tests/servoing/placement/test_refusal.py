@@ -92,7 +92,7 @@ def test_the_coarse_registration_must_land_too() -> None:
     near = [(float(k), 0.0) for k in range(1, 7)]
     for last, is_found in ((3, True), (4, False)):
         limit = CAMERA[0] + (last - 0.5) * SIDE
-        lands = lambda pose, machine, limit=limit: bool(pose[0] > limit)  # noqa: E731
-        assert any("nearest target" in each for each in _said(_artwork(*near), _always, lands)) == is_found
+        said = _said(_artwork(*near), _always, lambda pose, machine, limit=limit: bool(pose[0] > limit))
+        assert any("nearest target" in each for each in said) == is_found
     said = _said(_artwork(), _always, lambda pose, machine: machine.camera.window[0] >= 1024)
     assert said[3] == "a window of 1024 x 1024 px instead of 512 x 512 px has enough"

@@ -104,7 +104,7 @@ def check_host(array: HostArray, shape: tuple[int, ...], dtype: np.dtype[Any], w
     TypeError
         The dtype differs, or the array is masked: a kernel does not see the mask.
     ValueError
-        The shape differs, or the array is not C-contiguous.
+        The shape differs, or the array is not C-contiguous or not aligned to its dtype.
     """
     if isinstance(array, np.ma.MaskedArray):
         raise TypeError(f"{what}: expected a plain array, got a masked array; fill it with .filled(value), such as NaN")
@@ -112,5 +112,8 @@ def check_host(array: HostArray, shape: tuple[int, ...], dtype: np.dtype[Any], w
         raise TypeError(f"{what}: expected dtype {dtype}, got {array.dtype}; convert it with .astype")
     if array.shape != shape:
         raise ValueError(f"{what}: expected shape {shape}, got {array.shape}")
-    if not array.flags.c_contiguous:
+    flags = array.flags
+    if not flags.c_contiguous:
         raise ValueError(f"{what}: expected a C-contiguous array; use np.ascontiguousarray")
+    if not flags.aligned:
+        raise ValueError(f"{what}: expected an array aligned to {dtype}; use np.require(array, requirements='A')")

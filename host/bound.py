@@ -14,7 +14,7 @@ import pyopencl.array
 
 from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
 from gpuvision.host.device import Device
-from gpuvision.host.launch import Launchable, Spec
+from gpuvision.host.launch import Launchable, Spec, check_counts
 from gpuvision.host.program import build
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -60,6 +60,7 @@ class Bound(Generic[R]):
         inputs: Sequence[DeviceArray] = (),
     ) -> None:
         launch = operation.launch(device, shape, dtype)
+        check_counts(type(operation).__name__, launch)
         self.operation, self.device = operation, device
         self.queue = device.queue if queue is None else queue
         self._launch = launch

@@ -172,9 +172,27 @@ class Device:
         if not isinstance(handle, cl.CommandQueue):
             kind = type(handle).__name__
             raise TypeError(f"expected a pyopencl queue, context or array to take the device from, got {kind}")
-        if handle.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE:
-            raise ValueError("the queue runs out of order; operations follow each other, expected an in-order queue")
+        _check_order(handle)
         return _adopt(handle)
+
+    def check_queue(self, queue: Any) -> None:
+        """Check that operations on this device can run in a queue.
+
+        Raises
+        ------
+        TypeError
+            The object is no queue.
+        ValueError
+            The queue belongs to another context or device, or it runs out of order.
+        """
+        if not isinstance(queue, cl.CommandQueue):
+            raise TypeError(f"expected a pyopencl queue, got {type(queue).__name__}; Device.new_queue makes one")
+        if queue.context != self.context or queue.device not in (self.handle, self.inline_device):
+            raise ValueError(
+                f"the queue belongs to another context than device {self.label}; use a queue of device.new_queue(), or "
+                "the device Device.of(queue)"
+            )
+        _check_order(queue)
 
     def wait(self, event: Any) -> None:
         """Wait for an event with the least delay.
@@ -274,6 +292,11 @@ class Device:
         size = max(int(np.prod(shape, dtype=np.int64)) * dtype.itemsize, 1)
         memory = cl.SVMAllocation(self.context, size, 0, SHARED_FLAGS, queue)
         return cl.array.Array(queue, shape, dtype, data=memory)
+
+
+def _check_order(queue: Any) -> None:
+    if queue.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE:
+        raise ValueError("the queue runs out of order; operations follow each other, expected an in-order queue")
 
 
 def _has_fine_grained_memory(handle: Any) -> bool:

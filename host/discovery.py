@@ -39,7 +39,14 @@ _KINDS = {
     "apple": "apple",
 }
 _PREFERRED = ("pocl", "intel")
+# Drivers that run on GPUs of several makers: the maker's driver comes first.
+_GENERIC_GPU_DRIVERS = ("pocl-gpu", "rusticl")
 _SIMULATORS = ("oclgrind",)
+# Reasons of a device or machine that is busy: the next process probes again. 137: the system stopped the process.
+_BUSY = re.compile(
+    "did not finish within|exit (-9|137):|"
+    "OUT_OF_RESOURCES|OUT_OF_HOST_MEMORY|MEM_OBJECT_ALLOCATION_FAILURE|DEVICE_NOT_AVAILABLE"
+)
 
 
 @dataclass(frozen=True)
@@ -111,6 +118,8 @@ class ProbedDevice(ListedDevice):
         """Advice to the user about an unhealthy device."""
         if self.healthy:
             return ""
+        if _BUSY.search(self.reason):
+            return "the device or the machine is busy; start again when it is idle: the verdict is not kept"
         if self.kind == "pocl" and "debian" not in self.driver:
             return (
                 "this PoCL does not suit the processor; use Debian's (as root: apt-get install pocl-opencl-icd) "
@@ -119,18 +128,32 @@ class ProbedDevice(ListedDevice):
         return f"update or remove this driver; meanwhile {INSTALL_HINT}"
 
     @property
-    def rank(self) -> tuple[bool, int, str]:
-        """Sort key of the preference: GPUs, PoCL, Intel's CPU runtime, other devices, simulators."""
+    def rank(self) -> tuple[int, ...]:
+        """Sort key of the preference: GPUs, PoCL, Intel's CPU runtime, other devices, simulators.
+
+        Among GPUs, the maker's driver precedes a generic driver, a GPU with memory of its own precedes a GPU that uses
+        the host's memory, and then the number of compute units and the size of the memory decide. Compute units of
+        different makers differ in size; the order among them is a guess, which ``GPUVISION_DEVICE`` replaces.
+        """
         place = _PREFERRED.index(self.kind) if self.kind in _PREFERRED else len(_PREFERRED)
-        return (not self.is_gpu, place + len(_PREFERRED) * (self.kind in _SIMULATORS), self.label)
+        return (
+            not self.is_gpu,
+            self.is_gpu and self.kind in _GENERIC_GPU_DRIVERS,
+            place + len(_PREFERRED) * (self.kind in _SIMULATORS),
+            self.is_gpu and bool(self.handle.host_unified_memory),
+            -int(self.handle.max_compute_units),
+            -int(self.handle.global_mem_size),
+            self.platform_index,
+            self.device_index,
+        )
 
 
 def kind_of(handle: Any) -> str:
-    """Return the kind of a device: ``pocl``, ``intel``, ``intel-gpu``, ``nvidia``, ..."""
+    """Return the kind of a device: ``pocl``, ``pocl-gpu``, ``intel``, ``intel-gpu``, ``nvidia``, ..."""
     words = f"{handle.platform.name} {handle.platform.vendor} {handle.vendor}".lower()
     other = (handle.platform.name.lower().split() or ["unknown"])[0]
     kind = next((short for word, short in _KINDS.items() if word in words), other)
-    return f"{kind}-gpu" if kind == "intel" and handle.type & cl.device_type.GPU else kind
+    return f"{kind}-gpu" if kind in ("intel", "pocl") and handle.type & cl.device_type.GPU else kind
 
 
 def _key(handle: Any, twin: int) -> str:
@@ -243,7 +266,7 @@ def probed_devices(*, probe_again: bool = False) -> tuple[ProbedDevice, ...]:
     Notes
     -----
     Verdicts are cached in the user's cache folder for each driver version. The first call on a machine takes about a
-    second per device.
+    second per device. The verdict of a busy device (no memory, no end within the time limit) is not cached.
     """
     if probe_again:
         _probed_devices.cache_clear()
@@ -258,8 +281,9 @@ def _probed_devices(*, trust_bad: bool) -> tuple[ProbedDevice, ...]:
     for each in listed:
         if each.key not in known:
             fresh[each.key] = _ask_probe(each.platform_index, each.device_index)
-    if fresh:
-        _keep_verdicts(fresh)
+    lasting = {key: reason for key, reason in fresh.items() if not _BUSY.search(reason)}
+    if lasting:
+        _keep_verdicts(lasting)
     verdicts = known | fresh
     return tuple(_with_verdict(each, _one_line(verdicts[each.key])) for each in listed)
 

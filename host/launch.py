@@ -18,6 +18,9 @@ Variant = Literal["auto", "vector", "work_item"]
 Shape = tuple[int, ...]
 Spec = tuple[Shape, np.dtype[Any]]
 
+# Most elements of an array and most work-items of a launch: kernels count with int.
+MAX_COUNT = (1 << 31) - 1
+
 
 @dataclass(frozen=True)
 class Launch:
@@ -64,6 +67,28 @@ class Launch:
     def nbytes(self) -> int:
         """Bytes of inputs and outputs."""
         return nbytes_of((*self.inputs, *self.outputs.values()))
+
+
+def check_counts(name: str, launch: Launch) -> None:
+    """Check that a kernel can count the elements of its arrays and its work-items in 32-bit integers.
+
+    Raises
+    ------
+    ValueError
+        An array has more than `MAX_COUNT` elements, or the launch more work-items.
+    """
+    for spec in (*launch.inputs, *launch.outputs.values()):
+        if spec is not None and math.prod(spec[0]) > MAX_COUNT:
+            raise ValueError(
+                f"{name}: an array of shape {tuple(spec[0])} has more than {MAX_COUNT} elements, which kernels "
+                "count in 32 bits; split the input"
+            )
+    items = math.prod(launch.global_size)
+    if items > MAX_COUNT:
+        raise ValueError(
+            f"{name}: input of shape {tuple(launch.inputs[0][0])} takes {items} work-items, more than {MAX_COUNT}, "
+            "which kernels count in 32 bits; split the input"
+        )
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,18 @@ class LaunchBuilder:
 
     @functools.cached_property
     def real(self) -> np.dtype[Any]:
-        """Floating-point type of the arithmetic and the outputs."""
+        """Floating-point type of the arithmetic and the outputs.
+
+        Raises
+        ------
+        TypeError, ValueError
+            The operation does not take float64 input in single precision, or the device has no double precision.
+        """
+        if self.dtype == np.float64 and not self.device.has_double:
+            raise ValueError(
+                f"{self.name}: device {self.device.label} has no double precision and reads no float64 input; "
+                "give float32 input (array.astype(np.float32))"
+            )
         return real_of(self._precision, self.dtype, narrows=self._narrows)
 
     @property

@@ -107,7 +107,7 @@ class Operation(Generic[R]):
         dtype : dtype
             Dtype of the (first) input, in native byte order.
         queue : pyopencl.CommandQueue, optional
-            Queue to run in; the device's default queue otherwise.
+            In-order queue of the device's context to run in; the device's default queue otherwise.
         inputs : sequence of pyopencl.array.Array
             Arrays that calls without arguments read, such as results of another operation; by default new arrays.
 
@@ -119,7 +119,7 @@ class Operation(Generic[R]):
         Raises
         ------
         TypeError, ValueError
-            The operation does not take such input.
+            The operation does not take such input, or the queue is of another context or runs out of order.
         BuildError
             The kernel does not compile on this device.
         """
@@ -137,6 +137,8 @@ class Operation(Generic[R]):
     ) -> Bound[R]:
         """Return a bound instance; a short launch is built for the queue only when it first waits for an event."""
         device, dtype = _device(device), np.dtype(dtype)
+        if queue is not None:
+            device.check_queue(queue)
         if not dtype.isnative:
             raise TypeError(
                 f"expected native byte order, got {dtype.str}; convert it with .astype(dtype.newbyteorder('='))"

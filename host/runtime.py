@@ -23,18 +23,25 @@ SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
 _VARIABLE = "OCL_ICD_VENDORS"
 _ENTRY = "gpuvision-intel.icd"
 _DRIVER = "libintelocl.so"
+# Variables that limit the number of PoCL's workers, by version.
+_WORKER_COUNTS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT", "POCL_MAX_COMPUTE_UNITS")
 _POCL_3 = re.compile(r"libpocl\.so\.2\.(9|10)\.")  # 3.0 and 3.1
 # The driver finds these libraries by name only: they must be loaded before the driver is.
 _SIBLINGS = ("libintlc.so.5", "libirng.so", "libimf.so", "libsvml.so")
 
 
 def pin_workers() -> None:
-    """Make PoCL pin each worker thread to a core, unless the user has set ``POCL_AFFINITY``.
+    """Make PoCL pin each worker thread to a core, where it has one worker for each core of the machine.
 
     While Python works on one core of a two-core machine, Linux puts both worker threads on the other core, where they
-    take turns: kernels took 1.7 times as long (measured). Must run before the first platform query.
+    take turns: kernels took 1.7 times as long (measured). PoCL pins worker k to core k of the machine. With fewer
+    workers than cores, all processes would share the first cores, and a process that is restricted to some cores would
+    have workers on other cores: the function does nothing there, and nothing where the user has set
+    ``POCL_AFFINITY``. Must run before the first platform query.
     """
-    os.environ.setdefault("POCL_AFFINITY", "1")
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
+    if usable == os.cpu_count() and not any(os.environ.get(name) for name in _WORKER_COUNTS):
+        os.environ.setdefault("POCL_AFFINITY", "1")
 
 
 def request_inline_device() -> None:

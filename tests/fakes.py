@@ -14,6 +14,9 @@ class FakeDevice:
     driver_version: str = "1.0"
     extensions: str = ""
     type: int = cl.device_type.CPU
+    max_compute_units: int = 2
+    global_mem_size: int = 8 << 30
+    host_unified_memory: bool = True
     platform: FakePlatform | None = None
 
 

@@ -26,6 +26,7 @@ from gpuvision.host import (
     StatusArray,
     WorkSize,
     flags,
+    padded_groups,
     type_defines,
 )
 from gpuvision.operation import VisionOperation
@@ -33,6 +34,8 @@ from gpuvision.validation import finite, integer
 
 R = TypeVar("R", bound=tuple[Any, ...])
 Direction = Literal["x", "-x", "y", "-y"]
+# Work-items of a group on a GPU: two warps, since lines of unlike length keep each other waiting in larger groups.
+_GROUP = 64
 _DIRECTIONS = ("x", "-x", "y", "-y")
 MAX_MAP_CELLS = 1 << 26
 """Largest number of cells of a height map. Chosen: bounds the memory, 256 MiB of float32 heights."""
@@ -322,6 +325,7 @@ class RegridCounts(NamedTuple):
     out_line_pitch: int
     out_cell_pitch: int
     drop_folded: int
+    lines: int
 
 
 class RegridTable(NamedTuple):
@@ -401,7 +405,7 @@ class _Pass(VisionOperation[R]):
             "regrid/regrid.cl",
             "resample",
             # A CPU runtime that runs several lines in one group spills the state of each line.
-            work=WorkSize((lines,), (1,) if build.device.is_cpu else None),
+            work=WorkSize((lines,), (1,)) if build.device.is_cpu else padded_groups(lines, _GROUP),
             more_inputs=[value, value, (build.shape, np.dtype(np.uint8)), *([value] * (with_other + with_sigma))],
             outputs=build.outputs(made_by_name),
             defines=type_defines("INPUT", build.dtype) | flags(WITH_OTHER=with_other, WITH_SIGMA=with_sigma),
@@ -433,6 +437,7 @@ class _AlongSamples(_Pass[_Lines]):
             out_line_pitch=cells,
             out_cell_pitch=1,
             drop_folded=0,
+            lines=profiles,
         )
         return self._resample(build, profiles, (profiles, cells), counts, with_other=True)
 
@@ -458,5 +463,6 @@ class _AlongProfiles(_Pass[HeightMap]):
             out_line_pitch=line_pitch,
             out_cell_pitch=cell_pitch,
             drop_folded=int(self.regrid.folded == "drop"),
+            lines=lines,
         )
         return self._resample(build, lines, self.regrid.grid.shape, counts, with_other=False)

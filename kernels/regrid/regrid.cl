@@ -25,6 +25,7 @@
 typedef struct {
     uint samples, line_pitch, sample_pitch, cells, out_line_pitch, out_cell_pitch;
     uint drop_folded; // whether NOT_INVERTIBLE cells have no value
+    uint lines;       // the work-items beyond the last line do nothing
 } RegridCounts;
 
 // Grid: RegridTable in regrid.py.
@@ -121,6 +122,7 @@ kernel void resample(global const INPUT *restrict along, global const INPUT *res
                      global uchar *restrict out_status, global real *restrict out_sigma,
                      global real *restrict out_other, constant RegridCounts *count, constant RegridTable *grid) {
     const ulong line = get_global_id(0);
+    if (line >= count->lines) return;
     const ulong in = line * count->line_pitch, out = line * count->out_line_pitch;
     const real sense = grid->sense, tolerance = grid->fold_tolerance;
     clear_cells(out_height, out_intensity, out_sigma, out_other, out_status, out, count, 0, STATUS_NO_DATA);

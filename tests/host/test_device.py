@@ -14,8 +14,10 @@ import pytest
 from fakes import FakeDevice, FakePlatform
 from gpuvision.host import Device, DeviceUnusableError, NoDeviceError, discovery, host_view
 from gpuvision.host import device as module
+from gpuvision.ranging.psd import PsdReadout
 
 Paper = Callable[..., None]
+READOUT = PsdReadout(strip_length=6e-3)
 
 
 @pytest.fixture
@@ -207,3 +209,23 @@ def test_empty(device: Device, shape: tuple[int, ...]) -> None:
 def test_empty_on_another_queue(device: Device) -> None:
     queue = device.new_queue()
     assert device.empty((4,), np.uint8, queue).queue == queue
+
+
+def test_queue_of_another_context_is_refused(device: Device) -> None:
+    queue = cl.CommandQueue(cl.Context([device.handle]))
+    with pytest.raises(ValueError, match=f"belongs to another context than device {device.label}"):
+        READOUT.bind(device, (4, 2), np.float32, queue=queue)
+
+
+def test_queue_without_order_is_refused(device: Device) -> None:
+    out_of_order = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
+    queue = cl.CommandQueue(device.context, device.handle, properties=out_of_order)
+    with pytest.raises(ValueError, match="out of order"):
+        READOUT.bind(device, (4, 2), np.float32, queue=queue)
+    with pytest.raises(ValueError, match="out of order"):
+        Device.of(queue)
+
+
+def test_object_that_is_no_queue_is_refused(device: Device) -> None:
+    with pytest.raises(TypeError, match=r"expected a pyopencl queue, got Context; Device\.new_queue"):
+        READOUT.bind(device, (4, 2), np.float32, queue=device.context)

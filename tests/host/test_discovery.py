@@ -80,6 +80,7 @@ def test_twins_are_each_asked(see: Any) -> None:
     ("platform", "vendor", "gpu", "kind"),
     [
         ("Portable Computing Language", "The pocl project", False, "pocl"),
+        ("Portable Computing Language", "The pocl project", True, "pocl-gpu"),
         ("Intel(R) OpenCL", "Intel(R) Corporation", False, "intel"),
         ("Intel(R) OpenCL Graphics", "Intel(R) Corporation", True, "intel-gpu"),
         ("NVIDIA CUDA", "NVIDIA Corporation", True, "nvidia"),
@@ -100,6 +101,63 @@ def test_order_of_preference(see: Any) -> None:
     see(*(FakePlatform(name, vendor="") for name in names), gpu)
     ranked = sorted(discovery.probed_devices(), key=lambda each: each.rank)
     assert [each.kind for each in ranked] == ["nvidia", "pocl", "intel", "other", "oclgrind"]
+
+
+@pytest.mark.parametrize(
+    ("better", "worse"),
+    [
+        ({"max_compute_units": 80}, {"max_compute_units": 16}),
+        ({"global_mem_size": 16 << 30}, {"global_mem_size": 4 << 30}),
+        ({"host_unified_memory": False, "max_compute_units": 40}, {"max_compute_units": 96}),
+    ],
+)
+def test_larger_gpu_comes_first_whatever_its_label(see: Any, better: dict[str, Any], worse: dict[str, Any]) -> None:
+    def gpu(**properties: Any) -> FakeDevice:
+        return FakeDevice(type=cl.device_type.GPU, **properties)
+
+    see(FakePlatform("AMD", devices=[gpu(**worse)]), FakePlatform("NVIDIA CUDA", devices=[gpu(**better)]))
+    assert min(discovery.probed_devices(), key=lambda each: each.rank).kind == "nvidia"
+    see(FakePlatform("AMD", devices=[gpu(**better)]), FakePlatform("NVIDIA CUDA", devices=[gpu(**worse)]))
+    assert min(discovery.probed_devices(), key=lambda each: each.rank).kind == "amd"
+
+
+def test_gpus_alike_rank_as_listed(see: Any) -> None:
+    """Labels sort nvidia:10 before nvidia:2."""
+    see(FakePlatform("NVIDIA CUDA", devices=[FakeDevice(type=cl.device_type.GPU) for _ in range(11)]))
+    ranked = sorted(discovery.probed_devices(), key=lambda each: each.rank)
+    assert [each.device_index for each in ranked] == [*range(11)]
+
+
+def test_driver_of_the_maker_precedes_pocl_on_a_gpu(see: Any) -> None:
+    gpu = cl.device_type.GPU
+    see(
+        FakePlatform(devices=[FakeDevice("NVIDIA A2", type=gpu, max_compute_units=99)]),
+        FakePlatform("NVIDIA CUDA", vendor="NVIDIA", devices=[FakeDevice("NVIDIA A2", type=gpu)]),
+        FakePlatform(devices=[FakeDevice()]),
+    )
+    ranked = sorted(discovery.probed_devices(), key=lambda each: each.rank)
+    assert [each.label for each in ranked] == ["nvidia", "pocl-gpu", "pocl"]
+
+
+@pytest.mark.parametrize(
+    "reason",
+    [
+        "clCreateContext failed: OUT_OF_RESOURCES",
+        "clEnqueueNDRangeKernel failed: MEM_OBJECT_ALLOCATION_FAILURE",
+        "clBuildProgram failed: OUT_OF_HOST_MEMORY",
+        "clCreateContext failed: DEVICE_NOT_AVAILABLE",
+        "the probe kernel did not finish within 120 s",
+        "the runtime ended the probe's process (exit -9: no message)",
+    ],
+)
+def test_verdict_of_a_busy_device_is_not_kept(see: Any, reason: str) -> None:
+    see(FakePlatform(), probe=lambda p, d: reason)
+    (busy,) = discovery.probed_devices()
+    assert (busy.healthy, busy.reason) == (False, reason)
+    assert "start again when it is idle" in busy.advice
+    probed = see(FakePlatform())
+    assert discovery.probed_devices()[0].healthy
+    assert probed == [(0, 0)]
 
 
 def test_inline_device_is_listed_with_the_device_it_belongs_to(see: Any) -> None:

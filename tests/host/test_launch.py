@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 import pytest
 
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.host import (
     Device,
     Launch,
@@ -28,6 +32,9 @@ from gpuvision.host import (
     type_defines,
     vector_work,
 )
+from gpuvision.host.launch import check_counts
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.psd import PsdReadout
 
 SINGLE, DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 
@@ -210,6 +217,11 @@ def test_doubles_need_a_device_with_doubles() -> None:
     single = Machine(has_double=False)
     build = builder((3,), np.float64, machine=single)
     build.check_dtype("float64", of="points")
+    with pytest.raises(ValueError, match=r"^Scale: device machine has no double .*; give float32 input \(array"):
+        build.launch("a.cl", "a", work=build.work(3, each=16, group=64), outputs={})
+    with pytest.raises(ValueError, match="give float32 input"):
+        _ = builder((3,), np.float64, machine=single, precision="single").real
+    build = builder((3,), machine=single, precision="double")
     with pytest.raises(ValueError, match="machine has no double precision; use precision='single'"):
         build.launch("a.cl", "a", work=build.work(3, each=16, group=64), outputs={})
     with pytest.raises(ValueError, match="give points as float32"):
@@ -240,3 +252,50 @@ def test_offsets_of_a_table_with_parts_of_several_sizes() -> None:
     offsets = table_offsets("NODE", {"centre": 3, "radius": 1, "normal": 3})
     assert offsets == {"NODE_CENTRE": 0, "NODE_RADIUS": 3, "NODE_NORMAL": 4, "NODE_SIZE": 7}
     assert table_offsets("EMPTY", {}) == {"EMPTY_SIZE": 0}
+
+
+@pytest.mark.parametrize(
+    ("shape", "work", "message"),
+    [
+        ((1 << 31,), (64,), r"^Scale: an array of shape \(2147483648,\) has more than 2147483647 elements"),
+        ((1 << 16, 1 << 16), (64,), r"shape \(65536, 65536\) has more than"),
+        ((3,), (1 << 26, 64), r"^Scale: input of shape \(3,\) takes 4294967296 work-items, more than 2147483647"),
+    ],
+)
+def test_counts_beyond_32_bits_are_refused(shape: tuple[int, ...], work: tuple[int, ...], message: str) -> None:
+    launch = builder(shape).launch("a.cl", "a", work=WorkSize(work, None), outputs={"sum": ((3,), SINGLE)})
+    with pytest.raises(ValueError, match=message):
+        check_counts("Scale", launch)
+    outputs = builder((3,)).launch("a.cl", "a", work=WorkSize((64,), None), outputs={"x": None, "sum": (shape, SINGLE)})
+    if shape != (3,):
+        with pytest.raises(ValueError, match=f"shape {re.escape(str(shape))} has more than"):
+            check_counts("Scale", outputs)
+
+
+def test_largest_count_is_allowed() -> None:
+    launch = builder(((1 << 31) - 1,)).launch("a.cl", "a", work=WorkSize(((1 << 31) - 1,), None), outputs={})
+    check_counts("Scale", launch)
+
+
+def test_a_batch_of_too_many_samples_is_refused_before_its_memory_is_taken(device: Device) -> None:
+    camera = Camera(matrix=((9.0, 0.0, 4.0), (0.0, 9.0, 4.0), (0.0, 0.0, 1.0)))
+    with pytest.raises(ValueError, match=r"UndistortPoints: an array of shape \(1073741824, 2\).*; split the input"):
+        UndistortPoints(model=camera).bind(device, (1 << 30, 2), np.float32)
+
+
+ODD = 1_000_003  # a prime: without padding, no group of more than one work-item divides it
+
+
+@pytest.mark.parametrize(
+    ("operation", "shape", "dtype"),
+    [
+        (PsdReadout(strip_length=6e-3), (ODD, 2), np.float32),
+        (LineReadout(threshold=20), (64, ODD), np.uint8),
+    ],
+)
+def test_odd_sizes_run_in_whole_groups(operation: Any, shape: tuple[int, ...], dtype: Any) -> None:
+    launch = operation.launch(Machine(is_cpu=False), shape, np.dtype(dtype))
+    assert launch.local_size is not None
+    assert math.prod(launch.local_size) >= 32
+    assert all(each % group == 0 for each, group in zip(launch.global_size, launch.local_size, strict=True))
+    assert math.prod(launch.global_size) < 1.001 * ODD

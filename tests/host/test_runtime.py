@@ -129,10 +129,35 @@ def test_inline_device_is_requested_where_its_name_is_known(
     assert os.environ["POCL_DEVICES"] == "pthread", "the user decided"
 
 
-def test_workers_are_pinned_unless_the_user_decided(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Simulate a machine of four cores without settings of PoCL."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1, 2, 3})
+    for name in ("POCL_AFFINITY", *runtime._WORKER_COUNTS):
+        monkeypatch.setenv(name, "")  # removed again after the test
+        monkeypatch.delenv(name)
+
+
+def test_workers_are_pinned_unless_the_user_decided(cores: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("POCL_AFFINITY", "0")
     runtime.pin_workers()
     assert os.environ["POCL_AFFINITY"] == "0"
     monkeypatch.delenv("POCL_AFFINITY")
     runtime.pin_workers()
     assert os.environ["POCL_AFFINITY"] == "1"
+
+
+@pytest.mark.parametrize("name", runtime._WORKER_COUNTS)
+def test_few_workers_are_not_pinned(cores: None, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """PoCL pins the one worker of each process to the first core."""
+    monkeypatch.setenv(name, "1")
+    runtime.pin_workers()
+    assert "POCL_AFFINITY" not in os.environ
+
+
+def test_workers_of_a_restricted_process_are_not_pinned(cores: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """PoCL pins worker k to core k, also where the process may not run there."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {2, 3})
+    runtime.pin_workers()
+    assert "POCL_AFFINITY" not in os.environ

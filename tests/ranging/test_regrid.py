@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 
@@ -46,6 +47,16 @@ def test_a_plane_is_resampled_exactly(device, dtype, transposed):
     # On a plane, linear interpolation has only rounding errors: a few operations with numbers up to 10.
     np.testing.assert_allclose(made.z, x + y / 2, rtol=0, atol=8 * 2 * np.finfo(dtype).eps)
     np.testing.assert_allclose(made.intensity, 10 * x, rtol=0, atol=8 * 10 * np.finfo(dtype).eps)
+
+
+def test_groups_of_a_gpu_skip_the_lines_beyond_the_last(device):
+    """1 000 003 lines run in whole groups; lines that do not fill a group give the same map."""
+    gpu = copy.copy(device)
+    gpu.is_cpu = False
+    launch = OP._along_samples().launch(gpu, (1_000_003, 8), np.dtype(np.float32))
+    assert (launch.global_size, launch.local_size) == ((1_000_064,), (64,))
+    frames = flat((67, 61), np.float32)
+    close(OP(*frames, device=gpu), OP(*frames, device=device), 0.0)
 
 
 @pytest.mark.parametrize("directions", [("x", "y"), ("-x", "y"), ("x", "-y"), ("-y", "-x"), ("y", "x")])

@@ -2,8 +2,8 @@
 
 A process renders frames of a board at a fixed rate, 128 x 128 to 256 x 256 pixels with the noise of a sensor, and moves
 the camera as commanded (`gpuvision.profiling.servo_camera`). This process sleeps, polls shortly before the next frame,
-measures 60 calipers (rulers; 48 in the smallest frame) at the predicted pose (`FeatureSet.bind`), updates the observer,
-computes the command, and writes it. The time of a frame runs from its publication until its command.
+measures 60 calipers (rulers) at the predicted pose (`FeatureSet.bind`), updates the observer, computes the command,
+and writes it. The time of a frame runs from its publication until its command.
 
 A frame is missed if a newer frame was published before it was taken. The frames of the camera are at least three
 quarters of a period apart. A missed frame counts as interrupted if the frame before it needed less processor time than

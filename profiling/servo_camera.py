@@ -24,7 +24,7 @@ from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
 TARGET = np.array([3e-3, 3e-3, 0.0])  # pose of the camera that the loop holds [m, m, rad]
 START = np.array([15e-6, -12e-6, 1.5e-3])  # distance of the first pose from it
 PIXEL = 10e-6  # m
-_PAD, _PITCH = 0.3e-3, 0.55e-3  # m
+_PAD, _PITCH = 0.3e-3, 0.45e-3  # m: 60 rulers have room in a frame of 128 x 128 px
 _SLOTS = 4  # frames in shared memory
 _TIMES = 4096  # times of the newest frames in shared memory
 _READY_S = 120.0  # longest start of the other process: it compiles the renderer

@@ -53,7 +53,8 @@ def test_regions_have_enough_rulers() -> None:
     artwork = servo.board()
     for size in servo.SIZES:
         features = servo.features_of(artwork, size)
-        assert len(features.length) == (48 if size == 128 else servo.RULERS)
+        assert len(features.length) == servo.RULERS == 60
+        assert features.imaging.width_px == 5
         assert max(features.region_px) <= size
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from gpuvision.host.errors import GpuVisionError, ReadError
+from gpuvision.host.errors import GpuVisionError, ReadError, RecordingError
 from gpuvision.host.text import printable
 
 _LONGEST_REASON = 200  # characters: a reason stays readable in a line
@@ -93,6 +93,19 @@ def check_pixels(shape: tuple[int, ...], what: str, error: type[Exception] = Rea
     """
     rows, columns = (*shape, 1)[:2] if shape else (1, 1)
     MAX_PIXELS.check(int(rows) * int(columns), f"{what}: {columns} x {rows} pixels", error)
+
+
+def check_frames(path: Path, shape: tuple[int, ...]) -> None:
+    """Check the shape of an array of frames.
+
+    Raises
+    ------
+    RecordingError
+        The array has fewer than 2 axes or no element, or a frame has more pixels than `MAX_PIXELS`.
+    """
+    if len(shape) < 2 or 0 in shape:
+        raise RecordingError(f"{path}: expected frames along the first of 2 or more axes, got shape {shape}")
+    check_pixels(shape[1:], f"{path}: a frame", RecordingError)
 
 
 def check_archive(path: Path, error: type[Exception] = ReadError) -> None:

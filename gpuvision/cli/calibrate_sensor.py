@@ -21,7 +21,7 @@ from gpuvision.cli.arguments import (
 
 if TYPE_CHECKING:
     from gpuvision.camera.calibration import Calibration
-    from gpuvision.host.recordings import Channel as RecordingChannel
+    from gpuvision.host.channels import Channel as RecordingChannel
     from gpuvision.workflows.calibrating_sensor import BlockViews, TransportViews
     from gpuvision.workflows.sensor_calibration_result import SensorCalibration
 
@@ -237,7 +237,7 @@ def _check_place(out: Path, options: SensorOptions) -> None:
 
 
 def _checked_channel(name: str | None) -> RecordingChannel:
-    from gpuvision.host.recordings import CHANNELS
+    from gpuvision.host.channels import CHANNELS
 
     for each in CHANNELS:
         if each == (name or "grey"):

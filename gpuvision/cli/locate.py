@@ -168,7 +168,7 @@ def locate(
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size, read_lens
     from gpuvision.host import Device
-    from gpuvision.host.recordings import read_image
+    from gpuvision.host.image_files import read_image
     from gpuvision.plots.board import draw_located_board
     from gpuvision.workflows.locating_board import locate_board
 

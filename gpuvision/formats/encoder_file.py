@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.host.array_files import read_array
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.reading import FileLimit, check_archive, one_line, reading
-from gpuvision.host.recordings import read_array
 
 Float64 = npt.NDArray[np.float64]
 

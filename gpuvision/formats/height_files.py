@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from gpuvision.formats.range_image import HeightFile, read_npz, read_png16, read_tiff, states_grid
 from gpuvision.host.errors import ReadError
+from gpuvision.host.image_files import read_image
 from gpuvision.host.reading import check_pixels, reading
-from gpuvision.host.recordings import read_image
 from gpuvision.ranging.regrid import Grid
 from gpuvision.validation import finite
 

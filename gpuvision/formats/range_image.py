@@ -30,8 +30,9 @@ import tifffile
 from gpuvision.host import DeviceArray, to_numpy
 from gpuvision.host.errors import ReadError
 from gpuvision.host.files import atomic_write
+from gpuvision.host.image_files import read_image
 from gpuvision.host.reading import check_archive, reading
-from gpuvision.host.recordings import check_tiff_page, read_image
+from gpuvision.host.tiff_files import check_tiff_page
 from gpuvision.ranging.regrid import Grid
 
 _GRID_KEYS = ("left", "top", "cell_x", "cell_y")

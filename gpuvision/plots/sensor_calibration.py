@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
-from gpuvision.host.recordings import read_frame
+from gpuvision.host.image_files import read_frame
 from gpuvision.plots.figure import new_figure, write_png
 
 Float64 = npt.NDArray[np.float64]

@@ -45,7 +45,7 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host.recordings import CHANNELS, Channel
+from gpuvision.host.channels import CHANNELS, Channel
 from gpuvision.ranging.focus_stack import FocusStack
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.polygon_scan import PolygonScan

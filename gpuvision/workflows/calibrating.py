@@ -32,8 +32,8 @@ from gpuvision.formats.camera_file import covariance_table, write_lens
 from gpuvision.formats.json import json_tree
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import write_text_atomic
+from gpuvision.host.image_files import read_image
 from gpuvision.host.outputs import Outputs
-from gpuvision.host.recordings import read_image
 from gpuvision.plots.calibration import draw_calibration
 
 # Points, and part of the image that they cover, from which "no lens distortion" may be concluded. Derived: a grid of

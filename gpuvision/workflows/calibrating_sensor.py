@@ -22,7 +22,8 @@ from gpuvision.camera.lines.line_statistics import Loss
 from gpuvision.camera.views.target_views import make_view
 from gpuvision.formats.known_points_file import read_known_points
 from gpuvision.host import Device
-from gpuvision.host.recordings import Channel, image_files
+from gpuvision.host.channels import Channel
+from gpuvision.host.image_files import image_files
 from gpuvision.ranging.sensor_geometry import SensorGeometry
 from gpuvision.ranging.sheet_calibration import fit_sheet
 from gpuvision.ranging.sheet_from_points import sheet_from_points

@@ -14,8 +14,9 @@ import numpy.typing as npt
 
 from gpuvision.camera.calibration import DetectedTarget
 from gpuvision.host import Device, to_numpy
+from gpuvision.host.channels import Channel
 from gpuvision.host.errors import RecordingError
-from gpuvision.host.recordings import Channel, image_files, read_frame
+from gpuvision.host.image_files import image_files, read_frame
 from gpuvision.normal_distribution import MAD_TO_SIGMA
 from gpuvision.ranging.background import line_threshold, noise_threshold
 from gpuvision.ranging.line import LineReadout

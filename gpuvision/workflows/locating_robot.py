@@ -26,9 +26,10 @@ from gpuvision.camera.image import grey_image
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device
+from gpuvision.host.array_files import read_array
 from gpuvision.host.errors import RecordingError
+from gpuvision.host.image_files import read_image
 from gpuvision.host.reading import reading
-from gpuvision.host.recordings import read_array, read_image
 from gpuvision.matching.field.distance_map import DistanceMap, Field
 from gpuvision.matching.field.evidence import Evidence, evidence
 from gpuvision.matching.field.field_pose import PoseCandidate, find_pose_candidates

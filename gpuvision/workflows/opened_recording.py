@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host.errors import RecordingError
-from gpuvision.host.recordings import open_recording, read_frame
+from gpuvision.host.image_files import read_frame
+from gpuvision.host.recordings import open_recording
 from gpuvision.host.sources import ArraySource, Source
 from gpuvision.ranging.background import (
     ImageSubtracted,

@@ -16,9 +16,9 @@ import numpy.typing as npt
 from gpuvision.camera.calibration import Calibration
 from gpuvision.formats.json import json_tree
 from gpuvision.formats.sensor_file import sensor_text
+from gpuvision.host.channels import Channel
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
-from gpuvision.host.recordings import Channel
 from gpuvision.plots.sensor_calibration import SensorPicture, draw_sensor_calibration
 from gpuvision.ranging.sensor_geometry import SensorGeometry
 from gpuvision.ranging.sheet_readings import Along

@@ -17,10 +17,11 @@ from gpuvision.camera.undistort_image import Border, Interpolation, UndistortIma
 from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.formats.camera_file import check_calibrated_size
 from gpuvision.host import Device, to_numpy
+from gpuvision.host.array_files import read_array
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import atomic_write
+from gpuvision.host.image_files import read_image
 from gpuvision.host.outputs import Outputs
-from gpuvision.host.recordings import read_array, read_image
 
 # Largest number of pixels of the frame "all" per pixel of the image: near the fold of a lens the frame is unlimited.
 _LARGEST_FRAME = 16

@@ -24,7 +24,8 @@ from gpuvision.formats.machine_file import read_machine
 from gpuvision.formats.materials_file import read_materials
 from gpuvision.formats.range_image import read_npz, read_ply, read_png16, read_tiff
 from gpuvision.host import GpuVisionError, open_recording
-from gpuvision.host.recordings import read_array, read_image
+from gpuvision.host.array_files import read_array
+from gpuvision.host.image_files import read_image
 from gpuvision.matching.artwork.artwork import read_artwork
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.simulation.scene.scene import Scene

@@ -18,7 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpuvision.host import RecordingError
-from gpuvision.host.recordings import CHANNELS, open_recording
+from gpuvision.host.channels import CHANNELS
+from gpuvision.host.recordings import open_recording
 from gpuvision.host.sources import ArraySource, FrameSource, IteratedSource, PacedSource, Source
 from streams import ManualClock
 

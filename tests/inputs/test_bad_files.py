@@ -49,7 +49,7 @@ _READ_RECORDING = """
         while source.wait():
             source.read_into(out, numpy.zeros(1, numpy.int64))
 """
-_READ_IMAGE = "from gpuvision.host.recordings import read_image; read_image(path)"
+_READ_IMAGE = "from gpuvision.host.image_files import read_image; read_image(path)"
 _READ_BOARD = f"from gpuvision.matching.artwork.artwork import read_artwork; read_artwork(path, layers={LAYERS!r})"
 _READ_TOML = "from gpuvision.sensor.sensor import Sensor; Sensor.load(path)"
 _READ_MESH = "from gpuvision.simulation.scene.scene import Scene; Scene.load(path)"

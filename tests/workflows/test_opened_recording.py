@@ -13,7 +13,7 @@ import pytest
 from scipy.ndimage import median_filter
 
 from gpuvision.host import Device, RecordingError, to_numpy
-from gpuvision.host.recordings import read_frame
+from gpuvision.host.image_files import read_frame
 from gpuvision.host.sources import ArraySource
 from gpuvision.ranging.line import LineReadout
 from gpuvision.sensor.sensor import Background, Recording, Sensor

@@ -33,13 +33,13 @@ COMPARED_BY_IDENTITY = {
     *("ErrorAttribution", "StripErrorModel", "LightPaths", "Bvh", "Scene", "CameraSimulator", "Mask", "PsdSimulator"),
     *("SensorView", "ViewRays", "DirectLight", "LitSegments", "LensVisibility", "ProjectedLines", "MirrorFacets"),
     *("MirrorPoints", "MirrorSurfaces", "Mirrors", "Patches", "Radiosity", "SheetIndex", "SpecularInterreflection"),
-    *("SurfaceReflection", "SimulationTask", "_Site"),
+    *("SurfaceReflection", "SheetLighting", "SheetDivision", "SimulationTask", "_Site"),
 }
 # Calls of zip that end with the shorter sequence, and why.
 UNEQUAL_LENGTHS = {
     "gpuvision/matching/artwork/board_files.py": 1,  # the common beginning of two names
     "gpuvision/camera/image_map.py": 1,  # each table takes the first of the shifts
-    "host/recordings.py": 1,  # a damaged TIFF states more strips than it counts
+    "host/tiff_files.py": 1,  # a damaged TIFF states more strips than it counts
 }
 # Units of messages by the factor on a value in SI units, or on a fraction.
 UNITS = {100: {"%"}, 1e3: {"mm", "ms", "mrad"}, 1e6: {"um", "µm", "us"}, 1e9: {"nm"}}

@@ -90,6 +90,12 @@ def points_on(ends: Float64, share: Float64) -> Float64:
     return np.asarray(np.where(from_start, start + share * (end - start), end - (1.0 - share) * (end - start)))
 
 
+def whole_parts(line: LitLine) -> Parts:
+    """Return the whole segments of a line as parts."""
+    count = len(line.power)
+    return Parts(np.arange(count), np.zeros(count), np.ones(count), np.ones(count, bool))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LensVisibility:
     """Visibility of segments from the lens; compared by identity.
@@ -133,7 +139,7 @@ class LensVisibility:
         """
         count = len(line.power)
         lens = np.broadcast_to(lens, (count, 3))
-        todo = Parts(np.arange(count), np.zeros(count), np.ones(count), np.ones(count, bool))
+        todo = whole_parts(line)
         found = [todo.select(np.zeros(0, np.int64))]
         for _ in range(self.limits.max_halvings):
             if not len(todo.segment):

@@ -20,6 +20,7 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.readings import UNIFORM, UNIFORM_UNOCCLUDED, UNOCCLUDED
 from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet
+from gpuvision.simulation.transport.line_parts import LensVisibility
 from gpuvision.simulation.transport.specular_highlights import find_specular_highlights
 from gpuvision.status import Status
 from light_of_a_sheet import GREY, TRANSPORT, light_of, plate, quad, sensor_view, two_plates, u_of
@@ -122,7 +123,7 @@ def test_very_many_gaps() -> None:
     light = light_of(np.concatenate([plate(), screen]), seen_by=sensor_view(samples=1))
     found = light.exposures(0.0, causes=True)
     assert 0.3 < found["direct"].total()[0] / found[UNOCCLUDED].total()[0] < 0.9
-    parts = light._visibility.visible_parts(
+    parts = LensVisibility(scene=light.scene, device=Device.best()).visible_parts(
         light.sheet.illuminate(light.scene, 0.0), light.view.lens_at(0.0), with_hidden=True
     )
     assert parts.visible.sum() >= 100

@@ -23,9 +23,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.fold import InvertibleRegion, invertible_region
 from gpuvision.camera.inverse_start import InverseStart
-from gpuvision.camera.newton import determinant, invert_displacement
+from gpuvision.camera.lens_terms import LensTerms, apply_tilt
 from gpuvision.host import Define, flags
 from gpuvision.validation import check_keys, numbers
 
@@ -38,9 +37,6 @@ COEFFICIENT_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2",
 _COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
 # Squared normalised distorted radius beyond which no ideal point is searched.
 _MAX_SQUARE = 1e12
-# Factor on the largest squared distorted radius of the sampled fold points: the fold of a decentred lens can lie
-# farther out between the sampled directions.
-_FOLD_SAMPLING = 1.05
 # Largest error, relative to a rounding of the corrected coordinate, at which the kernel omits its convergence test.
 # Chosen.
 _SHARE_OF_ROUNDING = 0.25
@@ -89,6 +85,11 @@ class Camera:
         if max(map(abs, self.distortion[12:])) >= 0.5 * math.pi:
             raise ValueError(f"Camera.distortion tilts by {self.distortion[12:]} rad, expected less than a right angle")
 
+    @cached_property
+    def terms(self) -> LensTerms:
+        """Distortion in normalised coordinates."""
+        return LensTerms(coefficients=self.distortion)
+
     def in_window(self, first: Sequence[float], binning: int = 1) -> Camera:
         """Return the camera in the pixels of a window of the image, as `Lens.in_window`."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix
@@ -99,14 +100,14 @@ class Camera:
 
     def defines(self, matrix: npt.ArrayLike | None = None) -> dict[str, Define]:
         """Return the defines of ``kernels/common/camera.h``; ``matrix`` is the camera matrix of the ideal pixels."""
-        k = self._radial
+        k = self.terms.radial
         return {
             "CAMERA": None,
             "CAMERA_RADIAL": _polynomial_order(k[:3]),
             "CAMERA_RATIONAL": _polynomial_order(k[3:]),
             **flags(
-                CAMERA_DECENTRED=self._is_decentred,
-                CAMERA_PRISM=any(self._prism[1::2]),
+                CAMERA_DECENTRED=self.terms.is_decentred,
+                CAMERA_PRISM=any(self.terms.prism[1::2]),
                 CAMERA_TILTED=any(self.distortion[12:]),
                 CAMERA_MATRICES=self._ideal_matrix(matrix) != self.matrix,
             ),
@@ -189,16 +190,16 @@ class Camera:
         centre = source[:2, 2].astype(real).astype(np.float64)
         relative_focal_change = target_focal / focal - 1.0
         shift = target[:2, 2] - source[:2, 2] + relative_focal_change * (centre - source[:2, 2])
-        tilt = self._untilt if inverse else self._tilt
-        (p1, p2), (s1, s2, s3, s4) = self._tangential, self._prism
+        tilt = self.terms.untilt if inverse else self.terms.tilt
+        (p1, p2), (s1, s2, s3, s4) = self.terms.tangential, self.terms.prism
         parts: list[Any] = [
             *(centre, 1.0 / focal, target_focal, shift, relative_focal_change),
             *((tilt - np.eye(3))[:2, :2].ravel(), tilt[2, :2]),
-            *(self._radial, (p1, p2, p2 + s1, s2, p1 + s3, s4)),
-            (self._invertible_region.safe, self._invertible_region.limit),
+            *(self.terms.radial, (p1, p2, p2 + s1, s2, p1 + s3, s4)),
+            (self.terms.invertible_region.safe, self.terms.invertible_region.limit),
         ]
         if inverse:
-            parts += [(min(self._max_distorted_square, _MAX_SQUARE),)]
+            parts += [(min(self.terms.max_distorted_square, _MAX_SQUARE),)]
         if inverse and region is not None:
             parts += [_inverse_start(self, region).packed(real)]
         with np.errstate(over="ignore"):
@@ -245,7 +246,7 @@ class Camera:
             (..., 2) float64 [px]; NaN past the fold.
         """
         ideal = np.array(self._ideal_matrix(matrix))
-        return self._to_pixels(self._measured((np.asarray(points, np.float64) - ideal[:2, 2]) / np.diag(ideal)[:2]))
+        return self._to_pixels(self.terms.measure((np.asarray(points, np.float64) - ideal[:2, 2]) / np.diag(ideal)[:2]))
 
     def undistort(self, points: npt.ArrayLike, *, matrix: npt.ArrayLike | None = None) -> Float64:
         """Return the ideal (column, row) of measured points: the inverse of `distort`.
@@ -294,17 +295,13 @@ class Camera:
         if translation is not None:
             scene = scene + np.asarray(translation, dtype=np.float64)
         depth = np.where(scene[..., 2:] > 0.0, scene[..., 2:], np.nan)
-        return self._to_pixels(self._measured(scene[..., :2] / depth))
+        return self._to_pixels(self.terms.measure(scene[..., :2] / depth))
 
     def jacobian(self, points: npt.ArrayLike) -> Float64:
         """Return d(ideal) / d(measured), (..., 2, 2), at measured points (..., 2) [px]; NaN past the fold."""
         ideal = self._ideal(points)
-        _, lens_jacobian, _ = self._displacement(ideal)
-        depth = 1.0 + self._distorted(ideal) @ self._tilt[2, :2]
-        measured = self._measured(ideal)
-        tilt = (self._tilt[:2, :2] - measured[..., :, None] * self._tilt[2, :2]) / depth[..., None, None]
         focal = np.diag(self.matrix)[:2]
-        slopes: Float64 = focal[:, None] * np.linalg.inv(tilt @ lens_jacobian) / focal
+        slopes: Float64 = focal[:, None] * np.linalg.inv(self.terms.jacobian(ideal)) / focal
         return slopes
 
     @property
@@ -315,7 +312,7 @@ class Camera:
     @property
     def invertible_radius(self) -> float:
         """Tangent of the angle to the optical axis up to which the lens model is invertible (inf: everywhere)."""
-        return math.sqrt(self._invertible_region.safe)
+        return math.sqrt(self.terms.invertible_region.safe)
 
     def covers(self, size: tuple[int, int]) -> bool:
         """Return whether every pixel of an image of (columns, rows) has an ideal point; tested along its border."""
@@ -327,38 +324,6 @@ class Camera:
     # ---- parts ---------------------------------------------------------------------------------------------
 
     @property
-    def _radial(self) -> tuple[float, ...]:
-        return (*self.distortion[:2], *self.distortion[4:8])
-
-    @property
-    def _tangential(self) -> tuple[float, ...]:
-        return self.distortion[2:4]
-
-    @property
-    def _prism(self) -> tuple[float, ...]:
-        return self.distortion[8:12]
-
-    @property
-    def _is_decentred(self) -> bool:
-        return any(self._tangential) or any(self._prism)
-
-    @cached_property
-    def _invertible_region(self) -> InvertibleRegion:
-        return invertible_region(self._radial, self._tangential, self._prism)
-
-    @cached_property
-    def _max_distorted_square(self) -> float:
-        """Squared normalised radius beyond which no distorted point lies."""
-        with np.errstate(all="ignore"):
-            edge = self._invertible_region.edge
-            square = np.sum((edge + self._displacement(edge)[0]) ** 2, axis=-1)
-        return (
-            float(np.max(square)) * (_FOLD_SAMPLING if self._is_decentred else 1.0)
-            if np.isfinite(square).all()
-            else math.inf
-        )
-
-    @property
     def _principal_region(self) -> Region:
         """Region of a sensor that the principal point halves [px]."""
         (_, _, cx), (_, _, cy), _ = self.matrix
@@ -368,34 +333,16 @@ class Camera:
         """Fit the starting polynomials of the kernels' inversion to a region ((column, column), (row, row)) [px]."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix
         corners = np.array([[(a - cx) / fx, (b - cy) / fy] for a in region[0] for b in region[1]])
-        distorted = _apply_tilt(self._untilt, corners)
+        distorted = apply_tilt(self.terms.untilt, corners)
         farthest = float(np.nanmax(np.sum(distorted**2, axis=-1), initial=0.0))
-        k1, k2, k3, k4, k5, k6 = self._radial
-        radial = replace(self, distortion=(k1, k2, 0.0, 0.0, k3, k4, k5, k6, *(0.0,) * 6))
+        k1, k2, k3, k4, k5, k6 = self.terms.radial
+        radial = LensTerms(coefficients=(k1, k2, 0.0, 0.0, k3, k4, k5, k6, *(0.0,) * 6))
         return InverseStart(
-            self._displacement,
-            radial._displacement if self._is_decentred else None,
-            radial._invertible_region.limit,
+            self.terms.displacement,
+            radial.displacement if self.terms.is_decentred else None,
+            radial.invertible_region.limit,
             farthest,
         )
-
-    @cached_property
-    def _tilt(self) -> Float64:
-        """Homography (3, 3) of the tilt, normalised to a last element of 1; it maps the origin to itself."""
-        (cos_x, cos_y), (sin_x, sin_y) = np.cos(self.distortion[12:]), np.sin(self.distortion[12:])
-        about_x = np.array([[1.0, 0.0, 0.0], [0.0, cos_x, sin_x], [0.0, -sin_x, cos_x]])
-        about_y = np.array([[cos_y, 0.0, -sin_y], [0.0, 1.0, 0.0], [sin_y, 0.0, cos_y]])
-        rotation = about_y @ about_x
-        r = rotation[2, 2]
-        projection = np.array([[r, 0.0, -rotation[0, 2]], [0.0, r, -rotation[1, 2]], [0.0, 0.0, 1.0]])
-        tilt: Float64 = projection @ rotation / r
-        # These elements are 0 up to rounding.
-        tilt[:2, 2] = 0.0
-        return tilt
-
-    @cached_property
-    def _untilt(self) -> Float64:
-        return np.asarray(np.linalg.inv(self._tilt), dtype=np.float64)
 
     def _ideal_matrix(self, matrix: npt.ArrayLike | None) -> Matrix:
         return self.matrix if matrix is None else _checked_matrix(matrix, "matrix")
@@ -404,38 +351,11 @@ class Camera:
         matrix = np.array(self.matrix)
         return np.asarray(matrix[:2, 2] + np.diag(matrix)[:2] * points)
 
-    def _displacement(self, points: Float64) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:
-        """Return displacements, Jacobians and invertibility at normalised ideal points, as `newton.Displacement`."""
-        q = np.sum(points**2, axis=-1, keepdims=True)
-        k1, k2, k3, k4, k5, k6 = self._radial
-        (p1, p2), (s1, s2, s3, s4) = self._tangential, self._prism
-        under = q * (k4 + q * (k5 + q * k6))
-        stretch = (q * (k1 + q * (k2 + q * k3)) - under) / (1.0 + under)
-        slope = k1 + q * (2.0 * k2 + 3.0 * q * k3) - (1.0 + stretch) * (k4 + q * (2.0 * k5 + 3.0 * q * k6))
-        slope = slope / (1.0 + under)
-        e = stretch + 2.0 * points @ np.array([[p2], [p1]])
-        e_slope = 2.0 * (slope * points + np.array([p2, p1]))
-        second = np.array([s2, s4])
-        decentring = np.array([p2 + s1, p1 + s3]) + second * q
-        jacobian = (1.0 + e)[..., None] * np.eye(2) + points[..., :, None] * e_slope[..., None, :]
-        jacobian += 2.0 * (decentring + second * q)[..., :, None] * points[..., None, :]
-        inside = (q[..., 0] < self._invertible_region.limit) & (determinant(jacobian) > 0.0)
-        return points * e + q * decentring, jacobian, inside
-
-    def _distorted(self, points: Float64) -> Float64:
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            move, _, inside = self._displacement(points)
-            return np.where(inside[..., None], points + move, np.nan)
-
-    def _measured(self, points: Float64) -> Float64:
-        """Return normalised measured points of normalised ideal ones; NaN past the fold or behind the tilted sensor."""
-        return _apply_tilt(self._tilt, self._distorted(points))
-
     def _ideal(self, points: npt.ArrayLike) -> Float64:
         """Return normalised ideal points of measured pixels; NaN past the fold."""
         matrix = np.array(self.matrix)
         measured = (np.asarray(points, dtype=np.float64) - matrix[:2, 2]) / np.diag(matrix)[:2]
-        return invert_displacement(self._displacement, _apply_tilt(self._untilt, measured))
+        return self.terms.undistort(measured)
 
     # ---- tables --------------------------------------------------------------------------------------------
 
@@ -503,9 +423,3 @@ def _checked_matrix(matrix: Any, what: str) -> Matrix:
 def _polynomial_order(coefficients: Sequence[float]) -> int:
     """Return the number of coefficients up to the last one that is not 0."""
     return max((place for place, value in enumerate(coefficients, 1) if value != 0.0), default=0)
-
-
-def _apply_tilt(tilt: Float64, points: Float64) -> Float64:
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        w = 1.0 + points @ tilt[2, :2]
-        return np.asarray(points @ tilt[:2, :2].T / np.where(w > 0.0, w, np.nan)[..., None])

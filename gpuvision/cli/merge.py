@@ -63,6 +63,13 @@ OnDisagreement = Annotated[
         "cell is flagged AMBIGUOUS."
     ),
 ]
+RequireBoth = Annotated[
+    bool,
+    typer.Option(
+        "--require-both",
+        help="Drop heights that one scan alone has: nothing confirms them. Occlusions are then not filled.",
+    ),
+]
 
 
 def merge(
@@ -72,6 +79,7 @@ def merge(
     tolerance: Tolerance = None,
     max_sigmas: MaxSigmas = 3.0,
     disagreement: OnDisagreement = Disagreement.drop,
+    require_both: RequireBoth = False,
     as_json: ReportFile = None,
     device: DeviceLabel = None,
     overwrite: Overwrite = False,
@@ -92,10 +100,14 @@ def merge(
         max_sigmas=max_sigmas,
         tolerance=allowed,
         disagreement=disagreement.value,
+        require_both=require_both,
         device=None if device is None else Device.named(device),
     )
     done.write(out, inputs=inputs, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
     for advice in done.advice():
         echo(f"warning: {advice}", err=True)
-    echo(f"{done.summary()}\nlook at {out / 'picture.png'} and {out / 'report.json'}", err=prints_report(as_json))
+    echo(
+        f"{done.summary()}\nlook at {out / 'picture.png'}, {out / 'sources.png'} and {out / 'report.json'}",
+        err=prints_report(as_json),
+    )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import matplotlib as mpl
@@ -205,6 +206,7 @@ def draw_height_map(
     style: Style = "colour",
     title: str = "Height map",
     span: tuple[float, float] | None = None,
+    tints: Sequence[tuple[Array, str, str]] = (),
     overwrite: bool = False,
 ) -> None:
     """Draw a height map as PNG, with length bar, height bar and a legend of missing heights. Written atomically.
@@ -223,6 +225,8 @@ def draw_height_map(
         Title above the picture.
     span : (float, float), optional
         Heights of the ends of the colour scale [m]. Default: the 0.5 % and 99.5 % percentiles of the heights.
+    tints : sequence of (mask, colour, meaning)
+        Cells to tint (bool, shape of the grid), the colour ``#rrggbb`` and its text in the legend. Default: none.
     overwrite : bool
         Whether an existing file may be replaced. Default False.
 
@@ -240,6 +244,9 @@ def draw_height_map(
     exaggeration = choose_exaggeration(z, grid.cell_x, grid.cell_y)
     shade = shade_relief(z, grid.cell_x, grid.cell_y, exaggeration=exaggeration)
     picture, legend = paint_heights(z, status, shade, span, style)
+    for mask, colour, meaning in tints:
+        picture[mask] = (1 - _TINT) * picture[mask] + _TINT * np.array(to_rgb(colour))
+        legend += [LegendEntry(colour, meaning, float(np.mean(mask)))] if mask.any() else []
     subtitle = _subtitle(z, _grid_size(grid)) + (f"  ·  relief {exaggeration:.0f} ×" if exaggeration > 1 else "")
     width, height = grid.columns * grid.cell_x, grid.rows * grid.cell_y
     page = _Page(picture, width / height, legend, title, subtitle, span if style == "colour" else None)

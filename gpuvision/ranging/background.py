@@ -22,13 +22,19 @@ _NOISE_QUANTILE, _NOISE_FACTOR = 1e-3, 2.0
 # Differences that are clipped at zero have no dark side: multiple of the distance to their 90 % quantile, also 6.2
 # standard deviations.
 _BRIGHT_QUANTILE, _BRIGHT_FACTOR = 0.9, 4.8
-# Threshold of integer frames without noise [grey levels]. Chosen: above rounding and the ripple of video codecs.
-_LEAST_INTEGER_THRESHOLD = 4
+LEAST_INTEGER_THRESHOLD = 4
+"""Smallest estimated threshold of integer frames [grey levels]. Chosen: above rounding and ripple of video codecs."""
 # Threshold as a part of the typical peak of the line. Chosen: secondary light is usually weaker; surfaces that reflect
 # less than a quarter of the typical light are lost.
 _PEAK_FRACTION = 0.25
 # Part of the image that a line covers at most: above this quantile a background without a subtraction is not counted.
 _UNLIT_QUANTILE = 0.97
+# A line that stands still lights samples up to this part of the profile from its brightest one. Chosen: eight samples
+# in a window of 64, where 3 % of the profile are less than the width of a thin line.
+_STILL_LINE_REACH = 1 / 8
+# A line stands still if frames less their median have less than this part of its light. Chosen: a line that moves by
+# more than its width keeps all of it.
+_STILL_SHARE = 0.5
 _LARGEST_SAMPLE_BYTES = 1 << 28
 _LARGEST_SAMPLE_VALUES = 1 << 22
 
@@ -307,11 +313,11 @@ def noise_threshold(differences: npt.ArrayLike, *, integer: bool) -> float:
     values = _thinned(np.asarray(differences))
     values = values[np.isfinite(values)]
     if not values.size:
-        return float(_LEAST_INTEGER_THRESHOLD if integer else 0)
+        return float(LEAST_INTEGER_THRESHOLD if integer else 0)
     low, centre, high = np.quantile(values, (_NOISE_QUANTILE, 0.5, _BRIGHT_QUANTILE))
     distance = max(_NOISE_FACTOR * (centre - low), _BRIGHT_FACTOR * (high - centre) if low >= 0 else 0.0)
     threshold = float(centre + distance)
-    return float(max(math.ceil(threshold), _LEAST_INTEGER_THRESHOLD)) if integer else max(threshold, 0.0)
+    return float(max(math.ceil(threshold), LEAST_INTEGER_THRESHOLD)) if integer else max(threshold, 0.0)
 
 
 def line_threshold(light: npt.ArrayLike, noise: float) -> float:
@@ -340,6 +346,39 @@ def unlit_level(background: npt.ArrayLike) -> float:
     A threshold for frames without a subtraction is this level plus `noise_threshold`.
     """
     return float(np.quantile(_thinned(np.asarray(background)), _UNLIT_QUANTILE))
+
+
+def beside_line(profiles: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Return which samples of a background are beside the line, (profiles, samples).
+
+    For a background that contains the line, because the line stands still: samples up to an eighth of the profile from
+    its brightest sample are taken for the line.
+
+    Parameters
+    ----------
+    profiles : array_like
+        Background, (profiles, samples): each profile crosses the line.
+    """
+    levels = np.asarray(profiles)
+    samples = levels.shape[-1]
+    beside = np.abs(np.arange(samples) - levels.argmax(axis=-1)[..., None]) > _STILL_LINE_REACH * samples
+    return beside if beside.any() else ~beside
+
+
+def line_stands_still(light: npt.ArrayLike, frames: npt.ArrayLike, unlit: float) -> bool:
+    """Return whether the median of the frames contains the line, because it stands still.
+
+    Parameters
+    ----------
+    light : array_like
+        Frames less their median, (frames, profiles, samples) [grey levels].
+    frames : array_like
+        The frames, of the same shape.
+    unlit : float
+        Level of the background `beside_line` [grey levels], see `unlit_level`.
+    """
+    left, whole = (float(np.median(np.asarray(each).max(axis=-1))) for each in (light, frames))
+    return left < _STILL_SHARE * (whole - unlit)
 
 
 def _thinned(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:

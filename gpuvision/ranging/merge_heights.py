@@ -34,7 +34,7 @@ from gpuvision.validation import finite
 Disagreement = Literal["drop", "first", "second", "lower", "higher", "mean"]
 DISAGREEMENTS = get_args(Disagreement)
 """Strategies of `MergeHeights` where the maps disagree."""
-FIRST, SECOND, DISAGREES = 1, 2, 4
+FIRST, SECOND, DISAGREES, UNCONFIRMED = 1, 2, 4, 8
 """Bits of `MergedHeights.source`."""
 
 # Cells of a strip in the vector variant, and work-items of a work-group (speed only).
@@ -60,7 +60,8 @@ class MergedHeights(NamedTuple):
         Standard deviation of the height [m]; None without `MergeHeights.sigma`.
     source
         uint8, a sum of `FIRST` (1) and `SECOND` (2), the maps that the height is from, and of `DISAGREES` (4): both
-        maps have a height, and they disagree.
+        maps have a height, and they disagree. Exactly `FIRST` or `SECOND`: no other map confirms the height, which may
+        be that of a reflection; `UNCONFIRMED` (8): ``require_both`` dropped such a height.
     """
 
     z: FloatArray
@@ -80,8 +81,9 @@ class MergeHeights(VisionOperation[MergedHeights]):
     `merge_height_maps` merges maps over different grids.
 
     A map has a height where it is finite and its status has no flag, or only SATURATED, AMBIGUOUS or NOT_INVERTIBLE
-    (doubtful). Where one map has a height, it is taken. Where both have one and agree, the result is their mean. Where
-    they disagree and one of them is doubtful, the other one is taken; otherwise the cell is AMBIGUOUS, and
+    (doubtful). Where one map has a height, it is taken, unless ``require_both`` drops it: nothing confirms it, and a
+    reflection that one sensor alone sees keeps its wrong height. Where both have one and agree, the result is their
+    mean. Where they disagree and one of them is doubtful, the other one is taken; otherwise the cell is AMBIGUOUS, and
     ``disagreement`` decides.
 
     Parameters
@@ -93,6 +95,8 @@ class MergeHeights(VisionOperation[MergedHeights]):
         Allowed difference of agreeing heights [m], 0 or more, default 0. Without ``sigma`` it is the only limit.
     disagreement : {"drop", "first", "second", "lower", "higher", "mean"}
         Height where the maps disagree: none (default), that of one map, the lower or the higher one, or the mean.
+    require_both : bool
+        Whether a height that one map alone has is dropped, default False. Its status is then the flags of both maps.
     sigma : bool
         Whether standard deviations are given and computed, default False. The mean is then weighted by the inverse
         variances, otherwise both maps have the weight 1/2. A height without a finite standard deviation above 0 is
@@ -122,6 +126,7 @@ class MergeHeights(VisionOperation[MergedHeights]):
     max_sigmas: float = 3.0
     tolerance: float = 0.0
     disagreement: Disagreement = "drop"
+    require_both: bool = False
     sigma: bool = False
     precision: Precision = None
     variant: Variant = "auto"
@@ -165,6 +170,7 @@ class MergeHeights(VisionOperation[MergedHeights]):
                 build.real.type(self.max_sigmas),
                 build.real.type(self.tolerance),
                 np.int32(DISAGREEMENTS.index(self.disagreement)),
+                np.int32(self.require_both),
             ],
             passes_once=work.vectors,
             streams=True,
@@ -178,6 +184,7 @@ def merge_height_maps(
     max_sigmas: float = 3.0,
     tolerance: float = 0.0,
     disagreement: Disagreement = "drop",
+    require_both: bool = False,
     device: Device | None = None,
     max_cells: int = MAX_MAP_CELLS,
 ) -> tuple[MergedHeights, Grid]:
@@ -188,7 +195,7 @@ def merge_height_maps(
     first, second : (HeightMap, Grid)
         Maps with their grids, in one frame; the cells have one size, and the grids differ by whole cells. If both maps
         have standard deviations, they are used.
-    max_sigmas, tolerance, disagreement
+    max_sigmas, tolerance, disagreement, require_both
         As for `MergeHeights`.
     device : Device, optional
         Default `Device.best`.
@@ -208,7 +215,13 @@ def merge_height_maps(
     """
     grid = _common_grid(first[1], second[1], max_cells)
     with_sigma = first[0].sigma is not None and second[0].sigma is not None
-    operation = MergeHeights(max_sigmas=max_sigmas, tolerance=tolerance, disagreement=disagreement, sigma=with_sigma)
+    operation = MergeHeights(
+        max_sigmas=max_sigmas,
+        tolerance=tolerance,
+        disagreement=disagreement,
+        require_both=require_both,
+        sigma=with_sigma,
+    )
     dtype = np.result_type(*(to_numpy(each.z).dtype for each, _ in (first, second)))
     frames, sigmas = [], []
     for heights, own in (first, second):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.ranging.background import LEAST_INTEGER_THRESHOLD
 from gpuvision.ranging.focus_stack import FocusStack
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import ELECTRON, PsdReadout
@@ -39,8 +40,8 @@ def require_light(sensor: Sensor) -> Light:
     Raises
     ------
     ValueError
-        The sensor file has no table ``[light]`` or no pinhole position, the transport is not straight, a
-        polygon mirror turns the beam, or the threshold is to be estimated from a recording.
+        The sensor file has no table ``[light]`` or no pinhole position, the transport is not straight, or a
+        polygon mirror turns the beam.
     """
     name = sensor.name or "the sensor"
     if isinstance(sensor.readout, FocusStack):
@@ -51,8 +52,6 @@ def require_light(sensor: Sensor) -> Light:
         raise ValueError(
             f"{name}: a simulation needs a sheet of light, this one is a point sensor behind a polygon mirror"
         )
-    if sensor.auto_threshold:
-        raise ValueError(f'{name}: [line] threshold = "auto" needs a recording; give a number for a simulation')
     if sensor.light is None:
         raise ValueError(
             f"{name}: its file has no table [light], which a simulation needs; see gpuvision.sensor.light_source"
@@ -136,7 +135,7 @@ def minimum_sample_power(sensor: Sensor) -> float:
 
     PSD: ``minimum_total / responsivity``. Camera: the power whose photo-electrons in one exposure give the larger of
     ``minimum_peak`` and ``threshold``, ``grey full_well / 255 q / (responsivity exposure)``, with the charge q of an
-    electron.
+    electron. An estimated threshold (``threshold = "auto"``) counts as its smallest value for integer frames.
 
     Parameters
     ----------
@@ -155,7 +154,8 @@ def minimum_sample_power(sensor: Sensor) -> float:
     light, readout = require_light(sensor), _readout(sensor)
     if isinstance(readout, PsdReadout):
         return readout.minimum_total / light.responsivity
-    grey = max(readout.minimum_peak or 0.0, readout.threshold)
+    threshold = LEAST_INTEGER_THRESHOLD if sensor.auto_threshold else readout.threshold
+    grey = max(readout.minimum_peak or 0.0, threshold)
     return grey * light.full_well / _MAX_GREY_LEVEL * ELECTRON / (light.responsivity * light.exposure)
 
 
@@ -195,7 +195,9 @@ def make_simulator(sensor: Sensor, view: SensorView, mask: Mask | None = None) -
     Returns
     -------
     PsdSimulator or CameraSimulator
-        A camera without a noise model in ``[line]`` reads its frames with the noise model of `line_noise`.
+        A camera without a noise model in ``[line]`` reads its frames with the noise model of `line_noise`. It reads
+        with the threshold of ``sensor.readout``: a threshold that is to be estimated is estimated before, see
+        `gpuvision.workflows.simulated_recording.sensor_of_recording`.
 
     Raises
     ------

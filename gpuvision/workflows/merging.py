@@ -25,6 +25,7 @@ from gpuvision.ranging.merge_heights import (
     DISAGREES,
     FIRST,
     SECOND,
+    UNCONFIRMED,
     Disagreement,
     MergedHeights,
     common_differences,
@@ -33,10 +34,16 @@ from gpuvision.ranging.merge_heights import (
 from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.status import Status
 
-MERGE_FILES = ("range_image.tiff", "range_image.png", "range_image.npz", "picture.png", "report.json")
+MERGE_FILES = ("range_image.tiff", "range_image.png", "range_image.npz", "picture.png", "sources.png", "report.json")
 """Names of the files that `HeightMapMerge.write` writes; ``range_image_sigma.tiff`` is added if sigma is known."""
 SIGMA_FILE = "range_image_sigma.tiff"
-# Standard deviation of a normal distribution over its median absolute deviation.
+# Colours and texts of `sources.png`: values of `MergedHeights.source`, apart from 3 (both maps confirm the height).
+_SOURCES = (
+    ((FIRST,), "#1f77b4", "first scan alone: unconfirmed"),
+    ((SECOND,), "#f28c28", "second scan alone: unconfirmed"),
+    ((UNCONFIRMED,), "#2ca02c", "one scan alone: dropped"),
+    (tuple(DISAGREES | each for each in range(4)), "#d62728", "the scans disagree"),
+)
 # Median difference of the maps, in standard deviations of one difference, from which a warning names an offset of the
 # frames. Chosen: half a standard deviation moves 12 % of the agreeing cells beyond two.
 _OFFSET = 0.5
@@ -75,7 +82,11 @@ class HeightMapMerge:
     without_sigma: tuple[float, float] = (0.0, 0.0)
 
     def counts(self) -> dict[str, int]:
-        """Return the number of cells by source; ``disagrees`` counts cells where the maps disagree."""
+        """Return the number of cells by source.
+
+        ``disagrees`` counts cells where the maps disagree, ``unconfirmed`` cells with the height of one map where the
+        other one has none, and ``unconfirmed_dropped`` such heights that ``require_both`` dropped.
+        """
         source = to_numpy(self.heights.source)
         taken = source & (FIRST | SECOND)
         return {
@@ -83,6 +94,8 @@ class HeightMapMerge:
             "second": int(np.count_nonzero(taken == SECOND)),
             "both": int(np.count_nonzero(taken == FIRST | SECOND)),
             "none": int(np.count_nonzero(taken == 0)),
+            "unconfirmed": int(np.count_nonzero(np.isin(source, (FIRST, SECOND)))),
+            "unconfirmed_dropped": int(np.count_nonzero(source & UNCONFIRMED)),
             "common": len(self.differences),
             "disagrees": int(np.count_nonzero(source & DISAGREES)),
         }
@@ -125,7 +138,8 @@ class HeightMapMerge:
         return (
             f"{self.grid.columns} x {self.grid.rows} cells: {part['both']} from both, {part['first']} from the first "
             f"alone, {part['second']} from the second alone, {part['none']} without a height; the maps disagree in "
-            f"{part['disagrees']}"
+            f"{part['disagrees']}; seen by one sensor and unconfirmed: {part['unconfirmed']}"
+            + (f", and {part['unconfirmed_dropped']} dropped" if self.settings["require_both"] else "")
         )
 
     def report(self) -> dict[str, Any]:
@@ -138,6 +152,7 @@ class HeightMapMerge:
             "max_sigmas": self.settings["max_sigmas"],
             "tolerance_m": self.settings["tolerance"],
             "disagreement": self.settings["disagreement"],
+            "require_both": self.settings["require_both"],
             "cells": self.counts(),
             "difference": {"median_m": middle, "robust_sigma_m": spread},
             "weights": "equal" if self.heights.sigma is None else "inverse variance",
@@ -150,7 +165,7 @@ class HeightMapMerge:
         return MERGE_FILES if self.heights.sigma is None else (*MERGE_FILES, SIGMA_FILE)
 
     def write(self, folder: str | Path, *, inputs: tuple[Path, ...] = (), overwrite: bool = False) -> None:
-        """Write the merged map as TIFF, 16-bit PNG and NPZ, a picture and a report; after an error no file remains.
+        """Write the merged map as TIFF, 16-bit PNG and NPZ, two pictures and a report; after an error no file remains.
 
         Without standard deviations ``range_image_sigma.tiff`` of an earlier merge is removed from the folder.
 
@@ -180,7 +195,7 @@ class HeightMapMerge:
                 "map_z": (heights.z, "m"),
                 "map_status": (heights.status, "flags"),
                 "map_intensity": (heights.intensity, ""),
-                "map_source": (heights.source, "flags: 1 first, 2 second, 4 disagree"),
+                "map_source": (heights.source, "flags: 1 first, 2 second, 4 disagree, 8 unconfirmed and dropped"),
             }
             if heights.sigma is not None:
                 write_tiff(inside / SIGMA_FILE, heights.sigma, grid, quantity="random sigma of height")
@@ -189,6 +204,11 @@ class HeightMapMerge:
             write_npz(inside / "range_image.npz", arrays, units)
             shown = HeightMap(heights.z, heights.intensity, heights.status)
             draw_height_map(inside / "picture.png", shown, grid, title="Merged height map")
+            source = to_numpy(heights.source)
+            tints = [(np.isin(source, values), colour, meaning) for values, colour, meaning in _SOURCES]
+            draw_height_map(
+                inside / "sources.png", shown, grid, style="shaded", title="Sources of the heights", tints=tints
+            )
             write_text_atomic(inside / "report.json", json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
 
 
@@ -238,6 +258,7 @@ def merge_scans(
     max_sigmas: float = 3.0,
     tolerance: float = 0.0,
     disagreement: Disagreement = "drop",
+    require_both: bool = False,
     device: Device | None = None,
 ) -> HeightMapMerge:
     """Merge the height maps of two scans of one part, by two sensors or by one sensor in two positions.
@@ -246,7 +267,7 @@ def merge_scans(
     ----------
     first, second : str or Path
         Scans, see `read_height_map`. Both are in one frame, with cells of one size.
-    max_sigmas, tolerance, disagreement, device
+    max_sigmas, tolerance, disagreement, require_both, device
         As for `gpuvision.merge_height_maps`.
 
     Raises
@@ -262,15 +283,19 @@ def merge_scans(
             "a scan has no standard deviations (a noise model in its sensor file gives them); give a tolerance, the "
             "largest difference of heights that agree"
         )
-    merged, grid = merge_height_maps(
-        *maps, max_sigmas=max_sigmas, tolerance=tolerance, disagreement=disagreement, device=device
-    )
+    settings: dict[str, Any] = {
+        "max_sigmas": max_sigmas,
+        "tolerance": tolerance,
+        "disagreement": disagreement,
+        "require_both": require_both,
+    }
+    merged, grid = merge_height_maps(*maps, **settings, device=device)
     return HeightMapMerge(
         names=(str(first), str(second)),
         heights=merged,
         grid=grid,
         differences=common_differences(*maps, merged, grid),
-        settings={"max_sigmas": max_sigmas, "tolerance": tolerance, "disagreement": disagreement},
+        settings=settings,
         without_sigma=(0.0, 0.0) if merged.sigma is None else (_share_missing(maps[0][0]), _share_missing(maps[1][0])),
     )
 

@@ -19,6 +19,8 @@ from gpuvision.ranging.background import (
     ImageSubtracted,
     PairsSubtracted,
     PreviousSubtracted,
+    beside_line,
+    line_stands_still,
     line_threshold,
     median_background,
     noise_threshold,
@@ -87,7 +89,7 @@ def open_for_scan(recording: str | Path | Source | Array, sensor: Sensor) -> Ope
         if background == "median" or sensor.auto_threshold:
             frames = _sampled(recording, sensor)
             image = median_background(frames[:, 0]) if background == "median" else image
-            sensor = _with_threshold(sensor, frames, image) if sensor.auto_threshold else sensor
+            sensor = sensor_with_threshold(sensor, frames, image) if sensor.auto_threshold else sensor
         subtracted = _subtracted(source, sensor, image)
         if sensor.encoder is not None and subtracted.length is not None:
             sensor.encoder.check_length(subtracted.length, name)
@@ -136,13 +138,22 @@ def _subtracted(source: Source, sensor: Sensor, image: Array | None) -> Source:
     return source
 
 
-def _with_threshold(sensor: Sensor, frames: Array, image: Array | None) -> Sensor:
-    """Return the sensor with the threshold for sampled frames, (groups, group, rows, columns).
+def sensor_with_threshold(sensor: Sensor, frames: Array, image: Array | None = None) -> Sensor:
+    """Return a sensor with the threshold that is estimated from frames of its recording.
 
     Parameters
     ----------
+    sensor : Sensor
+        Camera; ``recording.background`` says how the readout subtracts the background.
+    frames : numpy.ndarray
+        Sampled frames, (groups, group, rows, columns), as `gpuvision.ranging.background.sample_frames` returns them.
     image : numpy.ndarray or None
-        Background image, (rows, columns), if one is subtracted.
+        Background image, (rows, columns), if one is subtracted. Default: None.
+
+    Returns
+    -------
+    Sensor
+        ``readout.threshold`` is the estimate, and ``readout.minimum_peak`` at least that.
     """
     readout = sensor.readout
     assert isinstance(readout, LineReadout)  # only cameras have a threshold to estimate
@@ -163,11 +174,22 @@ def _threshold(frames: Array, background: Background | Path, image: Array | None
         differences = few[:, 1] - few[:, 0]
     else:
         differences = few[:, 0] - middle
+    light = _profiles(differences, along)
     if background == "previous":
         noise_factor = math.sqrt(2.0)  # a difference of two frames has the noise of both
     elif background == "none":
         level = unlit_level(middle)
+        lines, unlit = _profiles(few[:, 0], along), _profiles(middle, along)
+        beside = beside_line(unlit)
+        if line_stands_still(light, lines, unlit_level(unlit[beside])):
+            level, differences = unlit_level(unlit[beside]), light[:, beside]
+            light = lines - level
     integer = np.issubdtype(frames.dtype, np.integer)
     noise = noise_factor * noise_threshold(differences, integer=integer)
-    threshold = level + line_threshold(differences.swapaxes(1, 2) if along == "columns" else differences, noise)
+    threshold = level + line_threshold(light, noise)
     return math.ceil(threshold) if integer else threshold
+
+
+def _profiles(images: Array, along: Along) -> Array:
+    """Return images (..., rows, columns) as profiles across the line, (..., profiles, samples)."""
+    return images.swapaxes(-1, -2) if along == "columns" else images

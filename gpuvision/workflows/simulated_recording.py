@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,6 +16,8 @@ import tomli_w
 from gpuvision.host import Device
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
+from gpuvision.host.sources import IteratedSource
+from gpuvision.ranging.background import sample_frames
 from gpuvision.ranging.line import LineReadout
 from gpuvision.schema import Section, read_preset
 from gpuvision.sensor.sensor import BACKGROUNDS, Sensor
@@ -21,6 +25,7 @@ from gpuvision.sensor.simulated import line_noise, make_sensor_view, make_simula
 from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
 from gpuvision.workflows.light_cache import LightStore, SimulationTask, compute_missing_blocks
+from gpuvision.workflows.opened_recording import sensor_with_threshold
 
 Array = npt.NDArray[Any]
 
@@ -171,6 +176,31 @@ def recording_sensor(task: SimulationTask, sensor_file: str | Path, *, noise: bo
     return text
 
 
+def sensor_of_recording(store: LightStore, mask: Mask | None, seed: int | None) -> Sensor:
+    """Return the sensor of a simulation with the threshold that a scan of the simulated recording estimates.
+
+    Parameters
+    ----------
+    store : LightStore
+        Light of all profiles.
+    mask, seed
+        As for `gpuvision.workflows.simulating.simulate`.
+
+    Returns
+    -------
+    Sensor
+        The sensor of the task unless it has ``threshold = "auto"``. The estimate is that of
+        `gpuvision.workflows.opened_recording.open_for_scan`, from the simulated frames without a background.
+    """
+    sensor = store.task.sensor
+    if not sensor.auto_threshold:
+        return sensor
+    frames = itertools.chain.from_iterable(_stored_blocks(store, mask, seed))
+    bare = dataclasses.replace(sensor, recording=dataclasses.replace(sensor.recording, background="none"))
+    readout = sensor_with_threshold(bare, sample_frames(IteratedSource(frames)).frames).readout
+    return dataclasses.replace(sensor, readout=readout)
+
+
 def _even_transport(task: SimulationTask, table: dict[str, Any]) -> dict[str, Any]:
     """Return the table ``[transport]`` with the start and step of the task, without an encoder file.
 
@@ -197,7 +227,13 @@ def _recorded_blocks(
     """Yield the recording block by block; missing light is computed first."""
     store = LightStore(Path(folder), task)
     compute_missing_blocks(store, device=device)
-    simulator = make_simulator(task.sensor, make_sensor_view(task.sensor), mask)
+    yield from _stored_blocks(store, mask, seed)
+
+
+def _stored_blocks(store: LightStore, mask: Mask | None, seed: int | None) -> Iterator[Array]:
+    """Yield the recording of stored light block by block."""
+    sensor = store.task.sensor
+    simulator = make_simulator(sensor, make_sensor_view(sensor), mask)
     record = simulator.currents if isinstance(simulator, PsdSimulator) else simulator.frames
     first = 0
     for block in store:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
+from gpuvision.ranging.psd import PsdReadout
 from gpuvision.ranging.range_image import RangePoints
 from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.sensor.sensor import Sensor
@@ -34,6 +35,7 @@ from gpuvision.status import Status
 from gpuvision.workflows.light_cache import LightBlock, LightStore, Progress, SimulationTask, compute_missing_blocks
 from gpuvision.workflows.scan_result import ScanLimits
 from gpuvision.workflows.scanning import assemble_points, resample_heights
+from gpuvision.workflows.simulated_recording import sensor_of_recording
 from gpuvision.workflows.simulation_result import Simulation, light_strength
 
 DEFAULT_PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse")
@@ -180,7 +182,8 @@ def simulate(
     if mask == "best":
         found = optimise_mask(view, *_all_light(store, view.samples * view.bins, limits.max_mask_bins))
     before = found.mask if found is not None else mask if isinstance(mask, Mask) else None
-    attribution, statistics = _attribute_errors(store, make_simulator(task.sensor, view, before), seed, device)
+    sensor = sensor_of_recording(store, before, seed)
+    attribution, statistics = _attribute_errors(store, make_simulator(sensor, view, before), seed, device)
     points = _points(task, attribution.reading, device)
     if task.sensor.output.ambiguous == "drop":
         attribution = attribution.without_flagged(Status.AMBIGUOUS)
@@ -189,6 +192,7 @@ def simulate(
     )
     return Simulation(
         task=task,
+        threshold=None if isinstance(sensor.readout, PsdReadout) else sensor.readout.threshold,
         attribution=attribution,
         points=points,
         heights=heights,

@@ -54,6 +54,8 @@ class Simulation:
     ----------
     task
         Part, sensor and light paths.
+    threshold
+        Threshold of a camera's readout [grey levels], estimated with ``threshold = "auto"``; None for PSDs.
     attribution
         Readings, truth, errors and their causes, (profiles, samples).
     points
@@ -76,6 +78,7 @@ class Simulation:
     """
 
     task: SimulationTask
+    threshold: float | None
     attribution: ErrorAttribution
     points: RangePoints
     heights: HeightMap
@@ -110,6 +113,7 @@ class Simulation:
             "gpuvision": version("gpuvision"),
             "sensor": task.sensor.name,
             "kind": task.sensor.kind,
+            "threshold": self.threshold,
             "profiles": len(task.transports),
             "triangles": len(task.part.corners),
             "defects": {each.name: len(getattr(task.part.defects, each.name)) for each in fields(task.part.defects)},

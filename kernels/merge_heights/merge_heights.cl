@@ -10,9 +10,10 @@
 // Inputs:  z1, intensity1, z2, intensity2  (cells,) INPUT [m, any];  status1, status2  (cells,) uchar flags
 //          sigma1, sigma2  (cells,) INPUT [m], under WITH_SIGMA
 // Outputs: z, intensity  (cells,) real, NaN where no height is taken;  status  (cells,) uchar
-//          sigma  (cells,) real [m], null without WITH_SIGMA;  source  (cells,) uchar: 1 first, 2 second, 4 disagree
+//          sigma  (cells,) real [m], null without WITH_SIGMA;  source  (cells,) uchar: 1 first, 2 second, 4 disagree,
+//          8 a height of one map that require_both drops
 // Arguments: cells, each (see Work), max_sigmas, tolerance [m], disagreement: height where the maps disagree, one of the
-//          constants below; 0: no height.
+//          constants below; 0: no height. require_both: whether a height that one map alone has is dropped, 0 or 1.
 // Build options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, WITH_SIGMA, VECTOR_VARIANT, PAST_CACHES.
 // Work:    vector variant: a work-item processes `each` consecutive cells in vectors of 16. Otherwise: one work-item per
 //          cell, in work-groups of `each` cells.
@@ -52,7 +53,7 @@ static inline Heights load_heights(ulong i, global const INPUT *z, global const 
 
 // Merge the LANES cells from cell i on.
 static inline void merge_at(ulong i, Heights one, Heights two, real max_sigmas, real tolerance, int disagreement,
-                            global real *z, global real *intensity, global uchar *status, global real *sigma,
+                            int require_both, global real *z, global real *intensity, global uchar *status, global real *sigma,
                             global uchar *source) {
     const ints both = one.present & two.present;
     const reals difference = one.z - two.z;
@@ -70,8 +71,10 @@ static inline void merge_at(ulong i, Heights one, Heights two, real max_sigmas, 
     // Where the maps disagree and one of them is doubtful, the other one is taken.
     const ints doubtful1 = int_mask(one.status != 0), doubtful2 = int_mask(two.status != 0);
     const ints settled = disagree & (doubtful1 ^ doubtful2), open = disagree & ~settled;
-    ints take1 = (one.present & ~two.present) | (settled & doubtful2);
-    ints take2 = (two.present & ~one.present) | (settled & doubtful1);
+    const ints alone = one.present ^ two.present;
+    const ints dropped = require_both ? alone : (ints)0; // its status is the flags of both maps: of a cell without height
+    ints take1 = (one.present & alone & ~dropped) | (settled & doubtful2);
+    ints take2 = (two.present & alone & ~dropped) | (settled & doubtful1);
     ints mean = agree;
     switch (disagreement) { // the same in all work-items
     case KEEP_FIRST: take1 |= open; break;
@@ -100,7 +103,8 @@ static inline void merge_at(ulong i, Heights one, Heights two, real max_sigmas, 
     // A height that one map alone has keeps the flags of that map.
     const ints kept = choose_ints(open, (one.status | two.status) | (ints)STATUS_AMBIGUOUS, flags1 | flags2);
     store_bytes(convert_bytes(kept), status + i);
-    store_bytes(convert_bytes((take1 & (ints)1) | (take2 & (ints)2) | (mean & (ints)3) | (disagree & (ints)4)), source + i);
+    const ints from = (take1 & (ints)1) | (take2 & (ints)2) | (mean & (ints)3);
+    store_bytes(convert_bytes(from | (disagree & (ints)4) | (dropped & (ints)8)), source + i);
 }
 
 kernel void merge_heights(global const INPUT *restrict z1, global const INPUT *restrict intensity1,
@@ -111,7 +115,8 @@ kernel void merge_heights(global const INPUT *restrict z1, global const INPUT *r
 #endif
                           global real *restrict z, global real *restrict intensity, global uchar *restrict status,
                           global real *restrict sigma, global uchar *restrict source, const ulong cells,
-                          const ulong each, const real max_sigmas, const real tolerance, const int disagreement) {
+                          const ulong each, const real max_sigmas, const real tolerance, const int disagreement,
+                          const int require_both) {
 #ifndef WITH_SIGMA
     global const INPUT *sigma1 = 0, *sigma2 = 0;
 #endif
@@ -122,11 +127,11 @@ kernel void merge_heights(global const INPUT *restrict z1, global const INPUT *r
     for (ulong next = first; next < end; next += LANES) {
         const ulong i = min(next, cells - LANES);
         merge_at(i, load_heights(i, z1, intensity1, status1, sigma1), load_heights(i, z2, intensity2, status2, sigma2),
-                 max_sigmas, tolerance, disagreement, z, intensity, status, sigma, source);
+                 max_sigmas, tolerance, disagreement, require_both, z, intensity, status, sigma, source);
     }
 #else
     const ulong i = min(get_group_id(0) * each, cells - each) + get_local_id(0);
     merge_at(i, load_heights(i, z1, intensity1, status1, sigma1), load_heights(i, z2, intensity2, status2, sigma2),
-             max_sigmas, tolerance, disagreement, z, intensity, status, sigma, source);
+             max_sigmas, tolerance, disagreement, require_both, z, intensity, status, sigma, source);
 #endif
 }

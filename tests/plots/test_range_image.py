@@ -109,6 +109,29 @@ def test_a_doubtful_height_is_tinted_and_a_saturated_one_is_not():
     assert not np.array_equal(made[0, 1], to_rgb(legend[0].colour))
 
 
+def test_tinted_cells_are_in_the_legend(tmp_path, heights, monkeypatch):
+    legends = []
+    page = picture._Page
+    monkeypatch.setattr(
+        picture,
+        "_Page",
+        lambda shown, ratio, legend, *more: legends.append((shown, legend)) or page(shown, ratio, legend, *more),
+    )
+    for tints in (
+        (),
+        [(np.isfinite(heights.z), "#1f77b4", "one scan alone"), (np.zeros(GRID.shape, bool), "#d62728", "-")],
+    ):
+        picture.draw_height_map(tmp_path / "map.png", heights, GRID, style="shaded", tints=tints, overwrite=True)
+    (plain, before), (tinted, after) = legends
+    assert after == [*before, picture.LegendEntry("#1f77b4", "one scan alone", float(np.mean(np.isfinite(heights.z))))]
+    known = np.isfinite(heights.z)
+    assert np.array_equal(plain[~known], tinted[~known])
+    assert np.all(
+        np.linalg.norm(tinted[known] - to_rgb("#1f77b4"), axis=-1)
+        < np.linalg.norm(plain[known] - to_rgb("#1f77b4"), axis=-1)
+    )
+
+
 @pytest.mark.parametrize("style", ["colour", "shaded"])
 def test_the_length_bar_is_as_long_as_it_says(tmp_path, heights, style):
     path = tmp_path / "map.png"

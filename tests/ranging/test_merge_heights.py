@@ -15,6 +15,7 @@ from gpuvision.ranging.merge_heights import (
     DISAGREES,
     FIRST,
     SECOND,
+    UNCONFIRMED,
     MergeHeights,
     merge_height_maps,
 )
@@ -55,6 +56,7 @@ def assert_close(found: Any, operation: MergeHeights, one: Arrays, two: Arrays) 
         max_sigmas=operation.max_sigmas,
         tolerance=operation.tolerance,
         disagreement=operation.disagreement,
+        require_both=operation.require_both,
     )
     np.testing.assert_array_equal(found.status, expected.status)
     np.testing.assert_array_equal(found.source, expected.source)
@@ -82,6 +84,16 @@ def test_against_the_oracle(
     found = run(operation, one, two, device)
     assert found.z.dtype == dtype
     assert set(np.unique(found.source)) >= {0, FIRST, SECOND, BOTH, FIRST | DISAGREES}
+    assert_close(found, operation, one, two)
+
+
+def test_heights_of_one_map_are_dropped(device: Device, rng: np.random.Generator) -> None:
+    operation = MergeHeights(sigma=True, require_both=True, disagreement="lower")
+    one, two = maps(rng, (23, 37), np.float32)
+    found = run(operation, one, two, device)
+    assert set(np.unique(found.source)) == {0, BOTH, UNCONFIRMED, FIRST | DISAGREES, SECOND | DISAGREES}
+    assert np.all(np.isnan(found.z[found.source == UNCONFIRMED]))
+    assert np.all(found.status[found.source == UNCONFIRMED] != 0)  # the flags of the map without a height
     assert_close(found, operation, one, two)
 
 

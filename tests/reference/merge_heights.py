@@ -29,6 +29,7 @@ def merge_heights(
     max_sigmas: float,
     tolerance: float,
     disagreement: str,
+    require_both: bool = False,
 ) -> ReferenceMergedHeights:
     """Merge two maps of (z, intensity, status, sigma); a sigma of None: equal weights."""
     shape = np.shape(first[0])
@@ -49,8 +50,11 @@ def merge_heights(
                 flag = NOT_FINITE
             cells.append((known and not flag & ~_DOUBTFUL, height, float(intensity[cell]), spread, flag))
         taken, flag, disagrees = _decide(cells, first[3] is not None, max_sigmas, tolerance, disagreement)
+        unconfirmed = require_both and len(taken) == 1 and not disagrees
+        if unconfirmed:
+            taken, flag = [], cells[0][4] | cells[1][4]
         made.status[cell] = flag
-        made.source[cell] = sum(1 << number for number in taken) + 4 * disagrees
+        made.source[cell] = sum(1 << number for number in taken) + 4 * disagrees + 8 * unconfirmed
         if taken:
             weights = np.array([1.0 / cells[number][3] ** 2 for number in taken])
             weights /= weights.sum()

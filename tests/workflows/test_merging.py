@@ -17,9 +17,10 @@ import pytest
 from gpuvision.cli import main as cli
 from gpuvision.formats.range_image import read_npz, read_tiff, write_npz, write_tiff
 from gpuvision.host.errors import ReadError
-from gpuvision.ranging.merge_heights import DISAGREES, FIRST, SECOND
+from gpuvision.ranging.merge_heights import DISAGREES, FIRST, SECOND, UNCONFIRMED
 from gpuvision.ranging.regrid import Grid
 from gpuvision.status import Status
+from gpuvision.workflows import merging
 from gpuvision.workflows.merging import MERGE_FILES, SIGMA_FILE, merge_scans, read_height_map
 
 CELL = 1e-4
@@ -106,6 +107,40 @@ def test_occlusion_is_filled_and_disagreement_flagged(scans: tuple[Path, Path], 
     assert "warning" not in err
     # A merged map is the input of the next merge.
     assert read_height_map(out)[0].sigma is not None
+
+
+def test_a_reflection_that_one_sensor_sees(
+    rng: np.random.Generator, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second sensor does not see the reflection's place: it is called unconfirmed, or dropped on request."""
+    z = step(rng, slice(0, 0), noise=0.0)
+    z[10:14, 33:37] += np.float32(4e-4)
+    scans = write_scan(tmp_path / "first", z), write_scan(tmp_path / "second", step(rng, slice(30, 38), noise=0.0))
+    drawn: dict[str, Any] = {}
+    monkeypatch.setattr(
+        merging, "draw_height_map", lambda path, *heights, **options: drawn.update({path.name: (heights, options)})
+    )
+    seen = np.zeros((40, 60), bool)
+    seen[:, 30:38] = True
+    counts, pictures = {}, {}
+    for words in ((), ("--require-both",)):
+        code, text, err = run("merge", *scans, "--out", tmp_path / "out", *words)
+        assert code == 0, err
+        arrays, _ = read_npz(tmp_path / "out" / "range_image.npz")
+        counts[words] = json.loads((tmp_path / "out" / "report.json").read_text())["cells"]
+        assert "seen by one sensor and unconfirmed" in text
+        expected = UNCONFIRMED if words else FIRST
+        np.testing.assert_array_equal(arrays["map_source"], np.where(seen, expected, BOTH))
+        np.testing.assert_array_equal(np.isnan(arrays["map_z"]), seen if words else np.zeros_like(seen))
+        pictures[words] = {meaning: mask for mask, _, meaning in drawn["sources.png"][1]["tints"] if mask.any()}
+    assert counts[()] | {"unconfirmed": 320, "unconfirmed_dropped": 0, "none": 0} == counts[()]
+    assert (
+        counts[("--require-both",)] | {"unconfirmed": 0, "unconfirmed_dropped": 320, "none": 320}
+        == counts[("--require-both",)]
+    )
+    np.testing.assert_array_equal(pictures[()].pop("first scan alone: unconfirmed"), seen)
+    np.testing.assert_array_equal(pictures[("--require-both",)].pop("one scan alone: dropped"), seen)
+    assert not any(pictures.values())
 
 
 def test_an_offset_of_the_frames_is_said(rng: np.random.Generator, tmp_path: Path, run: Run) -> None:

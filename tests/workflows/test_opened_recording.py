@@ -120,6 +120,20 @@ def test_the_command_reads_the_background_beside_the_sensor_file_and_keeps_it(
     assert image.read_bytes() == before
 
 
+@pytest.mark.parametrize("along", ["columns", "rows"])
+@pytest.mark.parametrize("step", [0.0, 0.3])
+def test_a_line_that_stands_still(step: float, along: Any) -> None:
+    """On a flat part the median of the frames contains the line, which covers more than 3 % of a small window."""
+    rows = 30.0 + step * np.arange(PROFILES)[:, None] + np.zeros(480)
+    frames = noisy(line_frames(rows, peak=100.0).astype(float) + 10.0)
+    if along == "rows":
+        frames = np.ascontiguousarray(frames.swapaxes(1, 2))
+    camera = dataclasses.replace(sensor(), readout=LineReadout(along=along), frame=frames.shape[1:])
+    threshold = open_for_scan(frames, camera).sensor.readout.threshold
+    # The unlit level and a quarter of the line's peak.
+    assert threshold == pytest.approx(10.0 + 25.0, abs=4.0)
+
+
 @pytest.mark.realdata
 def test_a_real_line_on_a_textured_board(device: Device, data: Path) -> None:
     """A red line on a chequered board in a lit room, with an image of the board without the line."""

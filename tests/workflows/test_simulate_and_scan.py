@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -207,6 +208,26 @@ def test_a_scan_has_the_readings_of_the_simulation(commands: Commands, method: s
     assert ran.code == 0, ran.err
     scanned = commands.scan(commands.folder / "sim")
     simulated, _ = read_npz(commands.folder / "sim" / "simulation.npz")
+    assert np.isfinite(scanned["z"]).mean() > 0.9
+    for name in ("x", "y", "z"):
+        np.testing.assert_array_equal(scanned[name], simulated[name])
+
+
+@pytest.mark.parametrize("noise", ["--noise", "--no-noise"])
+def test_the_threshold_of_the_recording(commands: Commands, noise: str) -> None:
+    """``threshold = "auto"`` in simulate: the threshold, and with it each reading, is that of a scan of the frames."""
+    commands.table["line"] |= {"threshold": "auto"}
+    commands.table["recording"] = {"background": "median"}  # the simulated frames have no background
+    commands.write("sensor.toml", commands.table)
+    ran = commands.simulate("--profiles", 20, noise)
+    assert ran.code == 0, ran.err
+    sim = commands.folder / "sim"
+    scanned = commands.scan(sim)
+    estimated = [json.loads((sim.parent / name / "report.json").read_text())["threshold"] for name in ("sim", "scan")]
+    assert estimated[0] == estimated[1]
+    frames = np.load(sim / "recording.npy")
+    assert np.median(frames) + 4 <= estimated[0] < 0.75 * np.median(frames.max(axis=1))
+    simulated, _ = read_npz(sim / "simulation.npz")
     assert np.isfinite(scanned["z"]).mean() > 0.9
     for name in ("x", "y", "z"):
         np.testing.assert_array_equal(scanned[name], simulated[name])

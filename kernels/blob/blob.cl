@@ -518,7 +518,7 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
     const uint first = get_global_id(0) * each, end = min(first + each, count);
     const int mine = 1;
 #else
-    local real profile[LENGTH], slopes[RULER_SLOPES], shared_state[5];
+    local real profile[RULER_CAPACITY], slopes[RULER_SLOPES_CAPACITY], shared_state[5];
     local int flags;
     local blob_edges shared;
     const uint first = get_group_id(0), end = first + 1;

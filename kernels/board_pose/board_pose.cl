@@ -161,7 +161,7 @@ kernel void board_pose(global const CODE *restrict image, global const BoardRule
         }
     }
 #else
-    local real profile[LENGTH], slopes[RULER_SLOPES];
+    local real profile[RULER_CAPACITY], slopes[RULER_SLOPES_CAPACITY];
     local int flags;
     const int item = get_local_id(0), items = RULER_GROUP;
     for (int i = 0; i < lines * each; i++) {

@@ -41,7 +41,7 @@ kernel void ruler_edges(global const CODE *restrict image, global const real *re
         store_edges(edges, ruler, count, position, amplitude, width, sigma, spacing, status);
     }
 #else
-    local real profile[LENGTH], slopes[RULER_SLOPES];
+    local real profile[RULER_CAPACITY], slopes[RULER_SLOPES_CAPACITY];
     local int flags;
     const uint ruler = get_group_id(0);
     global const real *of = rulers + RULER_INPUTS * (ulong)ruler;

@@ -1,16 +1,17 @@
 // Calipers (rulers): 1-D edge measurement along short lines of samples in an image.
 //
-// A ruler (x, y, cos, sin) has LENGTH samples along its direction; each sample is the sum over WIDTH parallel lines one
-// pixel apart, interpolated bilinearly. The gradient of the profile is its convolution with the derivative of a Gaussian
-// (TAPS taps on either side). An edge is a local maximum of the gradient above the threshold.
+// A ruler (x, y, cos, sin) has table[RULER_LENGTH] samples along its direction; each sample is the sum over WIDTH
+// parallel lines one pixel apart, interpolated bilinearly. The gradient of the profile is its convolution with the
+// derivative of a Gaussian (TAPS taps on either side). An edge is a local maximum of the gradient above the threshold.
 //
 // Variants: VECTOR_VARIANT: one work-item takes 16 rulers, one in each lane; else a work-group of RULER_GROUP items takes
 //           one ruler, with its arrays in local memory.
 // Options:
 //     CODE, and CODE_uchar, CODE_ushort or CODE_float   type of the pixels
-//     RISING, FALLING    polarity of the edges (of the first edge of a pair); neither: both
+//     RULER_CAPACITY     largest length that the arrays of samples hold
+//     RULER_BITS         fractional bits of fixed-point positions (vector variant)
 //     PAIRS              an edge is a pair of edges of opposite polarity: a stripe
-//     PER_RULER (with PAIRS, without RISING and FALLING)   each ruler has its own ruler_kind: single edge or pair
+//     PER_RULER (with PAIRS)   each ruler has its own polarity and kind, see ruler_set_kind: single edge or pair
 //     CHOOSE_STRONGEST, CHOOSE_FIRST, CHOOSE_LAST, CHOOSE_ALL (up to MAX_EDGES edges)   edge selection
 //     SATURATION, AMBIGUITY   flag saturated samples, and edges with a comparable second edge
 //     CURVED             correct the position for a curved edge
@@ -25,8 +26,9 @@
 // Offsets in the parameter table (RULER_THRESHOLD, ..., RULER_TAPS) are build options: the fields of RulerTable in
 // gpuvision/matching/features/ruler.py, with their units.
 
-#define RULER_SLOPES (LENGTH - 2 * TAPS)
-#define RULER_MIDDLE ((real)0.5f * (LENGTH - 1))
+#define RULER_SLOPES_CAPACITY (RULER_CAPACITY - 2 * TAPS)
+#define RULER_MIDDLE(table) ((real)0.5f * ((table)[RULER_LENGTH] - 1))
+#define RULER_SIGN ((bits)1 << (8 * sizeof(real) - 1)) // bit of the sign
 #define RULER_LARGEST 1e37f  // largest sum over lines; gradients of larger ones could overflow
 // Numbers of a ruler in memory: x, y, cos, sin, and with PER_RULER polarity, least and greatest spacing of a pair.
 #ifdef PER_RULER
@@ -43,20 +45,31 @@ typedef struct {
     reals x, y;                               // first sample of the first line, from `pixel`
     reals along_x, along_y, across_x, across_y; // steps to the next sample and to the next line
     masks last_column, last_row;              // last column and row that have a right and a lower neighbour, from `pixel`
+    reals polarity;             // sign of the (first) edge, 0: both
+    masks sign_flip, sign_keep; // the strength of a gradient is (its bits ^ sign_flip) & sign_keep
 #ifdef PER_RULER
-    reals polarity, nearest, farthest; // sign of the (first) edge; least and greatest spacing of a pair [samples]
+    reals nearest, farthest; // least and greatest spacing of a pair [samples]
     masks is_pair;
 #endif
 } ruler_place;
 
 #include "ruler/ruler_refine.h"
 
+// Set the polarity of the (first) edge: -1, 0 (both) or 1. The strength of an edge of this polarity is the gradient, its
+// negative or its absolute value: one operation with bits for all three. The polarity of a pair is checked later.
+static inline void ruler_set_polarity(reals polarity, masks is_pair, ruler_place *place) {
+    const masks both = is_pair | mask_of(polarity == 0);
+    place->polarity = polarity;
+    place->sign_flip = ~both & mask_of(polarity < 0) & (masks)RULER_SIGN;
+    place->sign_keep = ~(both & (masks)RULER_SIGN);
+}
+
 // Compute the layout of rulers; return their flags. Flagged rulers get a valid place at the first pixel.
 static inline masks ruler_layout(int rows, int columns, reals x, reals y, reals cosine, reals sine, constant real *table,
                        ruler_place *place) {
     const masks bad = mask_of((LANED(not_finite)(x) | LANED(not_finite)(y) | LANED(not_finite)(cosine) |
                                LANED(not_finite)(sine)) != 0);
-    const real half_length = RULER_MIDDLE * table[RULER_STEP], half_width = (real)0.5f * (WIDTH - 1);
+    const real half_length = RULER_MIDDLE(table) * table[RULER_STEP], half_width = (real)0.5f * (WIDTH - 1);
     const reals start_x = half_length * cosine - half_width * sine;
     const reals start_y = half_length * sine + half_width * cosine;
 #if defined(LENS) || defined(CAMERA)
@@ -81,16 +94,22 @@ static inline masks ruler_layout(int rows, int columns, reals x, reals y, reals 
     place->across_y = zero_where(away, cosine);
     place->last_column = (columns - 2) - column;
     place->last_row = (rows - 2) - row;
+#ifdef PAIRS
+    ruler_set_polarity(table[RULER_POLARITY], ~(masks)0, place);
+#else
+    ruler_set_polarity(table[RULER_POLARITY], (masks)0, place);
+#endif
     return bad ? (masks)STATUS_NOT_FINITE : away & STATUS_OUT_OF_RANGE;
 }
 
 #ifdef PER_RULER
-// Set what rulers look for: sign of the (first) edge; least and greatest spacing [px], 0 and 0 for a single edge.
+// Set the kind of each ruler: sign of the (first) edge; least and greatest spacing [px], 0 and 0 for a single edge.
 static inline void ruler_set_kind(reals polarity, reals nearest, reals farthest, constant real *table, ruler_place *place) {
-    place->polarity = polarity;
+    place->is_pair = mask_of(farthest > 0);
+    ruler_set_polarity(polarity, place->is_pair, place);
+    place->sign_keep &= place->is_pair | mask_of(fabs(polarity) > 0); // a polarity of 0 or NaN: no edges
     place->nearest = ruler_nearest(nearest / table[RULER_STEP]);
     place->farthest = ruler_nearest(farthest / table[RULER_STEP]);
-    place->is_pair = mask_of(farthest > 0);
 }
 #endif
 
@@ -127,19 +146,10 @@ static inline masks ruler_sum_flags(reals sum) {
 #endif
 }
 
-// Strength of an edge of the wanted polarity; the polarity of pairs is checked later.
-#if defined(PER_RULER)
+// Strength of an edge of the wanted polarity.
 static inline reals ruler_strength(reals slope, private const ruler_place *place) {
-    return place->is_pair ? fabs(slope) : slope * place->polarity;
+    return as_reals((as_masks(slope) ^ place->sign_flip) & place->sign_keep);
 }
-#elif defined(RISING) && !defined(PAIRS)
-static inline reals ruler_strength(reals slope, private const ruler_place *place) { return slope; }
-#elif defined(FALLING) && !defined(PAIRS)
-static inline reals ruler_strength(reals slope, private const ruler_place *place) { return -slope; }
-#else
-static inline reals ruler_strength(reals slope, private const ruler_place *place) { return fabs(slope); }
-#endif
-
 
 #ifdef VECTOR_VARIANT
 static inline reals ruler_slope(private const reals *profile, int i, constant real *table) {
@@ -185,7 +195,8 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
 #endif
     peak.before = ruler_gradient(values, 0, table);
     peak.here = ruler_gradient(values, 1, table);
-    for (int i = 1; i < RULER_SLOPES - 1; i++) {
+    const int slopes = (int)table[RULER_LENGTH] - 2 * TAPS;
+    for (int i = 1; i < slopes - 1; i++) {
         peak.after = ruler_gradient(values, i + 1, table);
         peak.at = i;
         reals strength = ruler_strength(peak.here, place);
@@ -204,11 +215,7 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
 #else
             candidate &= has_other & (mask_of(other.here > 0) ^ mask_of(peak.here > 0)) &
                          mask_of(gap >= table[RULER_NEAREST]) & mask_of(gap <= table[RULER_FARTHEST]);
-#if defined(RISING)
-            candidate &= mask_of(other.here > 0);
-#elif defined(FALLING)
-            candidate &= mask_of(other.here < 0);
-#endif
+            candidate &= mask_of(other.here * place->polarity >= 0);
             strength = strength < weaker ? strength : weaker;
 #endif
             const ruler_peak from = other;
@@ -266,7 +273,7 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
 // Measure 16 rulers of a given layout with its flags, one in each lane; fills edges[MAX_EDGES].
 static inline void ruler_measure_placed(global const CODE *image, int columns, private const ruler_place *place, masks flags,
                                  constant real *table, constant real *model, private ruler_edge *edges) {
-    reals profile[LENGTH];
+    reals profile[RULER_CAPACITY];
     flags |= ruler_sums(image, place, columns, table, model, profile);
     ruler_find(profile, place, flags, table, edges);
 }
@@ -332,14 +339,14 @@ static inline real ruler_sum(global const CODE *image, const ruler_place *place,
 static inline void ruler_measure_placed(global const CODE *image, int columns, private const ruler_place *place, int flags,
                                  constant real *table, constant real *model, local real *profile, local real *slopes,
                                  local int *shared_flags, private ruler_edge *edges) {
-    const int item = get_local_id(0);
+    const int item = get_local_id(0), length = (int)table[RULER_LENGTH];
     if (item == 0) *shared_flags = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (int i = item; i < LENGTH; i += RULER_GROUP)
+    for (int i = item; i < length; i += RULER_GROUP)
         profile[i] = ruler_sum(image, place, columns, i, table, model, &flags);
     if (flags) atomic_or(shared_flags, flags);
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (int i = item; i < RULER_SLOPES; i += RULER_GROUP) slopes[i] = ruler_slope(profile, i, table);
+    for (int i = item; i < length - 2 * TAPS; i += RULER_GROUP) slopes[i] = ruler_slope(profile, i, table);
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item == 0) ruler_find(slopes, place, *shared_flags, table, edges);
 }

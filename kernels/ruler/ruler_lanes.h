@@ -143,8 +143,9 @@ static inline __attribute__((always_inline)) masks ruler_sums(global const CODE 
     ruler_start(&walk, place, 0);
     for (int j = 0; j < WIDTH; j++) flags |= ruler_next(&walk, place, pitch, 0, j, model, x + j, y + j, pixels + j);
     global const CODE *below = image + pitch;
-    for (int i = 0; i < LENGTH; i++) {
-        const int now = i % 2 * WIDTH, then = WIDTH - now, next = min(i + 1, LENGTH - 1);
+    const int length = (int)table[RULER_LENGTH];
+    for (int i = 0; i < length; i++) {
+        const int now = i % 2 * WIDTH, then = WIDTH - now, next = min(i + 1, length - 1);
         ruler_start(&walk, place, next);
         ruler_levels whole = 0;
         reals rest = 0;

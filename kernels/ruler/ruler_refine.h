@@ -85,7 +85,7 @@ static inline ruler_edge ruler_refine(ruler_peak peak, private const ruler_place
     at -= pull + ruler_interpolation_bias(y, place->along_y, place->across_y, at, variance, table);
 #endif
     ruler_edge edge;
-    edge.position = (at - RULER_MIDDLE) * table[RULER_STEP];
+    edge.position = (at - RULER_MIDDLE(table)) * table[RULER_STEP];
     edge.amplitude = peak.here * exp((real)0.5f * tilt * shift) *
                      ((real)RULER_ROOT_TWO_PI * table[RULER_PER_LINE]) * sqrt(variance);
     edge.width = sqrt(fmax(variance - table[RULER_SMOOTHING], (reals)0)) * table[RULER_STEP];

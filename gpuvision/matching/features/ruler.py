@@ -46,6 +46,9 @@ SAMPLING_SIGMA_PX = 0.02
 MAX_WIDTH = 255
 MAX_EDGES = 64
 _LANES, _GROUP = 16, 64
+# Sizes of the kernel's arrays of samples: the length is an argument of the kernel, not a compilation for each length.
+_CAPACITIES = (128, MAX_LENGTH)
+_SIGNS = {"any": 0.0, "rising": 1.0, "falling": -1.0}
 _SHARES_PER_CORE = 4  # work-items per core: balances the cores
 _INLINE = 128  # rulers up to which one thread is faster than waking a second one (measured)
 # Binary places of fixed-point positions, of 31 bits: a side of an image takes 15; a float's mantissa has 23.
@@ -78,6 +81,10 @@ class RulerTable(NamedTuple):
         Distance between samples [px].
     per_line
         Reciprocal of the number of lines.
+    length
+        Number of samples.
+    polarity
+        Sign of the edges, of the first edge of a pair: -1, 1, or 0 for both.
     """
 
     threshold: float
@@ -91,6 +98,8 @@ class RulerTable(NamedTuple):
     across: float
     step: float
     per_line: float
+    length: float
+    polarity: float
 
 
 RULER_OFFSETS = table_offsets("RULER", {**dict.fromkeys(RulerTable._fields, 1), "taps": 0})
@@ -375,12 +384,11 @@ class RulerEdges(VisionOperation[Edges]):
 
     def _defines(self, dtype: np.dtype[Any]) -> dict[str, Define]:
         chosen = [f"CODE_{opencl_type(dtype)}", f"CHOOSE_{self.edge_selection.upper()}"]
-        chosen += [] if self.polarity == "any" else [self.polarity.upper()]
         return {
             **({} if self.model is None else self._model_defines(self.model)),
             **type_defines("CODE", dtype),
             **RULER_OFFSETS,
-            "LENGTH": self.length,
+            "RULER_CAPACITY": next(each for each in _CAPACITIES if self.length <= each),
             "WIDTH": self.width,
             "TAPS": self._reach,
             "MAX_EDGES": self._places,
@@ -427,6 +435,8 @@ class RulerEdges(VisionOperation[Edges]):
             across=(self.width**2 - 1) / 12.0,
             step=self.step_px,
             per_line=1.0 / self.width,
+            length=self.length,
+            polarity=_SIGNS[self.polarity],
         )
         return np.array([*table, *taps], _REAL)
 

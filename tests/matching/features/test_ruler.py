@@ -129,6 +129,17 @@ def test_all_of_an_image(device: Device, dtype: Any, angle: float) -> None:
     assert_like(ours, [theirs])
 
 
+def test_lengths_and_polarities_share_a_program(device: Device) -> None:
+    """Lengths of one capacity and one fixed-point format, and the polarities, are arguments of one program."""
+
+    def options(**changed: Any) -> Any:
+        return replace(STRONGEST, count=1, **changed).launch(device, SHAPE, np.dtype(np.uint8)).defines
+
+    assert options(length=120) == options(length=15) == options(polarity="rising") == options(polarity="falling")
+    assert options(length=129) != options(length=120)
+    assert options(length=129) == options(length=240)
+
+
 def test_shortest_and_a_single_line(device: Device) -> None:
     image = reference.step_image((20, 20), 0.0, 10.25, 0.8).astype(np.float32)
     operation = RulerEdges(threshold=20.0, length=9, width=1, smoothing_px=1.0)

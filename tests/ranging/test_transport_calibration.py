@@ -64,7 +64,7 @@ def test_two_views_suffice_and_one_does_not(rng: np.random.Generator) -> None:
 
 def test_step_is_the_one_of_weighted_least_squares(rng: np.random.Generator) -> None:
     """Against a search over rotation, middle and step for the least sum of squares of the poses themselves."""
-    profiles = np.array([0.0, 20.0, 50.0, 100.0])
+    profiles = np.array([10.0, 20.0, 50.0, 100.0])
     views = moved(rng, profiles, 0.1)
     # Views differ in their uncertainty, or all weights would agree.
     views = [replace_covariance(each, (1.0 + number) ** 2) for number, each in enumerate(views)]
@@ -89,6 +89,39 @@ def test_step_is_the_one_of_weighted_least_squares(rng: np.random.Generator) -> 
     predicted = np.linalg.inv(best.jac.T @ best.jac)[6:, 6:] * max(found.view_ratio, 1.0)
     np.testing.assert_allclose(found.noise_covariance, predicted, rtol=1e-3, atol=1e-3 * predicted.max())
     assert found.view_ratio == pytest.approx(2.0 * best.cost / (6 * 4 - 9), rel=1e-3)
+    turned = Rotation.from_rotvec(best.x[:3]).as_matrix() @ start
+    np.testing.assert_allclose(found.normal, turned[:, 2], atol=1e-6)
+    np.testing.assert_allclose(found.middle, best.x[3:6] + profiles[0] * best.x[6:], atol=1e-7)
+    for view, number, rotation, shift in zip(views, profiles, found.rotations, found.residuals, strict=True):
+        expected = Rotation.from_matrix(view.pose.rotation @ turned.T).as_rotvec()
+        np.testing.assert_allclose(rotation, expected, atol=1e-6)
+        middle = view.pose.rotation @ MIDDLE + view.pose.translation
+        np.testing.assert_allclose(shift, middle - best.x[3:6] - number * best.x[6:], atol=1e-6)
+
+
+def test_step_moves_with_the_camera_as_predicted(rng: np.random.Generator) -> None:
+    """Poses that move by their derivatives move the step by its derivative: the camera's share of the covariance."""
+    profiles = np.array([10.0, 20.0, 50.0, 100.0])
+    views = [
+        PoseResponse(each.pose, (1.0 + number) * each.covariance, rng.normal(size=(6, 2)) * 1e-3)
+        for number, each in enumerate(moved(rng, profiles, 1e-4))
+    ]
+    found = fit_transport(views, profiles, MIDDLE)
+    assert found.by_camera.shape == (3, 2)
+    for number, change in enumerate(1e-3 * np.eye(2)):
+        both = []
+        for sign in (1.0, -1.0):
+            shifted = []
+            for view in views:
+                turn, shift = np.split(sign * view.by_camera @ change, 2)
+                pose = Pose(Rotation.from_rotvec(turn).as_matrix() @ view.pose.rotation, view.pose.translation + shift)
+                shifted.append(PoseResponse(pose, view.covariance, view.by_camera))
+            both.append(fit_transport(shifted, profiles, MIDDLE).step)
+        scale = np.abs(found.by_camera).max()
+        np.testing.assert_allclose((both[0] - both[1]) / 2e-3, found.by_camera[:, number], atol=1e-3 * scale)
+    camera = np.array([[4.0, 1.0], [1.0, 2.0]])
+    expected = found.noise_covariance + found.by_camera @ camera @ found.by_camera.T
+    np.testing.assert_allclose(found.covariance(camera), expected, rtol=1e-12)
 
 
 def replace_covariance(view: PoseResponse, factor: float) -> PoseResponse:

@@ -1,0 +1,141 @@
+"""Traversal of the light tree by the kernel of `LightClustering`: decisions and bounds as an oracle finds them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gpuvision.host import Device, to_numpy
+from gpuvision.simulation.clustering import light_clustering as module
+from gpuvision.simulation.clustering.light_cut import BLOCK
+from gpuvision.simulation.clustering.light_tree import NODE_SIZES, LightTree
+from gpuvision.simulation.scene.scene import Scene
+from light_cuts import Block, Traversal, traverse
+
+MIDDLE = np.array([0.25, -0.5, 1.0])
+ROUNDING, MARGIN = 2e-3, 1.5e-3
+CAPACITY = 256
+TWO_WAYS = pytest.mark.parametrize("variant", ["vector", "work_item"])
+
+
+def named(rows: NDArray[Any], sizes: dict[str, int]) -> list[dict[str, Any]]:
+    """Return the numbers of rows by their names."""
+    places = np.cumsum([0, *sizes.values()])
+    return [
+        {
+            name: row[first] if size == 1 else row[first : first + size]
+            for (name, size), first in zip(sizes.items(), places, strict=False)
+        }
+        for row in rows.astype(np.float64)
+    ]
+
+
+def lit_segments(rng: np.random.Generator, count: int, size: float) -> NDArray[Any]:
+    """Return short segments of different exitance about the origin, with normals about z."""
+    start = rng.normal(size=(count, 3)) * size * [1.0, 1.0, 0.3]
+    way = rng.normal(size=(count, 3)) * [0.2, 0.2, 0.02] * size
+    normal = [0.0, 0.0, 1.0] + 0.15 * rng.normal(size=(count, 3))
+    normal -= way * (np.sum(normal * way, axis=1) / np.sum(way * way, axis=1))[:, None]
+    return np.hstack([start, start + way, normal, rng.uniform(0.2, 1.0, (count, 1))])
+
+
+def strips_around(rng: np.random.Generator, strips: int, count: int, far: tuple[float, float]) -> NDArray[Any]:
+    """Return strips of receivers at distances from the origin; some see the segments at grazing incidence."""
+    direction = rng.normal((0.0, 0.0, 0.8), 1.0, (strips, 1, 3))
+    direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+    place = direction * rng.uniform(*far, (strips, 1, 1)) + rng.normal(size=(strips, count, 3)) * 0.01
+    normal = -direction + 0.6 * rng.normal(size=(strips, 1, 3)) + 0.1 * rng.normal(size=(strips, count, 3))
+    return np.concatenate([place, normal], axis=2)
+
+
+def compare(
+    device: Device,
+    variant: Any,
+    segments: NDArray[Any],
+    receivers: NDArray[Any],
+    costs: NDArray[Any],
+    shares: NDArray[Any],
+    *,
+    triangles: NDArray[Any] | None = None,
+    clusters: bool = True,
+) -> list[Traversal]:
+    """Run the kernel and the oracle, compare all blocks, and return the oracle's results."""
+    scene = None if triangles is None else Scene(triangles + MIDDLE)
+    # The kernel computes relative to the middle of the frame. Tree and segments are given so, receivers are not.
+    middle = MIDDLE if scene is None else scene.bvh.middle
+    shift = middle - MIDDLE
+    segments = segments - np.concatenate([shift, shift, np.zeros(4)])
+    tree = LightTree.build(segments)
+    placed = np.zeros((len(tree.spans) // 2, sum(module._SEGMENT_SIZES.values())), np.float32)
+    placed[: len(segments)] = module._segment_rows(segments[tree.order], np.zeros(3))
+    operation = module._SelectLights(
+        nodes=len(tree.spans),
+        segments=len(placed),
+        capacity=CAPACITY,
+        scene=scene,
+        clearance=MARGIN,
+        clusters=clusters,
+        variant=variant,
+    )
+    given = receivers + np.append(MIDDLE, np.zeros(3))
+    rows, frame = tree.rows.astype(np.float32), np.append(middle, ROUNDING)
+    found = operation(
+        given, costs.astype(np.float32), shares.astype(np.float32), rows, tree.spans, placed, frame, device=device
+    )
+    selected, errors, counts, sums, tallies = map(to_numpy, found)
+    nodes, lits = named(rows, NODE_SIZES), named(placed, module._SEGMENT_SIZES)
+    expected = []
+    blocks = -(-receivers.shape[1] // BLOCK)
+    for number in range(len(receivers) * blocks):
+        strip, first = number // blocks, number % blocks * BLOCK
+        block = Block.of(receivers[strip, first : first + BLOCK], costs[strip, first : first + BLOCK], shift)
+        local = None if triangles is None else triangles - shift
+        each = traverse(block, nodes, tree.spans, lits, shares[strip], ROUNDING, local, MARGIN, clusters=clusters)
+        assert counts[number] == len(each.entries)
+        np.testing.assert_array_equal(selected[number, : counts[number]], each.entries)
+        np.testing.assert_allclose(errors[number, : counts[number]], each.errors, rtol=4e-4)
+        np.testing.assert_allclose(sums[number], each.sums, rtol=4e-4)
+        np.testing.assert_array_equal(tallies[number], each.tallies)
+        expected.append(each)
+    return expected
+
+
+@TWO_WAYS
+def test_bounds_without_occluders(device: Device, variant: Any) -> None:
+    """Shares from 0, where all single segments are kept, to 1e9 / m^2, where the root is omitted."""
+    rng = np.random.default_rng(0)
+    near, far = (strips_around(rng, *size) for size in ((24, BLOCK + 5, (0.02, 0.3)), (8, BLOCK + 5, (0.4, 3.0))))
+    receivers = np.concatenate([near, far])
+    costs = rng.uniform(0.5, 2.0, receivers.shape[:2]) * (rng.random(receivers.shape[:2]) < 0.8)
+    receivers[3, 4, 3:] = 0.0
+    costs[5, BLOCK:] = 0.0
+    shares = np.tile([0.0, 1e9, 0.3, 3.0, 30.0, 0.05], 6)[:32]
+    expected = compare(device, variant, lit_segments(rng, 21, 0.03), receivers, costs, shares)
+    assert sum(each.tallies[1] > 0 for each in expected) >= 10
+    assert sum(0 < each.tallies[0] < 21 for each in expected) >= 10
+
+
+@TWO_WAYS
+def test_triangles_that_may_occlude(device: Device, variant: Any) -> None:
+    """The most distant strips have more clusters to test than a block tests at most."""
+    rng = np.random.default_rng(0)
+    receivers = np.concatenate([strips_around(rng, 20, BLOCK, (0.1, 0.4)), strips_around(rng, 3, BLOCK, (1.0, 2.0))])
+    costs = rng.uniform(0.5, 2.0, receivers.shape[:2])
+    corners = rng.normal(size=(9, 1, 3)) * [0.05, 0.05, 0.02] + [0.0, 0.0, 0.06] + rng.normal(size=(9, 3, 3)) * 0.02
+    shares = np.append(np.tile([0.0, 0.3, 3.0, 0.1], 5), np.full(3, 2e-3))
+    expected = compare(device, variant, lit_segments(rng, 100, 0.03), receivers, costs, shares, triangles=corners)
+    assert sum(any(k < 0 for k in each.entries) for each in expected) >= 5
+    assert sum(any(k >= 1 << 30 for k in each.entries) for each in expected) >= 3
+    assert sum(each.tests == 0 for each in expected) >= 1
+
+
+@pytest.mark.slow
+def test_clusters_switched_off(device: Device) -> None:
+    rng = np.random.default_rng(1)
+    receivers = strips_around(rng, 2, BLOCK, (1.0, 2.0))
+    costs = rng.uniform(0.5, 2.0, receivers.shape[:2])
+    expected = compare(device, "vector", lit_segments(rng, 8, 0.03), receivers, costs, np.full(2, 0.1), clusters=False)
+    assert not any(each.tallies[1] for each in expected)

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 Reals = NDArray[np.float64]
 # Occlusion is tested for clusters of at most 16 segments: of more than 8, or of fewer that one segment could represent.
 _MAX_TESTED = 16
+# Factor that covers the rounding of the bounds in single.
+_UP = 1.0 + 256.0 * 2.0**-23
 # A block gives up after 32 failed tests; each success allows 2 more.
 _TESTS, _MORE_TESTS = 32, 2
 
@@ -100,15 +102,16 @@ def meeting(block: Block, node: dict[str, Any], single: bool, rounding: float) -
     nearest = max(float(np.linalg.norm(gap)), distance - block.radius - node["radius"]) - rounding
     if nearest <= 0.0:
         return np.inf, faces
+    nearest /= _UP
     cosines = min((lit_most + rounding) / nearest, 1.0) * min((got_most + rounding) / nearest, 1.0)
     along = np.pi / (nearest * node["length"]) if single else np.inf
-    return cosines * min(nearest**-2, along) / np.pi, faces
+    return _UP * cosines * min(nearest**-2, along) / np.pi, faces
 
 
 def replacement_error(block: Block, node: dict[str, Any], rounding: float) -> float:
     """Return the bound of the error of the representative [W/m^2 per watt]."""
     gap = np.maximum(np.maximum(block.low - node["centre"], node["centre"] - block.high), 0.0)
-    r = float(np.linalg.norm(gap)) - rounding
+    r = (float(np.linalg.norm(gap)) - rounding) / _UP
     q, arm = node["radius"] / r, node["arm"] / r
     if r <= 0.0 or q >= 1.0 or arm >= 1.0:
         return np.inf
@@ -118,7 +121,7 @@ def replacement_error(block: Block, node: dict[str, Any], rounding: float) -> fl
         node["third_moment"] * (4.0 - 3.0 * q) / (1.0 - q) ** 2 / r**5,
         node["fourth_moment"] * (5.0 - 4.0 * arm) / (1.0 - arm) ** 2 / r**6,
     )
-    return sum(terms) / np.pi
+    return _UP * sum(terms) / np.pi
 
 
 def segment_cost(block: Block, lit: dict[str, Any], length: float, rounding: float) -> float:
@@ -135,9 +138,10 @@ def segment_cost(block: Block, lit: dict[str, Any], length: float, rounding: flo
         r = np.linalg.norm(from_start - part * way) - rounding
         if r <= 0.0:
             return np.inf
+        r /= _UP
         cosines = min((up + rounding) / r, 1.0) * min((ahead + rounding) / r, 1.0)
         total += cost * cosines * min(r**-2, np.pi / (length * r)) / np.pi
-    return float(total)
+    return float(_UP * total)
 
 
 def meets_hull(corners: Reals, low: Reals, high: Reals, to_low: Reals, to_high: Reals) -> bool:
@@ -251,4 +255,4 @@ def traverse(
         errors.append(most)
 
     visit(1, False)
-    return Traversal(entries, errors, (lost, whole), (tallies[0], tallies[1]), tests)
+    return Traversal(entries, errors, (_UP * lost, _UP * whole), (tallies[0], tallies[1]), tests)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import math
+from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,11 +15,12 @@ import pytest
 from floors import floor_image
 from gpuvision.cli import main as cli
 from gpuvision.formats.field_file import read_field
-from gpuvision.host import ArraySource
+from gpuvision.host import ArraySource, Device
 from gpuvision.host.errors import RecordingError
 from gpuvision.matching.field.odometry import PoseEstimate, predict
+from gpuvision.matching.field.robot_filter import RobotState
 from gpuvision.status import Status
-from gpuvision.workflows.tracking_robot import read_odometry, track_robot
+from gpuvision.workflows.tracking_robot import RobotTrack, read_odometry, track_robot
 
 SCALE, SHAPE, WIDE = 0.04, (300, 330), 0.125
 MOTION = np.array([0.15, 0.02, 0.04])
@@ -177,3 +180,43 @@ def test_short_odometry_is_refused_before_the_first_frame(tmp_path: Path) -> Non
     source = ArraySource(np.zeros((4, *SHAPE), np.uint8))
     with pytest.raises(ValueError, match="has 2 motions, expected 3 between 4 frames"):
         track_robot(source, read_field("robocup_msl"), rate=10.0, odometry=np.zeros((2, 3)), scale=-1.0)
+
+
+def test_report_and_summary_of_a_track(device: Device) -> None:
+    covariance = np.diag([4e-4, 9e-4, 1e-4])
+    hypothesis = SimpleNamespace(estimate=SimpleNamespace(pose=np.array([1.0, 2.0, 0.5])), probability=0.75)
+    lost = RobotState(0.5, np.full(3, np.nan), np.full((3, 3), np.nan), 0.0, Status.NO_DATA, ())
+    found = RobotState(1.5, np.array([1.0, 2.0, 0.5]), covariance, 0.75, Status.OK, (hypothesis,))
+    field = read_field("robocup_msl")
+    track = RobotTrack(states=(lost, found), refused={0: "too dark"}, field=field, device=device)
+    unknown = dict.fromkeys(("x", "y", "theta", "sigma_x", "sigma_y", "sigma_theta"))
+    known = {"x": 1.0, "y": 2.0, "theta": 0.5, "sigma_x": 0.02, "sigma_y": pytest.approx(0.03), "sigma_theta": 0.01}
+    rows = [
+        {"frame": 0, "time": 0.5, **unknown, "probability": 0.0, "status": "NO_DATA"},
+        {"frame": 1, "time": 1.5, **known, "probability": 0.75, "status": "OK"},
+    ]
+    assert track.rows() == rows
+    assert track.report() == {
+        "gpuvision": version("gpuvision"),
+        "field": field.name,
+        "symmetric": True,
+        "frames": [
+            {**rows[0], "covariance": None, "hypotheses": [], "refused": "too dark"},
+            {
+                **rows[1],
+                "covariance": covariance.tolist(),
+                "hypotheses": [{"pose": [1.0, 2.0, 0.5], "probability": 0.75}],
+                "refused": None,
+            },
+        ],
+        "device": {"label": device.label, "name": device.name, "driver": device.driver},
+    }
+    assert track.summary() == (
+        "2 frames, 1 of them refused; last state OK, probability 0.750\nx 1.000 m, y 2.000 m, heading 28.65 degrees; "
+        "sigmas 20 mm, 30 mm, 0.57 degrees"
+    )
+    assert track.problem() is None
+    none = RobotTrack(states=(lost, lost), refused={0: "too dark", 1: "too dark"}, field=field, device=device)
+    assert none.summary() == "2 frames, 2 of them refused; last state NO_DATA\nno pose at the last frame"
+    assert none.problem() == "no pose in 2 frames: too dark"
+    assert RobotTrack(states=(lost,), refused={}, field=field, device=device).problem() == "no pose in 1 frames"

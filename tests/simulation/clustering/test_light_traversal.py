@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.simulation.clustering import light_clustering as module
@@ -17,6 +18,8 @@ from light_cuts import Block, Traversal, traverse
 
 MIDDLE = np.array([0.25, -0.5, 1.0])
 ROUNDING, MARGIN = 2e-3, 1.5e-3
+# No axis of the scenes is parallel to a coordinate axis.
+TURN = Rotation.from_euler("xyz", [0.5, -0.4, 0.7]).as_matrix()
 CAPACITY = 256
 TWO_WAYS = pytest.mark.parametrize("variant", ["vector", "work_item"])
 
@@ -39,7 +42,8 @@ def lit_segments(rng: np.random.Generator, count: int, size: float) -> NDArray[A
     way = rng.normal(size=(count, 3)) * [0.2, 0.2, 0.02] * size
     normal = [0.0, 0.0, 1.0] + 0.15 * rng.normal(size=(count, 3))
     normal -= way * (np.sum(normal * way, axis=1) / np.sum(way * way, axis=1))[:, None]
-    return np.hstack([start, start + way, normal, rng.uniform(0.2, 1.0, (count, 1))])
+    vectors = [each @ TURN.T for each in (start, start + way, normal)]
+    return np.hstack([*vectors, rng.uniform(0.2, 1.0, (count, 1))])
 
 
 def strips_around(rng: np.random.Generator, strips: int, count: int, far: tuple[float, float]) -> NDArray[Any]:
@@ -48,7 +52,14 @@ def strips_around(rng: np.random.Generator, strips: int, count: int, far: tuple[
     direction /= np.linalg.norm(direction, axis=2, keepdims=True)
     place = direction * rng.uniform(*far, (strips, 1, 1)) + rng.normal(size=(strips, count, 3)) * 0.01
     normal = -direction + 0.6 * rng.normal(size=(strips, 1, 3)) + 0.1 * rng.normal(size=(strips, count, 3))
-    return np.concatenate([place, normal], axis=2)
+    return np.concatenate([place @ TURN.T, normal @ TURN.T], axis=2)
+
+
+def some_triangles(rng: np.random.Generator) -> NDArray[Any]:
+    """Return triangles between segments and receivers, and triangles that rise little above the segments' planes."""
+    above = rng.normal((0.0, 0.0, 0.06), (0.05, 0.05, 0.02), (4, 1, 3)) + rng.normal(size=(4, 3, 3)) * 0.015
+    low = rng.normal(size=(4, 1, 3)) * [0.06, 0.06, 0.004] + rng.normal(size=(4, 3, 3)) * [0.015, 0.015, 0.006]
+    return np.concatenate([above, low]) @ TURN.T
 
 
 def compare(
@@ -62,7 +73,10 @@ def compare(
     triangles: NDArray[Any] | None = None,
     clusters: bool = True,
 ) -> list[Traversal]:
-    """Run the kernel and the oracle, compare all blocks, and return the oracle's results."""
+    """Run the kernel and the oracle, compare all blocks, and return the oracle's results.
+
+    The kernel computes in single: the scenes have no bound within 1e-5 of a limit.
+    """
     scene = None if triangles is None else Scene(triangles + MIDDLE)
     # The kernel computes relative to the middle of the frame. Tree and segments are given so, receivers are not.
     middle = MIDDLE if scene is None else scene.bvh.middle
@@ -96,8 +110,8 @@ def compare(
         each = traverse(block, nodes, tree.spans, lits, shares[strip], ROUNDING, local, MARGIN, clusters=clusters)
         assert counts[number] == len(each.entries)
         np.testing.assert_array_equal(selected[number, : counts[number]], each.entries)
-        np.testing.assert_allclose(errors[number, : counts[number]], each.errors, rtol=4e-4)
-        np.testing.assert_allclose(sums[number], each.sums, rtol=4e-4)
+        np.testing.assert_allclose(errors[number, : counts[number]], each.errors, rtol=3e-5)
+        np.testing.assert_allclose(sums[number], each.sums, rtol=3e-5)
         np.testing.assert_array_equal(tallies[number], each.tallies)
         expected.append(each)
     return expected
@@ -124,7 +138,7 @@ def test_triangles_that_may_occlude(device: Device, variant: Any) -> None:
     rng = np.random.default_rng(0)
     receivers = np.concatenate([strips_around(rng, 20, BLOCK, (0.1, 0.4)), strips_around(rng, 3, BLOCK, (1.0, 2.0))])
     costs = rng.uniform(0.5, 2.0, receivers.shape[:2])
-    corners = rng.normal(size=(9, 1, 3)) * [0.05, 0.05, 0.02] + [0.0, 0.0, 0.06] + rng.normal(size=(9, 3, 3)) * 0.02
+    corners = some_triangles(rng)
     shares = np.append(np.tile([0.0, 0.3, 3.0, 0.1], 5), np.full(3, 2e-3))
     expected = compare(device, variant, lit_segments(rng, 100, 0.03), receivers, costs, shares, triangles=corners)
     assert sum(any(k < 0 for k in each.entries) for each in expected) >= 5

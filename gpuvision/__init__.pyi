@@ -136,6 +136,9 @@ from .host import (
     Step as Step,
 )
 from .host import (
+    clear_cache as clear_cache,
+)
+from .host import (
     host_view as host_view,
 )
 from .host import (

@@ -9,6 +9,8 @@ from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
 from gpuvision.host.errors import (
     BuildError,
+    DeviceLostError,
+    DeviceMemoryError,
     DeviceUnusableError,
     GpuVisionError,
     NoDeviceError,
@@ -16,6 +18,7 @@ from gpuvision.host.errors import (
     RecordingError,
     StreamError,
 )
+from gpuvision.host.kept import clear_cache
 from gpuvision.host.launch import Launch, Precision, Spec, Specs, Variant, real_defines, real_of, uses_vectors
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, table_offsets, type_defines
 from gpuvision.host.operation import Operation
@@ -52,6 +55,8 @@ __all__ = [
     "Define",
     "Device",
     "DeviceArray",
+    "DeviceLostError",
+    "DeviceMemoryError",
     "DeviceUnusableError",
     "FileLimit",
     "FloatArray",
@@ -86,6 +91,7 @@ __all__ = [
     "WorkSize",
     "capacity",
     "ceil_div",
+    "clear_cache",
     "fitted_groups",
     "flags",
     "group_per_element",

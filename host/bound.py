@@ -6,7 +6,7 @@ import collections
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NoReturn, TypeVar
 
 import numpy as np
 import pyopencl as cl
@@ -14,7 +14,9 @@ import pyopencl.array
 
 from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
 from gpuvision.host.device import Device
+from gpuvision.host.failure import launch_failure
 from gpuvision.host.launch import Launchable, Spec, check_counts
+from gpuvision.host.process import after_fork, check_process
 from gpuvision.host.program import build
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -152,15 +154,32 @@ class Bound(Generic[R]):
         ------
         TypeError, ValueError
             Shape, dtype or device of an array differ from the bound shape, dtype or device.
+        DeviceMemoryError, DeviceLostError
+            The device has no memory or registers for the launch, or its context is lost.
         """
-        return self._enqueue(self._own if not frames and out is None else self._given(frames, out), wait_for)
+        given = self._own if not frames and out is None else self._given(frames, out)
+        try:
+            return self._enqueue(given, wait_for)
+        except cl.Error as error:
+            self._raise(error)
 
     def run(self, *frames: DeviceArray, out: R | None = None) -> R:
         """Launch, wait with the least delay, and return the written arrays: `out` or `outputs`."""
-        event = self._enqueue(self._own if not frames and out is None else self._given(frames, out))
-        if not self._queue_is_inline:
-            self._wait(event)
+        given = self._own if not frames and out is None else self._given(frames, out)
+        try:
+            event = self._enqueue(given)
+            if not self._queue_is_inline:
+                self._wait(event)
+        except cl.Error as error:
+            self._raise(error)
         return self.outputs if out is None else out
+
+    def _raise(self, error: cl.Error) -> NoReturn:
+        """Raise the exception of gpuvision for an error of the runtime."""
+        failure = launch_failure(error, self.device, self.queue, type(self.operation).__name__)
+        if failure is error:
+            raise error
+        raise failure from error
 
     def _given(self, frames: tuple[DeviceArray, ...], out: R | None) -> tuple[Any, ...]:
         """Return the arrays of a call in the kernel's order; the instance's arrays if no arrays are given."""
@@ -211,10 +230,13 @@ class Bound(Generic[R]):
         _check_apart(frames, targets, np.may_share_memory)
         if self._empty:
             return out
-        if self.device.shares_memory:
-            self._run_in_place(frames, targets)
-        else:
-            self._run_with_copies(frames, targets)
+        try:
+            if self.device.shares_memory:
+                self._run_in_place(frames, targets)
+            else:
+                self._run_with_copies(frames, targets)
+        except cl.Error as error:
+            self._raise(error)
         return out
 
     def _run_in_place(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
@@ -316,7 +338,10 @@ class Bound(Generic[R]):
 
     def _upload(self, table: HostArray) -> Any:
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
-        return cl.Buffer(self.device.context, flags, hostbuf=np.ascontiguousarray(table))
+        try:
+            return cl.Buffer(self.device.context, flags, hostbuf=np.ascontiguousarray(table))
+        except cl.Error as error:
+            self._raise(error)
 
     def _hold(self, event: Any, given: tuple[Any, ...]) -> None:
         """Keep references to arrays of the caller until the kernel has run."""
@@ -337,3 +362,16 @@ def _check_apart(inputs: Sequence[Any], outputs: Sequence[Any], same: Callable[[
     for number, output in enumerate(outputs):
         if any(same(output, other) for other in (*inputs, *outputs[:number])):
             raise ValueError("an output shares its memory with an input or another output; expected arrays apart")
+
+
+def _refuse_calls() -> None:
+    """Make the bound instances of a forked process raise: their kernels would never end. Costs nothing elsewhere."""
+
+    def refuse(*_: object, **__: object) -> None:
+        check_process()
+
+    setattr(Bound, "_enqueue", refuse)  # noqa: B010
+    setattr(Bound, "on_host", refuse)  # noqa: B010
+
+
+after_fork(_refuse_calls)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import threading
 import time
@@ -15,8 +16,10 @@ from numpy.typing import DTypeLike
 
 from gpuvision.host import discovery
 from gpuvision.host.arrays import SHARED_FLAGS, DeviceArray
-from gpuvision.host.errors import DeviceUnusableError, NoDeviceError
-from gpuvision.host.text import printable
+from gpuvision.host.errors import DeviceMemoryError, DeviceUnusableError, NoDeviceError
+from gpuvision.host.kept import clear_with
+from gpuvision.host.process import check_process
+from gpuvision.host.text import printable, size_in_words
 
 VARIABLE = "GPUVISION_DEVICE"
 _COMPLETE = cl.command_execution_status.COMPLETE
@@ -51,6 +54,8 @@ class Device:
         Cores of a CPU, multiprocessors of a GPU.
     has_double : bool
         Whether the device computes in double precision.
+    max_allocation : int
+        Size of the largest array [bytes].
     cache_bytes : int
         Size of the last-level cache, at least 32 MiB [bytes].
     inline_device : pyopencl.Device or None
@@ -63,15 +68,39 @@ class Device:
         self.label, self.kind = label, kind
         self.name, self.driver = printable(handle.name).strip(), printable(handle.driver_version)
         # The context is kept for the queue, too: Intel's runtime frees a context while a queue of it exists.
-        handles = [handle] if inline_device is None else [handle, inline_device]
-        self.context = queue.context if queue is not None else cl.Context(handles)
         self.inline_device = inline_device
+        self.context = queue.context if queue is not None else self._new_context()
         self.queue = queue if queue is not None else cl.CommandQueue(self.context, handle)
+        self._may_reopen = queue is None
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
         self.compute_units = int(handle.max_compute_units)
         self.has_double = bool(handle.double_fp_config)
+        self.max_allocation = int(handle.max_mem_alloc_size)
         self.cache_bytes = max(int(handle.global_mem_cache_size), _MIN_LAST_CACHE)
         self.shares_memory = self.is_cpu and _has_fine_grained_memory(handle)
+
+    def _new_context(self) -> Any:
+        return cl.Context([self.handle] if self.inline_device is None else [self.handle, self.inline_device])
+
+    def reopen(self) -> bool:
+        """Replace a lost context and its queue by new ones, once in the life of the object.
+
+        Returns
+        -------
+        bool
+            Whether the device has a new context. False where the caller owns the queue (`of`), where the device was
+            opened again before, and where the driver gives no new context.
+        """
+        with _opening:
+            if not self._may_reopen:
+                return False
+            self._may_reopen = False
+            try:
+                context = self._new_context()
+                self.queue, self.context = cl.CommandQueue(context, self.handle), context
+            except cl.Error:
+                return False
+            return True
 
     def __repr__(self) -> str:
         return f"Device({self.label}: {self.name}, driver {self.driver})"
@@ -165,6 +194,7 @@ class Device:
         ValueError
             The queue executes out of order.
         """
+        check_process()
         if isinstance(handle, cl.array.Array):
             handle = handle.queue if handle.queue is not None else handle.context
         if isinstance(handle, cl.Context):
@@ -283,14 +313,31 @@ class Device:
         -------
         pyopencl.array.Array
             Where `shares_memory`, `host_view` shows it to NumPy.
+
+        Raises
+        ------
+        DeviceMemoryError
+            The array is larger than the device allocates at once, or its memory is full.
         """
         queue = self.queue if queue is None else queue
         dtype = np.dtype(dtype)
-        if not self.shares_memory:
-            return cl.array.Array(queue, shape, dtype)
         # OpenCL refuses allocations of zero bytes; an empty batch needs one byte.
-        size = max(int(np.prod(shape, dtype=np.int64)) * dtype.itemsize, 1)
-        memory = cl.SVMAllocation(self.context, size, 0, SHARED_FLAGS, queue)
+        size = max(math.prod(shape) * dtype.itemsize, 1)
+        if size > self.max_allocation:
+            raise DeviceMemoryError(
+                f"an array of shape {tuple(shape)} and dtype {dtype} takes {size_in_words(size)}, device {self.label} "
+                f"allocates at most {size_in_words(self.max_allocation)} at once; split the input"
+            )
+        try:
+            if not self.shares_memory:
+                return cl.array.Array(queue, shape, dtype)
+            memory = cl.SVMAllocation(self.context, size, 0, SHARED_FLAGS, queue)
+        except cl.Error as error:
+            raise DeviceMemoryError(
+                f"device {self.label} cannot allocate {size_in_words(size)} for an array of shape {tuple(shape)} "
+                f"({str(error).splitlines()[0]}); split the input, or free the arrays of earlier shapes with "
+                "gpuvision.clear_cache()"
+            ) from error
         return cl.array.Array(queue, shape, dtype, data=memory)
 
 
@@ -334,3 +381,7 @@ def _adopt(queue: Any) -> Device:
             return Device(queue.device, listed.label, listed.kind, queue=queue)
     kind = discovery.kind_of(queue.device)
     return Device(queue.device, kind, kind, queue=queue)
+
+
+clear_with(_adopt.cache_clear)
+clear_with(_default_queue.cache_clear)

@@ -18,6 +18,7 @@ from typing import Any
 import pyopencl as cl
 
 from gpuvision.host.cache import cache_folder, provide_cache, read_private, write_private
+from gpuvision.host.process import begin_use, check_process
 from gpuvision.host.runtime import expose_installed_runtime, pin_workers, request_inline_device
 from gpuvision.host.text import printable
 
@@ -208,6 +209,7 @@ def _ask_probe(platform_index: int, device_index: int) -> str:
 @functools.cache
 def platforms() -> tuple[Any, ...]:
     """Return the OpenCL platforms, with Intel's pip-installed runtime; an empty tuple if no platform exists."""
+    begin_use()
     provide_cache()
     pin_workers()
     expose_installed_runtime()
@@ -268,6 +270,7 @@ def probed_devices(*, probe_again: bool = False) -> tuple[ProbedDevice, ...]:
     Verdicts are cached in the user's cache folder for each driver version. The first call on a machine takes about a
     second per device. The verdict of a busy device (no memory, no end within the time limit) is not cached.
     """
+    check_process()
     if probe_again:
         _probed_devices.cache_clear()
     return _probed_devices(trust_bad=not probe_again)

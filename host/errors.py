@@ -15,6 +15,14 @@ class DeviceUnusableError(GpuVisionError):
     """The requested device exists, and its probe failed."""
 
 
+class DeviceLostError(GpuVisionError):
+    """The context of a device is lost, with all its arrays, after an error of a kernel or of the driver."""
+
+
+class DeviceMemoryError(GpuVisionError, MemoryError):
+    """A device cannot allocate an array, or has no memory or registers for a launch."""
+
+
 class BuildError(GpuVisionError):
     """A kernel does not compile; the message contains the compiler's log."""
 

@@ -1,4 +1,4 @@
-"""Free memory of the machine and a device, and sizes in words."""
+"""Free memory of the machine and a device."""
 
 from __future__ import annotations
 
@@ -6,14 +6,6 @@ import os
 from pathlib import Path
 
 from gpuvision.host.device import Device
-
-
-def size_in_words(size: int) -> str:
-    """Return a number of bytes with a decimal unit."""
-    for unit, name in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
-        if size >= unit:
-            return f"{size / unit:.3g} {name}"
-    return f"{size} bytes"
 
 
 def free_bytes(device: Device) -> int:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import collections
 import operator
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -21,7 +20,10 @@ from numpy.typing import DTypeLike
 from gpuvision.host.arrays import DeviceArray, HostArray
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
+from gpuvision.host.errors import DeviceMemoryError
+from gpuvision.host.kept import clear_cache, kept_bound
 from gpuvision.host.launch import Launch, Specs
+from gpuvision.host.process import check_process
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -136,6 +138,7 @@ class Operation(Generic[R]):
         inputs: Sequence[DeviceArray] = (),
     ) -> Bound[R]:
         """Return a bound instance; a short launch is built for the queue only when it first waits for an event."""
+        check_process()
         device, dtype = _device(device), np.dtype(dtype)
         if queue is not None:
             device.check_queue(queue)
@@ -204,24 +207,21 @@ class Operation(Generic[R]):
 
     def _bound(self, device: Device, queue: Any, first: HostArray | DeviceArray) -> Bound[R]:
         """Return this thread's bound instance for a first input; bind a new instance if no cached instance fits."""
-        kept: collections.OrderedDict[Any, Bound[R]] = _kept_bound()
+        kept: collections.OrderedDict[Any, Bound[R]] = kept_bound()
         key = (self, device, queue, first.shape, first.dtype)
         if key not in kept:
-            kept[key] = self._bind(device, first.shape, first.dtype, queue)
+            try:
+                kept[key] = self._bind(device, first.shape, first.dtype, queue)
+            except DeviceMemoryError:
+                if not kept:
+                    raise
+                clear_cache()
+                kept = kept_bound()
+                kept[key] = self._bind(device, first.shape, first.dtype, queue)
             if len(kept) > _KEPT_BOUND:
                 kept.popitem(last=False)
         kept.move_to_end(key)
         return kept[key]
-
-
-# OpenCL kernel objects are not thread-safe: each thread has separate bound instances.
-_thread = threading.local()
-
-
-def _kept_bound() -> Any:
-    if not hasattr(_thread, "bound"):
-        _thread.bound = collections.OrderedDict()
-    return _thread.bound
 
 
 def _device(device: Device | None) -> Device:

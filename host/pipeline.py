@@ -25,7 +25,8 @@ from gpuvision.host.batch import Batch, default_batch
 from gpuvision.host.device import Device
 from gpuvision.host.device_clock import DeviceClock
 from gpuvision.host.errors import StreamError
-from gpuvision.host.memory import free_bytes, size_in_words
+from gpuvision.host.failure import launch_failure
+from gpuvision.host.memory import free_bytes
 from gpuvision.host.operation import Operation
 from gpuvision.host.report import StreamReport, StreamStatistics
 from gpuvision.host.ring import (
@@ -41,6 +42,7 @@ from gpuvision.host.ring import (
 )
 from gpuvision.host.sources import ArraySource, Clock, Source
 from gpuvision.host.stalls import StallRecorder
+from gpuvision.host.text import size_in_words
 from gpuvision.host.trace import Trace
 
 Policy = Literal["block", "drop_oldest", "raise"]
@@ -191,6 +193,7 @@ class Pipeline(Generic[R]):
         self._held: Slot[R] | None = None
         self._held_spans: dict[str, tuple[int, int]] = {}
         self._failure: StreamError | None = None
+        self._reported = False  # whether the loop has raised an error
         self._stopping = self._ended = False
         self._statistics.started = self._clock()
         self._stalls.start(self._statistics.started)
@@ -201,8 +204,13 @@ class Pipeline(Generic[R]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the stream, also after an exception."""
-        self.close()
+        """Close the stream; after an exception, a failure to close it becomes a note of the exception."""
+        try:
+            self.close()
+        except Exception as second:
+            if error is None:
+                raise
+            error.add_note(f"closing the stream failed, too: {second}")
 
     def stop(self) -> None:
         """Stop reading frames; batches in the ring are still delivered, then the loop ends. For any thread."""
@@ -219,7 +227,7 @@ class Pipeline(Generic[R]):
         Raises
         ------
         StreamError
-            The source does not return from a read.
+            The source does not return from a read, or the device has failed, unless the loop has reported a failure.
         """
         if self._state != "open":
             self._state = "closed"
@@ -233,9 +241,13 @@ class Pipeline(Generic[R]):
                 f"the source has not returned from a read for {self._limits.stop_timeout:.0f} s after the "
                 "stream's end; give it a stop() that ends the read"
             )
+        failure: Exception | None = None
         try:
             for queues in dict.fromkeys(self._queues):
-                queues.finish()
+                try:
+                    queues.finish()
+                except cl.Error as error:
+                    failure = launch_failure(error, self.device, queues.compute, "Pipeline")
         finally:
             self._release(self._clock())
             # Slots hold device memory: free it even where the caller keeps the stream for its report.
@@ -245,6 +257,8 @@ class Pipeline(Generic[R]):
             self.source.close()
         if self.trace is not None:
             self.trace.write()
+        if failure is not None and not self._reported:
+            raise StreamError(f"the device failed before the stream's end: {failure}") from failure
 
     # The producer's side ---------------------------------------------------------------------------------------
 
@@ -271,7 +285,10 @@ class Pipeline(Generic[R]):
                 stage = "source"
                 number += slot.count
                 ready.put(slot)
-        except BaseException as error:  # raised again in the consumer's thread
+        except BaseException as raised:  # raised again in the consumer's thread
+            error = raised
+            if isinstance(raised, cl.Error):
+                error = launch_failure(raised, self.device, self._queues[0].compute, "Pipeline")
             self._failure = _stopped(number, stage, error)
             self._failure.__cause__ = error
         ready.put(None)
@@ -326,6 +343,7 @@ class Pipeline(Generic[R]):
         if slot is None:
             self._ended = True
             if self._failure is not None:
+                self._reported = True
                 raise self._failure from self._failure.__cause__
             raise StopIteration
         self._held = slot
@@ -334,7 +352,9 @@ class Pipeline(Generic[R]):
             slot.wait()
         except cl.Error as error:
             self._ended = True
-            raise _stopped(slot.number, "operation", error) from error
+            cause = launch_failure(error, self.device, slot.queue, "Pipeline")
+            self._reported = True
+            raise _stopped(slot.number, "operation", cause) from cause
         return self._delivered(slot, now, taken_at, clock())
 
     def _delivered(self, slot: Slot[R], requested: int, taken: int, delivered: int) -> Batch[R]:

@@ -18,11 +18,12 @@ import numpy as np
 
 from gpuvision.host.device import Device
 from gpuvision.host.errors import StreamError
-from gpuvision.host.memory import free_bytes, size_in_words
+from gpuvision.host.memory import free_bytes
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Pipeline
 from gpuvision.host.ring import Step, slot_bytes, steps_of, takes_single_frames
 from gpuvision.host.sources import ArraySource, Source
+from gpuvision.host.text import size_in_words
 
 # Default batch sizes [frames] that are tried, doubling: the chosen one is at most twice the smallest that suffices.
 BATCHES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096)

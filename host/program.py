@@ -15,6 +15,7 @@ import pyopencl as cl
 from gpuvision.host.debug import debug_folder, dump_program, flatten_includes
 from gpuvision.host.device import Device
 from gpuvision.host.errors import BuildError
+from gpuvision.host.kept import clear_with
 
 _COMMENT = re.compile(r"[ \t]*//[^\n]*")
 
@@ -101,3 +102,6 @@ def _build(
     if debug_folder() is not None:
         dump(built.get_build_info(handle, cl.program_build_info.LOG))
     return built
+
+
+clear_with(_build.cache_clear)

@@ -12,9 +12,11 @@ import pyopencl as cl
 from gpuvision.host.arrays import HostArray, host_view
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
+from gpuvision.host.errors import DeviceMemoryError
 from gpuvision.host.launch import Spec, Specs, nbytes_of
 from gpuvision.host.operation import Operation
 from gpuvision.host.sequence import BoundSequence
+from gpuvision.host.text import size_in_words
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -229,6 +231,11 @@ class Slot(Generic[R]):
         """Whether all kernels run in the thread that launches the slot."""
         return self._first.inline and all(bound.inline for bound, _ in self._rest)
 
+    @property
+    def queue(self) -> Any:
+        """Queue of the operations."""
+        return self._queues.compute
+
     def launch(self) -> None:
         """Enqueue copies and operations of the batch without waiting."""
         raise NotImplementedError
@@ -285,8 +292,14 @@ class StagedSlot(Slot[R]):
         queue = self._queues.compute
         access: Any = cl.map_flags.READ | cl.map_flags.WRITE
         page_locked = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
-        memory = cl.Buffer(queue.context, page_locked, max(array.nbytes, 1))
-        host: HostArray = cl.enqueue_map_buffer(queue, memory, access, 0, array.shape, array.dtype)[0]
+        try:
+            memory = cl.Buffer(queue.context, page_locked, max(array.nbytes, 1))
+            host: HostArray = cl.enqueue_map_buffer(queue, memory, access, 0, array.shape, array.dtype)[0]
+        except cl.Error as error:
+            raise DeviceMemoryError(
+                f"the runtime cannot allocate {size_in_words(array.nbytes)} of page-locked memory "
+                f"({str(error).splitlines()[0]}); use a smaller ring or batch"
+            ) from error
         host.fill(0)
         return host
 

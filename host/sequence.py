@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+import pyopencl as cl
 
 from gpuvision.host.arrays import DeviceArray, HostArray, host_view
 from gpuvision.host.bound import Bound
@@ -188,7 +189,10 @@ class BoundSequence(Bound[R]):
     def run(self, *frames: DeviceArray, out: R | None = None) -> R:
         """Enqueue all stages, wait, and return the written arrays: `out` or `outputs`."""
         event = self(*frames, out=out)
-        self.device.wait(event)
+        try:
+            self.device.wait(event)
+        except cl.Error as error:
+            self._raise(error)
         return self.outputs if out is None else out
 
     def _run_in_place(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:

@@ -1,4 +1,4 @@
-"""Text from files, drivers and other programs, made safe for a terminal."""
+"""Text from files, drivers and other programs, made safe for a terminal; sizes in words."""
 
 from __future__ import annotations
 
@@ -19,3 +19,11 @@ def printable(text: str) -> str:
         return text
     plain = _ESCAPES.sub("", text)
     return "".join(each if each in "\n\t" or unicodedata.category(each) not in _UNSAFE else "?" for each in plain)
+
+
+def size_in_words(size: int) -> str:
+    """Return a number of bytes with a decimal unit."""
+    for unit, name in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if size >= unit:
+            return f"{size / unit:.3g} {name}"
+    return f"{size} bytes"

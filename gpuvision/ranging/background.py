@@ -361,7 +361,9 @@ def beside_line(profiles: npt.ArrayLike) -> npt.NDArray[np.bool_]:
     """
     levels = np.asarray(profiles)
     samples = levels.shape[-1]
-    beside = np.abs(np.arange(samples) - levels.argmax(axis=-1)[..., None]) > _STILL_LINE_REACH * samples
+    beside: npt.NDArray[np.bool_] = (
+        np.abs(np.arange(samples) - levels.argmax(axis=-1)[..., None]) > _STILL_LINE_REACH * samples
+    )
     return beside if beside.any() else ~beside
 
 

@@ -126,9 +126,9 @@ class FocusPeak(NamedTuple):
         maximum of nearly the same strength, or no maximum at all), NOT_FINITE.
     sigma
         Standard deviation of ``frame`` by the noise of the stack; None if the stack gives no noise. With the measure
-        "laplacian" it is NaN where it would exceed 0.1 frames, since it is too small there by up to 1.6, and in the
-        ``window + 1`` outermost rows and columns. `gpuvision.merge_height_maps` leaves out heights without a finite
-        standard deviation.
+        "laplacian" it is NaN where it would exceed 0.1 frames, since it is too small there by up to 1.6 (a factor that
+        depends on the texture), and in the ``window + 1`` outermost rows and columns. `gpuvision.merge_height_maps`
+        leaves out heights without a finite standard deviation.
     """
 
     frame: Float64
@@ -165,6 +165,9 @@ class FocusStack:
     read_noise : float, optional
         Standard deviation of a pixel without quantisation [grey levels], above 0; requests the standard deviations of
         the heights. Default: not known.
+    gain : float
+        Grey levels per electron, for shot noise: the variance of a pixel is ``read_noise**2 + gain * level``, plus 1/12
+        for integer frames. 0, the default: no shot noise. Only with ``read_noise``.
 
     Raises
     ------
@@ -201,6 +204,7 @@ class FocusStack:
     saturation: float | None = None
     principal_point_px: tuple[float, float] | None = None
     read_noise: float | None = None
+    gain: float = 0.0
 
     def __post_init__(self) -> None:
         if self.measure not in MEASURES:
@@ -213,6 +217,8 @@ class FocusStack:
             raise ValueError(f"FocusStack.ambiguity is {self.ambiguity}, expected a number above 0 and at most 1")
         if self.read_noise is not None and not finite(self.read_noise, "FocusStack.read_noise") > 0.0:
             raise ValueError(f"FocusStack.read_noise is {self.read_noise}, expected a number above 0 [grey levels]")
+        if finite(self.gain, "FocusStack.gain", minimum=0.0) > 0.0 and self.read_noise is None:
+            raise ValueError("FocusStack.gain is given without read_noise, which the noise of a pixel needs too")
 
     def sharpness(self, frame: npt.NDArray[Any]) -> Float32:
         """Compute the focus measure of each pixel of a frame, (rows, columns) [grey levels]."""
@@ -236,9 +242,12 @@ class FocusStack:
         if self.read_noise is None:
             raise ValueError("FocusStack.read_noise is None, expected the standard deviation of a pixel [grey levels]")
         quantisation = 1.0 / math.sqrt(12.0) if np.issubdtype(frame.dtype, np.integer) else 0.0
-        pixel = math.hypot(self.read_noise, quantisation)
+        pixel: float | Float64 = math.hypot(self.read_noise, quantisation)
+        if self.gain > 0.0:
+            # The level with its noise: unbiased, and the measure averages over the window.
+            pixel = np.sqrt(pixel**2 + self.gain * np.maximum(frame.astype(np.float64), 0.0))
         if self.measure == "intensity":
-            return np.full(frame.shape, pixel, np.float32)
+            return np.broadcast_to(pixel, frame.shape).astype(np.float32)
         return np.sqrt(laplacian_variance(frame, pixel, self.window)).astype(np.float32)
 
     def points(

@@ -29,6 +29,7 @@ def read_focus(table: Section) -> FocusStack:
             ambiguity=table.number("ambiguity", "share of the peak", None, above=0.0, at_most=1.0),
             saturation=table.number("saturation", "grey levels", None, above=0.0),
             read_noise=table.number("read_noise", "grey levels", None, above=0.0),
+            gain=table.number("gain", "grey levels per electron", default.gain, at_least=0.0),
             principal_point_px=_pair(table.numbers("principal_point_px", "pixel", (2,), None)),
         )
         table.finish()

@@ -42,6 +42,25 @@ def test_strong_texture_propagates_to_first_order(window: int, rng: np.random.Ge
         assert variance[row, column] == pytest.approx(noise**2 * square, rel=1e-6)
 
 
+@pytest.mark.parametrize("window", [0, 1, 2])
+def test_the_noise_of_each_pixel_is_propagated(window: int, rng: np.random.Generator) -> None:
+    """Shot noise: the variance is the sum over the pixels of derivative and standard deviation, squared."""
+    image = rng.uniform(0.0, 200.0, (11, 12))
+    noise = 1e-6 * np.sqrt(1.0 + image)
+    variance = laplacian_variance(image, noise, window)
+    for row, column in ((5, 6), (window + 1, 4), (6, 10 - window)):
+        square = 0.0
+        for place in np.ndindex(image.shape):
+            above, below = image.copy(), image.copy()
+            above[place] += 1e-3
+            below[place] -= 1e-3
+            ahead, behind = (mean_of_bends(each, row, column, window) for each in (above, below))
+            square += ((ahead - behind) / 2e-3 * noise[place]) ** 2
+        assert variance[row, column] == pytest.approx(square, rel=1e-6)
+    equal = laplacian_variance(image, np.full_like(image, 3.0), window)
+    np.testing.assert_allclose(equal, laplacian_variance(image, 3.0, window), rtol=1e-12)
+
+
 def test_the_border_has_no_variance(rng: np.random.Generator) -> None:
     variance = laplacian_variance(rng.uniform(0.0, 200.0, (9, 12)), 1.0, 1)
     expected = np.zeros((9, 12), bool)
@@ -69,17 +88,18 @@ def textures() -> dict[str, np.ndarray]:
     }
 
 
-def scatter_over_sigma(texture: str, noise: float, window: int, draws: int) -> tuple[float, float]:
+def scatter_over_sigma(texture: str, noise: float, window: int, draws: int, gain: float = 0.0) -> tuple[float, float]:
     """Return the median over the pixels of scatter over sigma of the sharpest frame, and the share with a sigma."""
     image = textures()[texture]
     image = 120.0 + 40.0 * (image - image.mean()) / image.std()
     clean = [scipy.ndimage.gaussian_filter(image, math.hypot(0.6, 0.5 * abs(k - 2.3))) for k in range(5)]
-    rng, stack = np.random.default_rng(5), FocusStack(geometry=STAGE, window=window, read_noise=noise)
+    rng, stack = np.random.default_rng(5), FocusStack(geometry=STAGE, window=window, read_noise=noise, gain=gain)
     places, sigmas = [], []
     for _ in range(draws):
         search = FocusSearch(stack, np.dtype(np.float64))
         for frame in clean:
-            search.add(frame + rng.normal(0.0, noise, frame.shape))
+            lit = frame if gain == 0.0 else gain * rng.poisson(frame / gain)
+            search.add(lit + rng.normal(0.0, noise, frame.shape))
         peak = search.peak()
         places.append(peak.frame)
         sigmas.append(peak.sigma)
@@ -109,6 +129,24 @@ def test_the_sharpest_frame_scatters_by_its_sigma(
     ratio, known = scatter_over_sigma(texture, noise, window, draws(16, 100))
     assert known > least
     assert 0.9 < ratio < 1.1
+
+
+@pytest.mark.parametrize(("texture", "gain", "window", "least"), [("white", 0.1, 2, 0.95), ("dots", 0.02, 2, 0.6)])
+def test_shot_noise_is_part_of_the_sigma(
+    texture: str, gain: float, window: int, least: float, draws: Callable[[int, int], int]
+) -> None:
+    """At a level of 120 the shot noise is 3.5 and 1.5 grey levels, and the read noise only 0.3."""
+    ratio, known = scatter_over_sigma(texture, 0.3, window, draws(16, 100), gain)
+    assert known > least
+    assert 0.9 < ratio < 1.1
+
+
+def test_a_pixel_has_read_and_shot_noise() -> None:
+    stack = FocusStack(geometry=STAGE, measure="intensity", read_noise=3.0, gain=0.16)
+    levels = np.array([[0, 100]], np.uint8)
+    np.testing.assert_allclose(stack.noise(levels), np.sqrt([[9 + 1 / 12, 25 + 1 / 12]]), rtol=1e-6)
+    with pytest.raises(ValueError, match="gain is given without read_noise"):
+        FocusStack(geometry=STAGE, gain=0.1)
 
 
 def test_noise_that_hides_the_texture_leaves_no_sigma() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,17 @@ def test_noise_scatters_the_heights_by_their_sigma(
     assert done.report()["error_budget"]["random"]["total"]["z"] == pytest.approx(np.nanmedian(done.errors.random.z))
     done.write(tmp_path / "out")
     assert (tmp_path / "out" / "range_image_sigma.tiff").exists()
+
+
+def test_shot_noise_of_the_sensor_file() -> None:
+    """The fit of symmetric frames depends on the two beside the peak, at 900 grey levels: variance 1 + 0.01 * 900."""
+    frames = (
+        np.full((5, 4, 4), 800.0, np.float32)
+        + 100.0 * (2 - np.abs(np.arange(5.0, dtype=np.float32) - 2))[:, None, None]
+    )
+    made = [sensor(measure="intensity", read_noise=1.0, gain=gain) for gain in (0.0, 0.01)]
+    sigmas = [np.nanmedian(done.errors.random.z) for done in (scan(frames, each) for each in made) if done.errors]
+    assert sigmas[1] / sigmas[0] == pytest.approx(math.sqrt(10.0), rel=1e-5)
 
 
 def test_a_laplacian_has_a_sigma_within_the_border(rng: np.random.Generator) -> None:

@@ -8,7 +8,7 @@ CACHES := XDG_CACHE_HOME="$(CURDIR)/build/cache" MPLCONFIGDIR="$(CURDIR)/build/c
 # otherwise.
 PYTEST = PYTHONDONTWRITEBYTECODE= .venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
 
-.PHONY: demo test test-full nightly fuzz mutants lint docs clean
+.PHONY: demo test test-full nightly fuzz mutants offline lint docs clean
 
 demo: .venv/ready
 	.venv/bin/gpuvision demo
@@ -24,6 +24,7 @@ nightly: .venv/ready-tests
 	$(PYTEST) --tier nightly
 	$(MAKE) fuzz FUZZ_ARGS="--engine atheris --runs 20000 --seconds 60"
 	$(MAKE) mutants
+	$(MAKE) offline
 
 # Fuzz the readers of files: see tests/fuzz/run.py. FUZZ_ARGS: its options, and readers such as sensor.toml.
 FUZZ_ARGS ?= --runs 100000
@@ -36,6 +37,13 @@ MUTANTS_ARGS ?= --sample 100 --seed 1
 mutants: .venv/ready-tests
 	.venv/bin/python -m pip --quiet --disable-pip-version-check install --editable ".[mutants]"
 	.venv/bin/python tests/mutants/run.py $(MUTANTS_ARGS)
+
+# Compile the kernels for GPUs that need not be present (Debian packages clang-16 and libclc-16). OFFLINE_ARGS: targets
+# and options of `gpuvision profile`. Compiled kernels are cached: a second run compiles only the changed ones.
+OFFLINE_ARGS ?= --offline sm_70 --offline sm_90 --offline gfx90a --offline gfx1100
+offline: .venv/ready
+	.venv/bin/python -m pip --quiet --disable-pip-version-check install --editable ".[offline]"
+	$(CACHES) .venv/bin/gpuvision profile $(OFFLINE_ARGS)
 
 # Type checkers do not understand setuptools' package-dir or its import hook for editable installs. Symbolic links in
 # build/lint give the package the layout of an installed wheel, so that messages name the real files.

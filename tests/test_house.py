@@ -193,6 +193,7 @@ FLOORS = (
     ("formats", "plots"),
     ("sensor",),
     ("workflows",),
+    ("profiling.offline",),
     ("profiling",),
     ("cli",),
     ("__main__",),

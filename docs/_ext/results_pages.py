@@ -1,6 +1,7 @@
 """Sphinx extension: one page for every file of ``profiling/results``, with all of its rows.
 
 All rows are printed in the order of the run, including the rows in which a peer is faster; their number is printed.
+The files ``offline-*.json`` hold the resources of kernels compiled for GPUs (``gpuvision profile --offline``).
 """
 
 from __future__ import annotations
@@ -92,16 +93,70 @@ def run_page(name: str, run: Mapping[str, Any]) -> str:
     return "\n".join(parts)
 
 
+_LIMITS = {
+    "spills": "spilled registers on NVIDIA [bytes]",
+    "spills_amd": "spilled registers on AMD [bytes]",
+    "spills_double": "spilled registers of builds in double precision [bytes]",
+    "local": "local memory of a work-group [bytes]",
+}
+
+
+def _resources(row: Mapping[str, Any] | None) -> str:
+    if row is None or "fault" in row:
+        return "" if row is None else f"**{row['fault']}**"
+    spills = f" / {row['spills']}" if row["spills"] else ""
+    return f"{row['registers']} / {row['stack']}{spills}"
+
+
+def offline_page(name: str, report: Mapping[str, Any]) -> str:
+    """Return the page of the kernels compiled for GPUs: a row for each kernel of each build."""
+    targets, rows = list(report["compilers"]), report["rows"]
+    found = {(row["source"], row["case"], row["kernel"], row["target"]): row for row in rows}
+    kernels = dict.fromkeys(key[:3] for key in found)
+    cells = []
+    for key in kernels:
+        of_targets = [found.get((*key, target)) for target in targets]
+        local = max((row.get("local", 0) for row in of_targets if row), default=0)
+        cells.append((f"``{key[2]}``", key[1], *map(_resources, of_targets), str(local)))
+    used = [f"- ``{target}``: {'; '.join(words)}." for target, words in report["compilers"].items()]
+    limits = [f"- {words}: {report['limits'][key]}." for key, words in _LIMITS.items()]
+    return "\n".join(
+        [
+            ":html_theme.sidebar_secondary.remove:\n",
+            title(name),
+            "Resources of the kernels compiled for GPUs that were not present: registers of a work-item (on AMD vector",
+            "registers), its stack [bytes] and, where there are any, its spilled registers [bytes]. They are no times.",
+            f"Command: ``gpuvision profile {' '.join(f'--offline {each}' for each in targets)} --json FILE``.\n",
+            "\n".join(used) + "\n",
+            "Limits of the check:\n",
+            "\n".join(limits) + "\n",
+            table(("kernel", "build", *targets, "local memory [B]"), cells, css_class="results"),
+        ]
+    )
+
+
 def results_pages(source: Path = SOURCE) -> dict[str, str]:
     """Return all pages by file name."""
-    runs = {path.stem: json.loads(path.read_text()) for path in sorted(source.glob("*.json"))}
+    files = {path.stem: json.loads(path.read_text()) for path in sorted(source.glob("*.json"))}
+    runs = {name: run for name, run in files.items() if not name.startswith("offline-")}
+    offline = {name: report for name, report in files.items() if name not in runs}
     pages = {f"{name}.rst": run_page(name, run) for name, run in runs.items()}
+    pages |= {f"{name}.rst": offline_page(name, report) for name, report in offline.items()}
     rows = []
     for name, run in runs.items():
         operations = dict.fromkeys(row["operation"] for row in run["rows"])
         slower = sum(row["ratio"] < 1.0 for row in run["rows"])
         rows.append((f":doc:`{name}`", ", ".join(operations), str(len(run["rows"])), str(slower)))
-    parts = [title("Runs"), table(("run", "operations", "rows", "rows with a faster peer"), rows), toctree(runs)]
+    compiled = [
+        (f":doc:`{name}`", ", ".join(report["compilers"]), str(len(report["rows"]))) for name, report in offline.items()
+    ]
+    parts = [
+        title("Runs"),
+        table(("run", "operations", "rows", "rows with a faster peer"), rows),
+        title("Kernels compiled for GPUs", "-"),
+        table(("report", "targets", "rows"), compiled),
+        toctree(files),
+    ]
     pages["index.rst"] = "\n".join(parts)
     return pages
 

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpuvision.cli.arguments import Overwrite, ReportFile, echo, named_path, prints_report
+from gpuvision.cli.arguments import Overwrite, ReportFile, echo, named_path, prints_report, reject_unused
 from gpuvision.host.errors import GpuVisionError
 
 if TYPE_CHECKING:
     from gpuvision.profiling.harness import Row
 
+_SECONDS = 2.0
 _NO_PLOTS = "no plots: these operations have no series over size or tolerance; try light_clustering or reflections"
 
 
@@ -29,7 +30,7 @@ def profile(
             help="Label of an OpenCL device, see `gpuvision devices`; repeat the option for several. Default: all.",
         ),
     ] = None,
-    seconds: Annotated[float, typer.Option(help="Approximate time to measure each case [s].", min=0.01)] = 2.0,
+    seconds: Annotated[float, typer.Option(help="Approximate time to measure each case [s].", min=0.01)] = _SECONDS,
     as_json: ReportFile = None,
     plots: Annotated[
         Path | None,
@@ -39,6 +40,17 @@ def profile(
             help="Folder for plots of time and error over the amount of work and over the tolerance.",
         ),
     ] = None,
+    offline: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TARGET",
+            help="Compile the kernels for this GPU (sm_70, sm_90, gfx90a, gfx1100), which need not be present, instead "
+            "of measuring; repeat the option for several. OPERATION then names kernel files, such as line or pose.",
+        ),
+    ] = None,
+    one_build: Annotated[
+        bool, typer.Option("--one-build", help="With --offline: compile only the first build of each kernel file.")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure operations against their peers: NumPy, Numba, OpenCV.
@@ -46,7 +58,20 @@ def profile(
     Candidates run interleaved. The ratio is the time of the peer over the time of gpuvision. A run during which the
     machine changed its speed is marked invalid, and the exit code is 1. If the measurement of an operation fails, the
     others are still measured; the report names the operation and the reason, and the exit code is 1.
+
+    With --offline nothing is measured: the kernels are compiled for GPUs by Clang and NVIDIA's ptxas. The table shows
+    the registers, stack, spilled registers and local memory of each kernel. The exit code is 1 if a kernel does not
+    compile, calls a function without a body, spills more registers than the limit, or takes more than 32 KiB of local
+    memory.
     """
+    if offline:
+        from gpuvision.cli.profile_offline import profile_offline
+
+        measures = {"device": device or None, "seconds": None if seconds == _SECONDS else seconds, "plots": plots}
+        reject_unused("with --offline", **measures)
+        profile_offline(offline, operations or (), as_json, one_build=one_build, overwrite=overwrite)
+        return
+    reject_unused("without --offline", one_build=one_build)
     if importlib.util.find_spec("numba") is None:
         raise GpuVisionError("the peer numba is missing; install it: pip install 'gpuvision[profile]'")
     from gpuvision.host import Device

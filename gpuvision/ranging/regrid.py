@@ -247,17 +247,17 @@ class Regrid:
             raise TypeError(f"Regrid.sigma is {self.sigma}; expected the standard deviation of z if it is True")
         along, across = (x, y) if self.along[-1] == "x" else (y, x)
         more = () if sigma is None else (sigma,)
-        lines = self._along_samples()(along, z, intensity, status, across, *more, device=device)
+        along_samples, along_profiles = self.passes
+        lines = along_samples(along, z, intensity, status, across, *more, device=device)
         kept = () if sigma is None else (lines.sigma,)
-        return self._along_profiles()(
-            lines.across, lines.z, lines.intensity, lines.status, *kept, device=device, out=out
+        return along_profiles(lines.across, lines.z, lines.intensity, lines.status, *kept, device=device, out=out)
+
+    @property
+    def passes(self) -> tuple[_AlongSamples, _AlongProfiles]:
+        """Operations of the two passes: along the samples of each profile, then along the profiles."""
+        return _AlongSamples(regrid=self, direction=self.along), _AlongProfiles(
+            regrid=self, direction=self.directions[1]
         )
-
-    def _along_samples(self) -> _AlongSamples:
-        return _AlongSamples(regrid=self, direction=self.along)
-
-    def _along_profiles(self) -> _AlongProfiles:
-        return _AlongProfiles(regrid=self, direction=self.directions[1])
 
 
 class BoundRegrid:
@@ -276,9 +276,10 @@ class BoundRegrid:
     ) -> None:
         self.operation, self.device = regrid, device
         self._x_first = regrid.along[-1] == "x"
-        self._samples: Bound[_Lines] = regrid._along_samples().bind(device, shape, dtype, queue=queue)
+        along_samples, along_profiles = regrid.passes
+        self._samples: Bound[_Lines] = along_samples.bind(device, shape, dtype, queue=queue)
         self._lines = self._samples.outputs
-        self._profiles: Bound[HeightMap] = regrid._along_profiles().bind(
+        self._profiles: Bound[HeightMap] = along_profiles.bind(
             device, self._lines.z.shape, self._lines.z.dtype, queue=queue
         )
         along, z, intensity, status, across, *sigma = self._samples.inputs

@@ -180,6 +180,24 @@ class LightClustering:
         _check_metres(chosen, "LightClustering.tolerance")
         return chosen
 
+    def selection(self, nodes: int, segments: int) -> _SelectLights:
+        """Return the operation that selects the lights of each block of receivers.
+
+        Parameters
+        ----------
+        nodes, segments : int
+            Nodes of the light tree, and segments in it.
+        """
+        return _SelectLights(
+            nodes=nodes,
+            segments=segments,
+            capacity=self._capacity_used[0],
+            scene=self.scene,
+            clearance=self.clearance,
+            clusters=self.clusters,
+            variant=self.variant,
+        )
+
 
 def _check_metres(value: float, what: str) -> None:
     if not (math.isfinite(value) and value >= 0.0):
@@ -440,15 +458,7 @@ def _select_lights(
     device: Device,
 ) -> _Selection:
     while True:
-        operation = _SelectLights(
-            nodes=len(spans),
-            segments=len(placed),
-            capacity=clustering._capacity_used[0],
-            scene=clustering.scene,
-            clearance=clustering.clearance,
-            clusters=clustering.clusters,
-            variant=clustering.variant,
-        )
+        operation = clustering.selection(len(spans), len(placed))
         found = operation(receivers, costs, shares, rows, spans, placed, frame, device=device)
         max_count = int(to_numpy(found.counts).max(initial=0))
         if max_count <= clustering._capacity_used[0]:

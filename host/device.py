@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 import os
@@ -31,6 +32,9 @@ _LOCAL_THREAD_QUEUE = 1 << 31  # CL_QUEUE_THREAD_LOCAL_EXEC_ENABLE_INTEL
 # Lower bound of the last-level cache: Intel's runtime reports the second level only. 32 MiB is a common third level of
 # servers. On a processor with less, kernels only begin later to write past the caches.
 _MIN_LAST_CACHE = 32 << 20
+# Kinds of runtimes whose compilers map vectors of 16 to the registers of a CPU. Mesa's rusticl calls its CPU device a
+# CPU too, and ends the process in such kernels ("LLVM ERROR: Unsupported vector type with 64 elements!", Mesa 22.3).
+_VECTOR_RUNTIMES = ("pocl", "intel")
 
 
 class Device:
@@ -47,7 +51,10 @@ class Device:
     label, kind, name, driver : str
         Short unique name, vendor (``pocl``, ``intel``, ``nvidia``, ...), full name, driver version.
     is_cpu : bool
-        Whether the device is a CPU. Kernels run their vector variant there, and one work-item per element elsewhere.
+        Whether the device is a CPU.
+    prefers_vectors : bool
+        Whether kernels run their vector variant by default: on the CPU devices of PoCL and Intel's runtime. Other
+        runtimes run one work-item per element: some of them abort the process on vectors of 16, or spill them.
     shares_memory : bool
         Whether host and device read and write the same allocations without map or copy (fine-grained SVM).
     compute_units : int
@@ -73,6 +80,7 @@ class Device:
         self.queue = queue if queue is not None else cl.CommandQueue(self.context, handle)
         self._may_reopen = queue is None
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
+        self.prefers_vectors = self.is_cpu and kind in _VECTOR_RUNTIMES
         self.compute_units = int(handle.max_compute_units)
         self.has_double = bool(handle.double_fp_config)
         self.max_allocation = int(handle.max_mem_alloc_size)
@@ -223,6 +231,12 @@ class Device:
                 "the device Device.of(queue)"
             )
         _check_order(queue)
+
+    def without_vectors(self) -> Device:
+        """Return this device, with its context and queue, for kernels in one work-item per element."""
+        scalar = copy.copy(self)
+        scalar.prefers_vectors = False
+        return scalar
 
     def wait(self, event: Any) -> None:
         """Wait for an event with the least delay.

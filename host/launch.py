@@ -170,7 +170,7 @@ class Launchable(Protocol):
 
 
 def uses_vectors(variant: Variant, device: Device) -> bool:
-    """Decide between the vector variant of a kernel (CPU runtimes) and one work-item per element."""
+    """Decide between the vector variant of a kernel and one work-item per element."""
     if variant not in ("auto", "vector", "work_item"):
         raise ValueError(f"variant must be 'auto', 'vector' or 'work_item', got {variant!r}")
-    return device.is_cpu if variant == "auto" else variant == "vector"
+    return device.prefers_vectors if variant == "auto" else variant == "vector"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import collections
 import operator
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -20,7 +21,7 @@ from numpy.typing import DTypeLike
 from gpuvision.host.arrays import DeviceArray, HostArray
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
-from gpuvision.host.errors import DeviceMemoryError
+from gpuvision.host.errors import BuildError, DeviceMemoryError
 from gpuvision.host.kept import clear_cache, kept_bound
 from gpuvision.host.launch import Launch, Specs
 from gpuvision.host.process import check_process
@@ -124,6 +125,11 @@ class Operation(Generic[R]):
             The operation does not take such input, or the queue is of another context or runs out of order.
         BuildError
             The kernel does not compile on this device.
+
+        Warns
+        -----
+        RuntimeWarning
+            The vector variant of the kernel does not compile on this device, and its work-item variant runs instead.
         """
         bound = self._bind(device, shape, dtype, queue, inputs)
         bound.prepare_queue()
@@ -146,7 +152,16 @@ class Operation(Generic[R]):
             raise TypeError(
                 f"expected native byte order, got {dtype.str}; convert it with .astype(dtype.newbyteorder('='))"
             )
-        return self._bound_to(device, tuple(map(operator.index, shape)), dtype, queue, inputs)
+        shape = tuple(map(operator.index, shape))
+        try:
+            return self._bound_to(device, shape, dtype, queue, inputs)
+        except BuildError as error:
+            if not device.prefers_vectors:
+                raise
+            bound = self._bound_to(device.without_vectors(), shape, dtype, queue, inputs)
+            reason = str(error).splitlines()[0]
+            warnings.warn(f"work-items replace vectors on {device.label}: {reason}", RuntimeWarning, stacklevel=2)
+            return bound
 
     def _bound_to(
         self,

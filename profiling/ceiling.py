@@ -30,14 +30,14 @@ def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[
     source.set(np.ones(source.shape, np.float32))
     target.set(np.ones(target.shape, np.float32))  # maps the pages before the first timed run
     kernel = cl.Kernel(
-        build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "move" if device.is_cpu else "move_items"
+        build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "move" if device.prefers_vectors else "move_items"
     )
     kernel.set_args(memory_of(source), memory_of(target), np.int64(reads), np.int64(writes))
-    items = device.compute_units * _ITEMS_PER_UNIT * (1 if device.is_cpu else 64)
+    items = device.compute_units * _ITEMS_PER_UNIT * (1 if device.prefers_vectors else 64)
 
     def run(kept: object = (source, target)) -> None:
         for _ in range(repeats):
-            event = cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.is_cpu else None)
+            event = cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.prefers_vectors else None)
         device.wait(event)
 
     run()
@@ -49,15 +49,15 @@ def flop_rate(device: Device, *, seconds: float = 0.15) -> float:
 
     Two calls differ if the machine changed its speed between them.
     """
-    items = device.compute_units * (4 if device.is_cpu else 4096)
+    items = device.compute_units * (4 if device.prefers_vectors else 4096)
     target = device.empty((items * 16,), np.float32)
     kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "compute")
-    steps = 20_000 if device.is_cpu else 2_000
+    steps = 20_000 if device.prefers_vectors else 2_000
     kernel.set_args(memory_of(target), np.float32(1.0), np.float32(0.5), np.int32(steps))
     rates: list[float] = []
     end = time.perf_counter() + seconds
     while len(rates) < 5 or time.perf_counter() < end:
         start = time.perf_counter()
-        cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.is_cpu else None).wait()
+        cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.prefers_vectors else None).wait()
         rates.append(items * steps * _FLOPS_PER_STEP / (time.perf_counter() - start))
     return float(np.median(rates[1:]))

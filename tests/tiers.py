@@ -107,7 +107,7 @@ def without_other_variants(items: Sequence[pytest.Item]) -> Iterator[pytest.Item
 def _has_usual_variant(item: pytest.Item) -> bool:
     """Return whether a kernel test has the variant that its device uses by default; True for other tests."""
     device, variant = device_of(item), _parameters_of(item).get("variant")
-    return device is None or variant != ("work_item" if device.is_cpu else "vector")
+    return device is None or variant != ("work_item" if device.prefers_vectors else "vector")
 
 
 def _designed(items: Sequence[pytest.Item], *, pairs: bool = False) -> Iterator[pytest.Item]:

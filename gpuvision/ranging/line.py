@@ -335,7 +335,7 @@ class LineReadout(VisionOperation[LineReading]):
             work=work,
             more_inputs=[(of_samples, build.real)] if self.peak_selection == "nearest" else [],
             outputs=build.outputs({name: of_samples if name in chosen else None for name in LineReading._fields}),
-            defines=self._defines(dtype, length, build.real, profiles) | flags(PREFETCH=device.is_cpu),
+            defines=self._defines(dtype, length, build.real, profiles) | flags(PREFETCH=device.prefers_vectors),
             arguments=[
                 np.int32(rows),
                 np.int32(columns),

@@ -406,7 +406,7 @@ class _Pass(VisionOperation[R]):
             "regrid/regrid.cl",
             "resample",
             # A CPU runtime that runs several lines in one group spills the state of each line.
-            work=WorkSize((lines,), (1,)) if build.device.is_cpu else padded_groups(lines, _GROUP),
+            work=WorkSize((lines,), (1,)) if build.device.prefers_vectors else padded_groups(lines, _GROUP),
             more_inputs=[value, value, (build.shape, np.dtype(np.uint8)), *([value] * (with_other + with_sigma))],
             outputs=build.outputs(made_by_name),
             defines=type_defines("INPUT", build.dtype) | flags(WITH_OTHER=with_other, WITH_SIGMA=with_sigma),

@@ -229,3 +229,22 @@ def test_queue_without_order_is_refused(device: Device) -> None:
 def test_object_that_is_no_queue_is_refused(device: Device) -> None:
     with pytest.raises(TypeError, match=r"expected a pyopencl queue, got Context; Device\.new_queue"):
         READOUT.bind(device, (4, 2), np.float32, queue=device.context)
+
+
+
+@pytest.mark.parametrize(
+    ("kind", "type_", "expected"),
+    [("pocl", "CPU", True), ("intel", "CPU", True), ("rusticl", "CPU", False), ("pocl", "GPU", False)],
+)
+def test_only_known_cpu_runtimes_prefer_vectors(device: Device, kind: str, type_: str, expected: bool) -> None:
+    """PoCL also drives GPUs, and Mesa's rusticl calls a device a CPU whose compiler has no vectors of 16."""
+
+    class Handle:
+        type = getattr(cl.device_type, type_)
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(device.handle, name)
+
+    assert Device(Handle(), kind, kind, queue=device.queue).prefers_vectors is expected
+    assert not device.without_vectors().prefers_vectors
+    assert device.without_vectors().context is device.context

@@ -49,7 +49,7 @@ class Machine:
     label = "machine"
 
     def __init__(self, *, is_cpu: bool = True, has_double: bool = True) -> None:
-        self.is_cpu, self.has_double = is_cpu, has_double
+        self.is_cpu, self.prefers_vectors, self.has_double = is_cpu, is_cpu, has_double
         self.compute_units, self.cache_bytes = 2, 32 << 20
 
 

@@ -130,5 +130,28 @@ def test_a_kernel_of_ones_own_that_does_not_compile(
     monkeypatch.setattr(type(correct), "kernel_folder", tmp_path)
     with pytest.raises(BuildError, match=r"/scale_offset/scale_offset\.cl does not build with .*-DINPUT=uchar"):
         correct.bind(device, (5, 7), np.uint8)
-    (path,) = (tmp_path / "debug").glob("*.cl")
-    assert "typedef float real;" in path.read_text()
+    paths = list((tmp_path / "debug").glob("*.cl"))
+    assert len(paths) == 1 + device.prefers_vectors  # the variant for vectors, then the variant for work-items
+    assert all("typedef float real;" in path.read_text() for path in paths)
+
+
+def test_a_vector_variant_that_does_not_compile_is_replaced_by_work_items(
+    example: dict[str, Any], correct: Any, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Compilers of other processors may reject vectors of 16; a variant that the caller asks for is never replaced."""
+    source = (EXAMPLE.parent / "kernels" / "scale_offset" / "scale_offset.cl").read_text()
+    (tmp_path / "scale_offset").mkdir()
+    guard = "#ifdef VECTOR_VARIANT\n#error vectors of 16\n#endif\n"
+    (tmp_path / "scale_offset" / "scale_offset.cl").write_text(guard + source)
+    monkeypatch.setattr(type(correct), "kernel_folder", tmp_path)
+    frames = np.arange(35, dtype=np.uint8).reshape(5, 7)
+    if device.prefers_vectors:
+        with pytest.warns(RuntimeWarning, match=rf"work-items replace vectors on {device.label}: .*scale_offset\.cl"):
+            bound = correct.bind(device, frames.shape, frames.dtype)
+    else:
+        bound = correct.bind(device, frames.shape, frames.dtype)
+    np.testing.assert_allclose(bound.on_host((frames,)).image, expected(correct, frames), atol=1e-4)
+    assert device.prefers_vectors == Device.named(device.label).prefers_vectors
+    vectors = example["FlatField"](offset=correct.offset, gain=correct.gain, variant="vector")
+    with pytest.raises(BuildError, match="vectors of 16"):
+        vectors.bind(device, frames.shape, frames.dtype)

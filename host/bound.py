@@ -191,6 +191,8 @@ class Bound(Generic[R]):
         site = self._queue_site if self._inline_site is None else self._site(wait_for)
         if given is not site.given:
             self._set_arrays(site, given)
+        if wait_for:
+            _flush_queues(wait_for, self.queue)
         if self._empty:
             return cl.enqueue_marker(self.queue, wait_for=wait_for)
         if site.inline:
@@ -260,10 +262,12 @@ class Bound(Generic[R]):
 
     def _run_with_copies(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
         for array, frame in zip(self.inputs, frames, strict=True):
-            cl.enqueue_copy(self.queue, memory_of(array), frame, is_blocking=False)
+            if frame.size:  # OpenCL refuses copies of zero bytes
+                cl.enqueue_copy(self.queue, memory_of(array), frame, is_blocking=False)
         self()
         for array, target in zip(self._computed(self.outputs), targets, strict=True):
-            cl.enqueue_copy(self.queue, target, memory_of(array), is_blocking=False)
+            if target.size:
+                cl.enqueue_copy(self.queue, target, memory_of(array), is_blocking=False)
         self.queue.finish()
 
     def _computed(self, result: R) -> tuple[Any, ...]:
@@ -281,7 +285,7 @@ class Bound(Generic[R]):
             if array is not before:
                 self._check(array, *spec)
         inputs = len(self.inputs)
-        _check_apart(given[:inputs], given[inputs:], lambda a, b: a.base_data is b.base_data)
+        _check_apart(given[:inputs], given[inputs:], _same_memory)
         for place, array, before in zip(self._places, given, site.given, strict=True):
             if array is not before:
                 site.kernel.set_arg(place, self._known.get(id(array)) or memory_of(array))
@@ -355,6 +359,23 @@ def _buffer_over(context: Any, array: DeviceArray) -> Any:
     """Return a buffer over the shared memory of an array."""
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
     return cl.Buffer(context, flags, hostbuf=host_view(array)) if array.nbytes else None
+
+
+def _flush_queues(events: Sequence[Any], queue: Any) -> None:
+    """Flush the other queues of some events before `queue` waits for them.
+
+    OpenCL 3.0, 5.15: a queue may wait forever for an event of another queue that was not flushed. Mesa's rusticl does.
+    """
+    for event in events:
+        if event.command_execution_status > _COMPLETE:
+            other = event.get_info(cl.event_info.COMMAND_QUEUE)  # None: an event that the user completes
+            if other is not None and other != queue:
+                other.flush()
+
+
+def _same_memory(one: DeviceArray, other: DeviceArray) -> bool:
+    """Return whether two arrays have the same memory; pyopencl gives an empty array no memory."""
+    return one.base_data is not None and one.base_data is other.base_data
 
 
 def _check_apart(inputs: Sequence[Any], outputs: Sequence[Any], same: Callable[[Any, Any], bool]) -> None:

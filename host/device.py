@@ -343,9 +343,10 @@ class Device:
                 f"allocates at most {size_in_words(self.max_allocation)} at once; split the input"
             )
         try:
-            if not self.shares_memory:
-                return cl.array.Array(queue, shape, dtype)
-            memory = cl.SVMAllocation(self.context, size, 0, SHARED_FLAGS, queue)
+            if self.shares_memory:
+                memory = cl.SVMAllocation(self.context, size, 0, SHARED_FLAGS, queue)
+            else:
+                memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size)
         except cl.Error as error:
             raise DeviceMemoryError(
                 f"device {self.label} cannot allocate {size_in_words(size)} for an array of shape {tuple(shape)} "

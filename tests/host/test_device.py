@@ -231,7 +231,6 @@ def test_object_that_is_no_queue_is_refused(device: Device) -> None:
         READOUT.bind(device, (4, 2), np.float32, queue=device.context)
 
 
-
 @pytest.mark.parametrize(
     ("kind", "type_", "expected"),
     [("pocl", "CPU", True), ("intel", "CPU", True), ("rusticl", "CPU", False), ("pocl", "GPU", False)],

@@ -201,25 +201,42 @@ class PidController:
 class SmithPredictor:
     """Observer that adds the motion commanded during a known delay to the latest pose.
 
-    Around an integrator this is the Smith predictor: with the right delay and gain of the plant the loop behaves as
-    without delay. In contrast to `PoseObserver` it uses a configured delay and no time stamps; `predictor_polynomial`
-    gives its sensitivity to a wrong model.
+    With the right delay, gain and lag of the plant the loop behaves as without delay. In contrast to `PoseObserver` it
+    uses a configured delay and no time stamps; `predictor_polynomial` gives its sensitivity to a wrong model.
 
     Parameters
     ----------
     delay : float
         Delay of the measurements [s].
+    lag : array_like
+        (3,) time constants with which the velocities of the axes follow the command [s], 0 or more; 0 (default) follows
+        at once.
     plant_gain : float
         Velocity of the plant per commanded velocity. Default 1.
     history : int
         Number of commands that are kept. Default 256.
+
+    Notes
+    -----
+    A model of the axes runs on the commands: ``lag v' = plant_gain u - v``, ``m' = v``, exact between two commands. The
+    estimate is the latest pose plus ``m(t) - m(t - delay)``, and the velocity of the model [1]_. The controller then
+    sees the axes without the delay: `closed_loop` with the delay 0 and the lag. Motion before the oldest kept command
+    counts as 0.
+
+    References
+    ----------
+    .. [1] K. J. Astrom and T. Hagglund, *Advanced PID Control*, ISA 2006, section 8.2.
     """
 
-    def __init__(self, delay: float, *, plant_gain: float = 1.0, history: int = 256) -> None:
+    def __init__(
+        self, delay: float, *, lag: npt.ArrayLike = (0.0, 0.0, 0.0), plant_gain: float = 1.0, history: int = 256
+    ) -> None:
         self.delay = finite(delay, "delay", minimum=0.0)
+        self.lag = np.array([finite(each, "lag", minimum=0.0) for each in numbers(lag, (3,), "lag")])
         self.plant_gain = finite(plant_gain, "plant_gain", above=0.0)
         self._latest = LatestPose()
-        self._commands: deque[tuple[float, Float64]] = deque(maxlen=history)
+        # Time, velocity to which the axes tend, position and velocity of the model.
+        self._commands: deque[tuple[float, Float64, Float64, Float64]] = deque(maxlen=history)
 
     def reset(self, time: float, pose: npt.ArrayLike, covariance: npt.ArrayLike) -> None:
         """Forget everything and start from a pose (3,) at rest with a covariance (3, 3)."""
@@ -233,7 +250,9 @@ class SmithPredictor:
 
     def command(self, time: float, velocity: Float64) -> None:
         """Take the velocity (3,) that the head is commanded from a time on."""
-        self._commands.append((time, np.array(velocity)))
+        position, speed = self._model(time)
+        wanted = self.plant_gain * np.array(velocity)
+        self._commands.append((time, wanted, position, np.where(self.lag > 0.0, speed, wanted)))
 
     def add(self, measurement: PoseMeasurement) -> Verdict:
         """Take a measurement that was exposed after all earlier ones."""
@@ -242,14 +261,23 @@ class SmithPredictor:
     def estimate(self, time: float) -> MotionEstimate:
         """Return the latest pose, moved by the commands of the last delay."""
         latest = self._latest.estimate(time)
-        moved, end = np.zeros(3), time
-        for start, velocity in reversed(self._commands):
-            begin = max(start, time - self.delay)
-            moved += velocity * max(end - begin, 0.0)
-            end = min(start, end)
-            if start <= time - self.delay:
-                break
-        velocity = self._commands[-1][1] if self._commands else np.zeros(3)
-        return MotionEstimate(
-            time, latest.pose + self.plant_gain * moved, self.plant_gain * velocity, latest.covariance
-        )
+        position, velocity = self._model(time)
+        moved = position - self._model(time - self.delay)[0]
+        return MotionEstimate(time, latest.pose + moved, velocity, latest.covariance)
+
+    def predicted_pose(self, time: float) -> Float64 | None:
+        """Return the pose (3,) predicted for an exposure: the latest pose and the commanded motion since its exposure.
+
+        None before the first accepted measurement.
+        """
+        latest = self._latest.predicted_pose(time)
+        return None if latest is None else latest + self._model(time)[0] - self._model(self.exposed)[0]
+
+    def _model(self, time: float) -> tuple[Float64, Float64]:
+        """Return position and velocity (3,) of the model of the axes at a time."""
+        for start, wanted, position, speed in reversed(self._commands):
+            if start <= time:
+                decay = np.exp((start - time) / np.maximum(self.lag, 1e-300))
+                faded = (speed - wanted) * (1.0 - decay)  # loss of the velocity beyond the wanted one
+                return position + wanted * (time - start) + self.lag * faded, speed - faded
+        return (self._commands[0][2], np.zeros(3)) if self._commands else (np.zeros(3), np.zeros(3))

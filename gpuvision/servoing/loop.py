@@ -22,7 +22,7 @@ import numpy.typing as npt
 from gpuvision.servoing.controllers import Controller
 from gpuvision.servoing.frames import pose_difference
 from gpuvision.servoing.guard import FaultCounter, LoopLimits, Outcome, TravelGuard
-from gpuvision.servoing.observer import SAME_TIME, MotionEstimate, Observer, PoseMeasurement, Verdict
+from gpuvision.servoing.observer import SAME_TIME, MotionEstimate, Observer, PoseMeasurement, PosePrediction, Verdict
 from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
@@ -63,8 +63,11 @@ class Plant(Protocol):
 class PoseSensor(Protocol):
     """Source of measured poses: a camera with its image processing, or their simulation."""
 
-    def __call__(self, time: float) -> Sequence[PoseMeasurement]:
-        """Return the measurements that arrived since the last call, up to a time."""
+    def __call__(self, time: float, predicted: PosePrediction) -> Sequence[PoseMeasurement]:
+        """Return the measurements that arrived since the last call, up to a time [s].
+
+        A sensor that searches near an expected pose calls ``predicted`` with the time of each exposure.
+        """
 
 
 class Clock(Protocol):
@@ -309,7 +312,7 @@ class _Run:
         """Do one frame, ``elapsed`` seconds after the last one; return the reason to end the loop, or None."""
         loop = self.loop
         self._watch(now)
-        for measurement in loop.sensor(now):
+        for measurement in loop.sensor(now, loop.observer.predicted_pose):
             is_future = measurement.exposed > now + SAME_TIME
             verdict = Verdict.REFUSED if is_future else loop.observer.add(measurement)
             self.measurements.append((measurement, verdict))

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -52,6 +53,11 @@ class PoseMeasurement(NamedTuple):
     pose: Float64
     covariance: Float64
     status: int
+
+
+PosePrediction = Callable[[float], Float64 | None]
+"""Function of the time of an exposure [s] that returns the predicted pose (3,) of the head, or None without one; see
+`Observer.predicted_pose`."""
 
 
 class MotionEstimate(NamedTuple):
@@ -105,6 +111,12 @@ class Observer(Protocol):
 
     def estimate(self, time: float) -> MotionEstimate:
         """Return the state at a time, not before the last command."""
+
+    def predicted_pose(self, time: float) -> Float64 | None:
+        """Return the predicted pose (3,) of the head at the time of an exposure, which may be before the last command.
+
+        None before the first accepted measurement.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,6 +325,17 @@ class PoseObserver:
         state, covariance = self._predict(last, time)
         return MotionEstimate(time, state[:3].copy(), state[3:].copy(), covariance[:3, :3].copy())
 
+    def predicted_pose(self, time: float) -> Float64 | None:
+        """Return the predicted pose (3,) at the time of an exposure, which may be before the last command.
+
+        The prediction starts at the last entry of the history up to this time, as in `add`. None before the first
+        accepted measurement, and for a time before the history.
+        """
+        if math.isinf(self._exposed) or time < self._times[self._first] - SAME_TIME:
+            return None
+        place = self._first + int(np.searchsorted(self._times[self._first : self._end], time + SAME_TIME, "right"))
+        return self._predict(place - 1, time)[0][:3].copy()
+
     def _insert(self, place: int, time: float) -> int:
         """Make room for an entry, drop the oldest one if the history is full, and return the index of the new entry."""
         if self._end == len(self._times):
@@ -424,3 +447,7 @@ class LatestPose:
     def estimate(self, time: float) -> MotionEstimate:
         """Return the latest pose at rest."""
         return MotionEstimate(time, self._pose.copy(), np.zeros(3), self._covariance.copy())
+
+    def predicted_pose(self, time: float) -> Float64 | None:
+        """Return the latest pose (3,), because this observer has no model of the motion; None before the first one."""
+        return None if math.isinf(self._exposed) else self._pose.copy()

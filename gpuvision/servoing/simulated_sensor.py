@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.servoing.observer import SAME_TIME, PoseMeasurement
+from gpuvision.servoing.observer import SAME_TIME, PoseMeasurement, PosePrediction
 from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
@@ -64,8 +64,8 @@ class SimulatedPoseSensor:
         self._frame = 0
         self._waiting: list[PoseMeasurement] = []
 
-    def __call__(self, time: float) -> list[PoseMeasurement]:
-        """Return the measurements that arrived since the last call, up to a time [s]."""
+    def __call__(self, time: float, predicted: PosePrediction | None = None) -> list[PoseMeasurement]:
+        """Return the measurements that arrived since the last call, up to a time [s]; a prediction has no effect."""
         while self._exposed(self._frame) + 0.5 * self.exposure <= time + SAME_TIME:
             measurement = self._measure(self._frame)
             self._waiting += [measurement] if self._fault is None else self._fault(self._frame, measurement)

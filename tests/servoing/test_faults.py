@@ -14,7 +14,7 @@ from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.controllers import PidController, PidGains, SmithPredictor
 from gpuvision.servoing.guard import LoopLimits, Outcome, TravelGuard
 from gpuvision.servoing.loop import LoopRecord, PlantReading, ServoLoop, SimulatedClock
-from gpuvision.servoing.observer import MotionModel, Observer, PoseMeasurement, PoseObserver, Verdict
+from gpuvision.servoing.observer import MotionModel, Observer, PoseMeasurement, PoseObserver, PosePrediction, Verdict
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.servoing.simulated_sensor import Fault, SimulatedPoseSensor
 
@@ -190,10 +190,10 @@ def test_head_stops_when_the_time_is_over_and_when_the_camera_fails() -> None:
     check_rest(record, plant)
 
     class Broken(SimulatedPoseSensor):
-        def __call__(self, time: float) -> list[PoseMeasurement]:
+        def __call__(self, time: float, predicted: PosePrediction | None = None) -> list[PoseMeasurement]:
             if time > 5e-3:
                 raise OSError("no camera")
-            return super().__call__(time)
+            return super().__call__(time, predicted)
 
     observer = PoseObserver(MODEL)
     observer.reset(-DELAY, np.zeros(3), COVARIANCE)
@@ -277,7 +277,7 @@ def test_times_ahead_of_the_loop_are_refused() -> None:
     observer.reset(-DELAY, np.zeros(3), COVARIANCE)
     controller = PidController(PidGains(proportional=50.0))
 
-    def sensor(time: float) -> list[PoseMeasurement]:
+    def sensor(time: float, _predicted: PosePrediction) -> list[PoseMeasurement]:
         return [PoseMeasurement(time + 5e4, time + 5e4 + DELAY, np.zeros(3), COVARIANCE, 0)]
 
     record = ServoLoop(plant, sensor, observer, controller, SimulatedClock(), period=PERIOD).run(TARGET, 1.0)
@@ -367,5 +367,5 @@ def test_controller_is_given_the_time_since_its_last_call() -> None:
     plant, observer = SimulatedPlant(), PoseObserver(MODEL)
     observer.reset(-DELAY, np.zeros(3), COVARIANCE)
     controller = Recorder(PidGains(proportional=50.0))
-    ServoLoop(plant, lambda _: [], observer, controller, Late(), period=PERIOD).run(TARGET, 8.0 * PERIOD)
+    ServoLoop(plant, lambda *_: [], observer, controller, Late(), period=PERIOD).run(TARGET, 8.0 * PERIOD)
     assert periods == pytest.approx([PERIOD] * 3 + [3.0 * PERIOD] + [PERIOD] * 2)

@@ -19,7 +19,7 @@ from gpuvision.servoing.margins import (
     predictor_polynomial,
     predictor_tolerance,
 )
-from gpuvision.servoing.observer import MotionModel, PoseMeasurement, PoseObserver
+from gpuvision.servoing.observer import MotionModel, PoseMeasurement, PoseObserver, PosePrediction
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.servoing.simulated_sensor import SimulatedPoseSensor
 
@@ -165,7 +165,7 @@ def observer_radius(
     observer.reset(-0.02, np.zeros(3), 1e-12 * np.eye(3))
     late = SimulatedPoseSensor(plant.pose, period=PERIOD, delay=plant_delay * PERIOD, is_noisy=False)
 
-    def sensor(time: float) -> list[PoseMeasurement]:
+    def sensor(time: float, _predicted: PosePrediction) -> list[PoseMeasurement]:
         """Return the measurements with the time stamps of the model's delay."""
         shift = (plant_delay - delay) * PERIOD
         return [each._replace(exposed=each.exposed + shift) for each in late(time)]

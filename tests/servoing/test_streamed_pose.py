@@ -17,7 +17,7 @@ from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.ranging.line import LineReadout
 from gpuvision.servoing.controllers import PidController, PidGains
 from gpuvision.servoing.loop import ServoLoop, WallClock
-from gpuvision.servoing.observer import MotionModel, PoseMeasurement, PoseObserver, Verdict
+from gpuvision.servoing.observer import MotionModel, PoseMeasurement, PoseObserver, PosePrediction, Verdict
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.servoing.streamed_pose import streamed_pose
 from gpuvision.status import Status
@@ -94,7 +94,7 @@ def test_loop_with_a_wall_clock_takes_the_poses_of_a_stream(
     with Pipeline(images, Step(bound.operation, fixed=(NEAR, CORNER)), device=device) as stream:
         batches = iter(stream)
 
-        def sensor(time: float) -> list[PoseMeasurement]:
+        def sensor(time: float, _predicted: PosePrediction) -> list[PoseMeasurement]:
             """Return the poses of the earlier calls that were not returned yet, and take the next one."""
             arrived = found[-1:]
             found.extend(streamed_pose(batch, clock.start) for batch in (next(batches, None),) if batch is not None)

@@ -226,6 +226,25 @@ def test_narrow_pads_are_landed_by_registration_and_tracked_by_short_rulers(tmp_
     assert result.report()["landing_s"] == 20e-3
 
 
+@pytest.mark.parametrize("observer", ["smith", pytest.param("kalman", marks=pytest.mark.slow)])
+def test_rulers_that_are_placed_at_the_predicted_pose_reach_less_than_the_motion(
+    tmp_path: Path, device: Device, observer: Literal["smith", "kalman"]
+) -> None:
+    """Gain 0.5: the head moves by up to 50 um between two frames, the rulers cover a tenth of it and a pixel."""
+    narrow_pads(tmp_path)
+    motion = (1e-6, 1e-6, 1e-4) if observer == "kalman" else None
+    control = Control(observer=observer, gain=0.5, motion_sigma=motion)
+    machine = dataclasses.replace(read_machine("look_while_place"), control=control)
+    layers = {name: LAYERS[name] for name in ("copper.gbr", "outline.gbr")}
+    board = read_artwork(tmp_path, layers=layers, clearance=edge_clearance(placement_imaging(machine)))
+    result = simulate_placements(board, (10.85e-3, 8.5e-3, 0.0), machine, count=2, device=device)
+    assert 15e-6 < result.plan.features.imaging.shift < 15.5e-6
+    assert max(np.abs(motion[0, :2]).max() for motion in result.motion) > 60e-6
+    assert all(each.status == 0 for placement in result.placements for each in placement.measurements)
+    assert [each.frames for each in result.placements] == [each.predicted_frames + 1 for each in result.placements]
+    assert np.all(np.abs(result.sources["vision and servo"][:, :2]) < 2e-6)
+
+
 def test_a_pattern_that_repeats_within_the_landing_zone_is_refused_by_the_plan(
     tmp_path: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,6 +38,8 @@ Float64 = npt.NDArray[np.float64]
 _THRESHOLD = 0.5
 # Largest distance of an edge from the coarse pose [px]: the default of `CoarseRegistration`.
 _TOLERANCE_PX = 1.0
+# Error of a predicted motion as a part of the motion (chosen): the plant's gain is calibrated far better.
+_MOTION_ERROR = 0.1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -184,14 +186,22 @@ def placement_imaging(machine: Machine, reflectance: BoardReflectance | None = N
 def tracking_imaging(machine: Machine, reflectance: BoardReflectance | None = None) -> Imaging:
     """Return image quality and search range of the frames after the landing.
 
-    The rulers of a frame are placed at the pose of the last frame. The head moves by the gain times the error at most
-    between them; the largest error is the landing zone, seen at the camera. The tolerance of the coarse registration
-    is added.
+    The rulers of a frame are placed at the predicted pose. The head moves by the gain times the error at most between
+    two frames; the largest error is the landing zone, seen at the camera. An observer that predicts the motion of the
+    axes leaves a tenth of it, the observer "latest" the whole motion. The tolerance of the coarse registration is
+    added.
     """
     wide, tolerance = placement_imaging(machine, reflectance), machine.tolerance
-    shift = machine.loop_gain * landing_range(machine) + _TOLERANCE_PX * machine.camera.pixel
-    angle = machine.loop_gain * tolerance.landing_angle + _TOLERANCE_PX / (min(machine.camera.window) / 2.0)
+    part = machine.loop_gain * (_MOTION_ERROR if _predicts_motion(machine) else 1.0)
+    shift = part * landing_range(machine) + _TOLERANCE_PX * machine.camera.pixel
+    angle = part * tolerance.landing_angle + _TOLERANCE_PX / (min(machine.camera.window) / 2.0)
     return replace(wide, shift=min(shift, wide.shift), angle=min(angle, wide.angle))
+
+
+def _predicts_motion(machine: Machine) -> bool:
+    """Return whether the observer predicts the motion of the axes: delay and lag, but no friction and no resonance."""
+    is_modelled = all(axis.is_linear and not axis.resonance and not axis.viscous for axis in machine.axes)
+    return machine.control.observer != "latest" and is_modelled
 
 
 def landing_range(machine: Machine) -> float:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.board.edge_measurement import move_view
 from gpuvision.servoing.frames import compose_poses, invert_pose, move_covariance
-from gpuvision.servoing.observer import SAME_TIME, PoseMeasurement
+from gpuvision.servoing.observer import SAME_TIME, PoseMeasurement, PosePrediction
 from gpuvision.servoing.placement.board_renderer import board_renderer
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.plan import PlacementPlan
@@ -135,9 +135,10 @@ class BoardPoseSensor:
 
     Notes
     -----
-    The rulers of a frame are placed at the pose of the last frame that was measured, at first at the target. A plan
-    with a ``landing`` registers the first frame instead: frames that arrive within `Machine.landing` after it are not
-    measured, and a refused registration is repeated. The covariance of a measurement contains the error of the vision
+    The rulers of a frame are placed at the pose that the observer of the loop predicts for the exposure. Before its
+    first accepted measurement, and without an observer, they are placed at the last measured pose, at first at the
+    target. A plan with a ``landing`` registers the first frame instead: frames that arrive within `Machine.landing`
+    after it are not measured, and a refused registration is repeated. The covariance of a measurement contains the error of the vision
     alone; the error of the calibration is common to all frames.
     """
 
@@ -160,13 +161,21 @@ class BoardPoseSensor:
 
     def reset(self) -> None:
         """Place the rulers at the target again."""
-        self._predicted = self._plan.camera_pose.copy()
+        self._last = self._plan.camera_pose.copy()  # last measured pose of the camera
         self._has_landed, self._ready = self._plan.landing is None, -math.inf
 
-    def __call__(self, time: float) -> list[PoseMeasurement]:
-        """Return the measurements that arrived since the last call, up to a time [s]."""
+    def __call__(self, time: float, predicted: PosePrediction | None = None) -> list[PoseMeasurement]:
+        """Return the measurements that arrived since the last call, up to a time [s].
+
+        Parameters
+        ----------
+        time : float
+            Time of the call [s].
+        predicted : function, optional
+            Prediction of the pose of the nozzle at an exposure. Default: the pose of the last measured frame.
+        """
         frames = (frame for frame in self.camera(time) if frame.arrived >= self._ready - SAME_TIME)
-        found = [self._measure(frame) if self._has_landed else self._land(frame) for frame in frames]
+        found = [self._measure(frame, predicted) if self._has_landed else self._land(frame) for frame in frames]
         return [each for each in found if each is not None]
 
     def _land(self, frame: Frame) -> PoseMeasurement | None:
@@ -176,16 +185,18 @@ class BoardPoseSensor:
         self._ready = frame.arrived + self._landing_time
         self._has_landed = found.status == 0
         if self._has_landed:
-            self._predicted = np.array(move_view(self._view, found.pose).pose)
+            self._last = np.array(move_view(self._view, found.pose).pose)
             return None
         nothing = np.full((3, 3), np.nan)
         return PoseMeasurement(frame.exposed, frame.arrived, nothing[0], nothing, int(found.status))
 
-    def _measure(self, frame: Frame) -> PoseMeasurement:
-        found = self._bound(frame.image, self._predicted)
+    def _measure(self, frame: Frame, predicted: PosePrediction | None) -> PoseMeasurement:
+        nozzle = None if predicted is None else predicted(frame.exposed)
+        place = self._last if nozzle is None else compose_poses(nozzle, invert_pose(self._calibrated))
+        found = self._bound(frame.image, place)
         status = int(np.asarray(found.status))
         pose, covariance = np.asarray(found.pose, np.float64), np.asarray(found.covariance, np.float64)
         if status == 0:
-            self._predicted = pose.copy()
+            self._last = pose.copy()
         moved = move_covariance(covariance, pose, self._calibrated)
         return PoseMeasurement(frame.exposed, frame.arrived, compose_poses(pose, self._calibrated), moved, status)

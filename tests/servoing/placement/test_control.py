@@ -13,7 +13,7 @@ from gpuvision.formats.machine_file import read_machine
 from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.controllers import PidController
 from gpuvision.servoing.loop import ServoLoop, SimulatedClock
-from gpuvision.servoing.observer import PoseMeasurement
+from gpuvision.servoing.observer import PoseMeasurement, PosePrediction
 from gpuvision.servoing.placement import rehearsal
 from gpuvision.servoing.placement.budget import noise_covariance
 from gpuvision.servoing.placement.control import Control, Settling
@@ -255,7 +255,7 @@ def test_the_plant_keeps_all_commands_of_the_longest_run() -> None:
         clock = SimulatedClock()
         clock.wait_until(0.005)
         plant = SimulatedPlant(start=(1.0, 0.0, 0.0), history=count_commands(machine) - missing)
-        assert place_part(machine, np.zeros(3), plant, lambda _: [], clock).frames == 21
+        assert place_part(machine, np.zeros(3), plant, lambda *_: [], clock).frames == 21
         if is_kept:
             assert plant.pose(0.0)[0] == 1.0
         else:
@@ -378,7 +378,7 @@ def test_refused_poses_are_not_counted_as_the_first_pose() -> None:
     sensor = _sensor(plant, PRESET, is_noisy=False)
     nothing = np.full((3, 3), np.nan)
 
-    def late(time: float) -> list[PoseMeasurement]:
+    def late(time: float, _predicted: PosePrediction) -> list[PoseMeasurement]:
         found = sensor(time)
         return found if time > 2.5e-3 else [PoseMeasurement(time, time, nothing[0], nothing, int(Status.AMBIGUOUS))]
 
@@ -387,7 +387,7 @@ def test_refused_poses_are_not_counted_as_the_first_pose() -> None:
     assert [each.status == 0 for each in placement.measurements[:4]] == [False, False, False, True]
     assert placement.first_pose == pytest.approx(3e-3, abs=1e-9)
     assert placement.steered_frames == placement.frames - 4 == placement.predicted_frames
-    blind = place_part(PRESET, np.zeros(3), SimulatedPlant(), lambda _: [], SimulatedClock())
+    blind = place_part(PRESET, np.zeros(3), SimulatedPlant(), lambda *_: [], SimulatedClock())
     assert (blind.first_pose, blind.steered_frames) == (math.inf, 0)
 
 

@@ -138,8 +138,8 @@ class BoardPoseSensor:
     The rulers of a frame are placed at the pose that the observer of the loop predicts for the exposure. Before its
     first accepted measurement, and without an observer, they are placed at the last measured pose, at first at the
     target. A plan with a ``landing`` registers the first frame instead: frames that arrive within `Machine.landing`
-    after it are not measured, and a refused registration is repeated. The covariance of a measurement contains the error of the vision
-    alone; the error of the calibration is common to all frames.
+    after it are not measured, and a refused registration is repeated. The covariance of a measurement contains the
+    error of the vision alone; the error of the calibration is common to all frames.
     """
 
     def __init__(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -27,7 +29,7 @@ def motion(start: float, end: float) -> np.ndarray:
         return np.concatenate([v, (u - v) / np.maximum(LAG, 1e-3)])
 
     edges, state, positions = [0.0, 1e-3, 2e-3, 3e-3, 10e-3], np.zeros(6), {}
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in itertools.pairwise(edges):
         times = sorted({each for each in (start, end, last) if first < each <= last})
         middle = 0.5 * (first + last)
         found = solve_ivp(

@@ -11,51 +11,36 @@ height H changes, and **v runs along the profile**. Both have the same unit, pix
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
-from gpuvision.camera.distortion import Distortion, ExchangedAxes
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.polynomial import PlanePolynomial
-from gpuvision.camera.profile_correction import ProfileCorrection, profile_correction
-from gpuvision.host import (
-    Define,
-    Device,
-    Launch,
-    LaunchBuilder,
-    Precision,
-    Variant,
-    flags,
-    type_defines,
-)
+from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, flags, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging import homography
 from gpuvision.ranging.homography import DEFAULT_LIMITS, HomographyLimits, Model
 from gpuvision.ranging.homography_fit import fit_models
-from gpuvision.ranging.sheet import SampleAxes, SheetPoints, SheetTable
+from gpuvision.ranging.sheet import SheetPoints
+from gpuvision.ranging.triangulation_model import Along, in_sensor_order, linear_part
+from gpuvision.ranging.triangulation_table import TriangulationTable
 from gpuvision.validation import check_keys, finite, numbers
-
-Along = Literal["columns", "rows"]
-Matrix = tuple[tuple[float, float, float], ...]
-Float64 = npt.NDArray[np.float64]
 
 # Lanes of a vector and work-items of a work-group (speed only; the kernel's build options).
 _LANES, _GROUP = 16, 256
 # Points of a strip in the vector variant. Long strips keep the hardware prefetchers running; several strips per core
 # balance the load.
 _SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
-# Largest error of a tabulated correction, relative to a rounding of the corrected coordinate. Chosen.
-_SHARE_OF_ROUNDING = 0.25
 _KEYS = ("homography", "region", "model", "along", "lens", "camera", "polynomial", "covariance", "sigma", "horizon")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Triangulation(VisionOperation[SheetPoints]):
+class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
     """Triangulation of sensor coordinates (u, v) to sheet coordinates (G, H), with correction of the distortion.
 
     ``(G, H, 1) ~ homography (u, v, 1)``. Sensor and sheet of light are planes, so the plane-to-plane homography holds
@@ -115,192 +100,8 @@ class Triangulation(VisionOperation[SheetPoints]):
 
     Result: ClassVar[type[Any]] = SheetPoints
 
-    homography: Matrix
-    region: tuple[tuple[float, float], tuple[float, float]]
-    model: Model = "H8"
-    along: Along = "columns"
-    lens: Lens | None = None
-    camera: Camera | None = None
-    polynomial: PlanePolynomial | None = None
-    covariance: tuple[tuple[float, ...], ...] | None = None
-    sigma: tuple[float, float] | None = None
-    horizon: float = 1e-3
     precision: Precision = None
     variant: Variant = "auto"
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "homography", numbers(self.homography, (3, 3), "Triangulation.homography"))
-        object.__setattr__(self, "region", numbers(self.region, (2, 2), "Triangulation.region"))
-        if self.covariance is not None:
-            object.__setattr__(self, "covariance", numbers(self.covariance, (8, 8), "Triangulation.covariance"))
-        if self.sigma is not None:
-            object.__setattr__(self, "sigma", numbers(self.sigma, (2,), "Triangulation.sigma"))
-        self._check()
-
-    def _check(self) -> None:
-        (u_min, u_max), (v_min, v_max) = self.region
-        if not (u_min < u_max and v_min <= v_max):
-            raise ValueError(f"Triangulation.region is {self.region}, expected ((u_min, u_max), (v_min, v_max))")
-        if self.model not in homography.MODELS:
-            raise ValueError(f"Triangulation.model is {self.model!r}, expected one of {', '.join(homography.MODELS)}")
-        if self.along not in ("columns", "rows"):
-            raise ValueError(f"Triangulation.along is {self.along!r}, expected 'columns' or 'rows'")
-        if self.lens is not None and self.camera is not None:
-            raise ValueError("Triangulation has a lens and a camera; the camera includes a lens, give one of them")
-        if self.polynomial is not None:
-            if self.lens is not None or self.camera is not None:
-                raise ValueError("Triangulation has a polynomial and a lens or camera; the polynomial includes them")
-            if self.homography != _linear_part(self.polynomial):
-                raise ValueError("Triangulation.homography is no linear part of the polynomial; use from_polynomial")
-            if self.covariance is not None:
-                raise ValueError("Triangulation.covariance is that of a homography; a polynomial has one itself")
-        if not 0.0 < self.horizon < 1.0:
-            raise ValueError(f"Triangulation.horizon is {self.horizon}, expected a number between 0 and 1")
-        if self.sigma is not None and min(self.sigma) < 0.0:
-            raise ValueError(f"Triangulation.sigma is {self.sigma}, expected (sigma_u, sigma_v), neither negative")
-        self.conditioned()
-
-    # ---- parameters of the kernels -------------------------------------------------------------------------
-
-    def profile_correction(
-        self, real: npt.DTypeLike, axes: SampleAxes, length: int, samples: int
-    ) -> ProfileCorrection | None:
-        """Return the camera's correction as a table for a readout of ``samples`` profiles of ``length`` positions.
-
-        None without a distorting camera, in double precision, and where polynomials do not reach a quarter of a
-        rounding: the kernel then computes the correction.
-        """
-        if self.camera is None or not self.camera.distorts or np.dtype(real) != np.float32:
-            return None
-        assert self.distortion is not None
-        _, _, first, pitch, unit = self._kernel_axes(np.dtype(real), axes)
-        tolerance = _SHARE_OF_ROUNDING * float(np.finfo(np.float32).eps)
-        return profile_correction(
-            self.distortion, first=first, pitch=pitch, length=length, samples=samples, unit=unit, tolerance=tolerance
-        )
-
-    def defines(self, real: npt.DTypeLike, profiles: ProfileCorrection | None = None) -> dict[str, Define]:
-        """Return the build options of ``kernels/common/sheet.h`` for a kernel with the real type ``real``.
-
-        ``profiles`` is the result of `profile_correction`.
-        """
-        options: dict[str, Define] = {} if self.covariance is None else {"SHEET_COVARIANCE": None}
-        if self.lens is not None:
-            options |= self.lens.defines
-        if self.camera is not None and self.camera.distorts:
-            _, half = self._centre_and_half_extent()
-            options |= (
-                self.camera.correction_defines(real, float(half[0]), self._image_region)
-                if profiles is None
-                else {**self.camera.defines(), "CAMERA_PROFILES": profiles.terms.shape[1]}
-            )
-            options |= flags(SHEET_ROWS=self.along == "rows")
-        return options if self.polynomial is None else {**options, **self.polynomial.defines}
-
-    def packed(
-        self, real: npt.DTypeLike, axes: SampleAxes | None = None, profiles: ProfileCorrection | None = None
-    ) -> npt.NDArray[Any]:
-        """Return the parameter table of the device functions of ``kernels/common/sheet.h`` (`SheetTable`).
-
-        Parameters
-        ----------
-        real : dtype
-            float32 or float64, the real type of the kernel. Origins and scales are rounded to it *before* the other
-            numbers are computed from them, so that their rounding costs no accuracy.
-        axes : SampleAxes, optional
-            Map from the positions and sample indices of the kernel to sensor coordinates; it is folded into the table.
-        profiles : ProfileCorrection, optional
-            Result of `profile_correction`.
-        """
-        real, axes = np.dtype(real), SampleAxes() if axes is None else axes
-        _, half = self._centre_and_half_extent()
-        origin, scale, first, pitch, unit = self._kernel_axes(real, axes)
-        start = first + pitch * origin
-        terms = self._displacement(start, unit)
-        lens, camera = np.zeros(Lens.TABLE_SIZE), np.zeros(0)
-        if self.sensor_lens is not None:
-            # The two scales differ by a rounding only, which moves a distorted point by less than a rounding.
-            lens = self.sensor_lens.packed(start.tolist(), 1.0 / half[0])
-        if self.camera is not None and self.camera.distorts:
-            to_image = [1, 0] if self.along == "columns" else [0, 1]
-            camera = self.camera.packed_correction(
-                real,
-                first[to_image],
-                pitch[to_image],
-                unit[to_image],
-                self._image_region,
-                None if profiles is None else (profiles.middle, profiles.scale),
-            )
-        plane: dict[str, Float64] = {}
-        if self.polynomial is not None:
-            plane_middle, plane_half, displacement = self.polynomial.displacement
-            plane = {
-                "plane_origin": (plane_middle - first[::-1]) / pitch[::-1],
-                "plane_scale": pitch[::-1] / plane_half,
-                "plane_unit": plane_half / unit[::-1],
-                "plane_terms": displacement.ravel(),
-            }
-        g0, gx, gy, h0, hx, hy, dx, dy = terms
-        factor_g, factor_h = self._factors()
-        table = SheetTable(
-            position_origin=origin[0],
-            position_scale=scale[0],
-            sample_origin=origin[1],
-            sample_scale=scale[1],
-            horizon=self.horizon,
-            w_terms=(dx, dy),
-            g_terms=(g0, gx, gy),
-            h_terms=(h0, hx, hy),
-            lens=lens,
-            factor_g=factor_g,
-            factor_h=factor_h,
-            camera=camera,
-            **plane,
-        )
-        with np.errstate(over="ignore"):
-            return np.hstack(table).astype(real)
-
-    def _kernel_axes(self, real: np.dtype[Any], axes: SampleAxes) -> tuple[Float64, Float64, Float64, Float64, Float64]:
-        """Return origin and scale of the kernel's positions and samples, first, pitch, and the units of x and y."""
-        middle, half = self._centre_and_half_extent()
-        pitch = np.array([axes.position_pitch, axes.sample_pitch])
-        first = np.array([axes.position_origin, axes.sample_origin])
-        origin = ((middle - first) / pitch).astype(real).astype(np.float64)
-        scale = (pitch / half).astype(real).astype(np.float64)
-        return origin, scale, first, pitch, pitch / scale
-
-    def conditioned(self) -> Float64:
-        """(g0, gx, gy, h0, hx, hy, dx, dy) of the displacement form over ``region``.
-
-        ``G = g0 + (gx x + gy y) / (1 + dx x + dy y)``, and the same form for H. x and y are the undistorted u and v,
-        shifted and scaled to about -1 to 1: ``x = (u - u_middle) / half``, where ``half`` is half of the larger extent
-        of the region.
-        """
-        return self._displacement(*self._centre_and_half_extent())
-
-    @property
-    def _image_region(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Region of the sensor as ranges of columns and rows."""
-        u, v = self.region
-        return (v, u) if self.along == "columns" else (u, v)
-
-    def _centre_and_half_extent(self) -> tuple[Float64, Float64]:
-        return homography.centre_and_half_extent(self.region)
-
-    def _displacement(self, origin: Float64, unit: Float64) -> Float64:
-        """Return the eight parameters for u = origin + unit x."""
-        matrix = np.array(self.homography) @ homography.shift_and_scale(origin, unit)
-        return homography.to_displacement(matrix, rank=2 if self.model == "C3" else 3)
-
-    def _factors(self) -> tuple[Float64, Float64]:
-        """Return triangular factors of the covariance of the parameters of G, and of the parameters of H."""
-        if self.covariance is None:
-            return np.zeros(15), np.zeros(15)
-        covariance = np.array(self.covariance)
-        # Displacement parameters on which G and H depend.
-        of_g, of_h = (0, 1, 2, 6, 7), (3, 4, 5, 6, 7)
-        factor_g, factor_h = (homography.packed_covariance_factor(covariance, which) for which in (of_g, of_h))
-        return factor_g, factor_h
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -330,98 +131,6 @@ class Triangulation(VisionOperation[SheetPoints]):
             ],
             passes_once=work.vectors,
         )
-
-    # ---- host computations for simulators, planners and error budgets --------------------------------------
-
-    def to_sensor(self, points: npt.ArrayLike) -> Float64:
-        """Compute the measured sensor coordinates (u, v) of sheet points (G, H), both of shape (..., 2): the inverse.
-
-        NaN for points behind the horizon of the sensor and for points that the lens does not image.
-        """
-        points = np.asarray(points, dtype=np.float64)
-        origin, unit = self._centre_and_half_extent()
-        g0, gx, gy, h0, hx, hy, dx, dy = self.conditioned()
-        matrix = np.array([[gx + g0 * dx, gy + g0 * dy, g0], [hx + h0 * dx, hy + h0 * dy, h0], [dx, dy, 1.0]])
-        if self.model == "C3":
-            # A single beam has no v: return the middle of the region.
-            matrix[0], points = (0.0, 1.0, 0.0), points * (0.0, 1.0)
-        inverse = np.linalg.inv(matrix)
-        lifted = points @ inverse[:, :2].T + inverse[:, 2]
-        middle = inverse @ matrix[:, 2]
-        lifted[lifted[..., 2] * middle[2] <= 0.0] = np.nan
-        straight: Float64 = origin + unit * lifted[..., :2] / lifted[..., 2:]
-        return straight if self.distortion is None else self.distortion.distort(straight)
-
-    def covariance_at(self, points: npt.ArrayLike) -> Float64:
-        """Compute the covariance (..., 2, 2) of (G, H) at measured points (u, v) (..., 2); NaN beyond the horizon.
-
-        ``J diag(sigma_u^2, sigma_v^2) J'`` with the Jacobian J of distortion and homography, plus the contribution of
-        the covariance of the parameters.
-
-        Raises
-        ------
-        ValueError
-            Neither ``sigma`` nor ``covariance`` is known.
-        """
-        if self.sigma is None and self.covariance is None:
-            raise ValueError("Triangulation knows neither sigma nor covariance; give it one of them")
-        points = np.asarray(points, dtype=np.float64)
-        p, values, w = self._at(points)
-        unit = self._centre_and_half_extent()[1]
-        _, gx, gy, _, hx, hy, dx, dy = self.conditioned()
-        slopes = np.array([[gx, gy], [hx, hy]]) - values[..., None] * np.array([dx, dy])
-        distortion_slopes = np.eye(2) if self.distortion is None else self.distortion.jacobian(points)
-        slopes = (slopes / w[..., None, None]) @ distortion_slopes / unit
-        scaled = slopes * np.array(self.sigma or (0.0, 0.0))
-        total: Float64 = scaled @ np.swapaxes(scaled, -1, -2)
-        if self.covariance is not None:
-            design = homography.displacement_design(p, values)
-            total += design @ np.array(self.covariance) @ np.swapaxes(design, -1, -2)
-        return total
-
-    def parameter_derivatives(self, points: npt.ArrayLike) -> Float64:
-        """Return the derivatives (..., 2, 8) of (G, H) at measured points (u, v) (..., 2) by the parameters.
-
-        `conditioned` returns the parameters, and ``covariance`` is their covariance. NaN beyond the horizon.
-        """
-        return homography.displacement_design(*self._at(np.asarray(points, dtype=np.float64))[:2])
-
-    def _at(self, points: Float64) -> tuple[Float64, Float64, Float64]:
-        """Return ``(x, y) / w``, the displacements (G - g0, H - h0) and the denominator w at measured points (u, v)."""
-        origin, unit = self._centre_and_half_extent()
-        x = ((points if self.distortion is None else self.distortion.undistort(points)) - origin) / unit
-        _, gx, gy, _, hx, hy, dx, dy = self.conditioned()
-        w = 1.0 + x @ np.array([dx, dy])
-        w = np.where(w > self.horizon, w, np.nan)
-        p = x / w[..., None]
-        return p, p @ np.array([[gx, hx], [gy, hy]]), w
-
-    def check_systematic(self, outputs: Iterable[str], operation: str) -> None:
-        """Check that an operation that computes systematic errors has the covariance for them.
-
-        Raises
-        ------
-        ValueError
-            ``outputs`` has a systematic error, and the triangulation has no covariance.
-        """
-        for name in outputs:
-            if name.startswith("systematic") and self.covariance is None:
-                raise ValueError(
-                    f"{operation}.outputs has {name!r}, but its triangulation has no covariance; "
-                    "give Triangulation.covariance"
-                )
-
-    @property
-    def sensor_lens(self) -> Lens | None:
-        """Lens for points in (u, v) order; None without a lens."""
-        return self.lens.swapped() if self.lens is not None and self.along == "columns" else self.lens
-
-    @property
-    def distortion(self) -> Distortion | None:
-        """Lens, camera or higher terms of the polynomial for points in (u, v) order; None without them."""
-        if self.polynomial is not None:
-            return ExchangedAxes(self.polynomial)
-        return _in_sensor_order(self.camera if self.lens is None else self.lens, self.along)
 
     # ---- construction --------------------------------------------------------------------------------------
 
@@ -480,7 +189,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             models=None if model is None else (model,),
             symmetry=symmetry,
             region=region,
-            distortion=_in_sensor_order(camera if lens is None else lens, along),
+            distortion=in_sensor_order(camera if lens is None else lens, along),
             limits=limits,
         )
         chosen = next(each for each in fits if each.p_value >= significance or each is fits[-1])
@@ -561,7 +270,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             Other parameters of the class. Default of ``region``: the region of the polynomial.
         """
         (v, u) = polynomial.region
-        return cls(**{"region": (u, v), **more, "homography": _linear_part(polynomial), "polynomial": polynomial})
+        return cls(**{"region": (u, v), **more, "homography": linear_part(polynomial), "polynomial": polynomial})
 
     @classmethod
     def from_stand_off(
@@ -626,23 +335,6 @@ class Triangulation(VisionOperation[SheetPoints]):
         rows, model = homography.homography_from_constants(tuple(finite(each, "constants") for each in constants))
         return cls(homography=rows, model=model, **more)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers, strings and lists, as in a TOML file; parameters that are None are omitted."""
-        table: dict[str, Any] = {"homography": [list(row) for row in self.homography]}
-        table["region"] = [list(bounds) for bounds in self.region]
-        table |= {"model": self.model, "along": self.along, "horizon": self.horizon}
-        if self.covariance is not None:
-            table["covariance"] = [list(row) for row in self.covariance]
-        if self.sigma is not None:
-            table["sigma"] = list(self.sigma)
-        if self.lens is not None:
-            table["lens"] = self.lens.to_dict()
-        if self.camera is not None:
-            table["camera"] = self.camera.to_dict()
-        if self.polynomial is not None:
-            table["polynomial"] = self.polynomial.to_dict()
-        return table
-
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], *, precision: Precision = None) -> Triangulation:
         """Build a triangulation from a table as `to_dict` makes it; ``homography`` and ``region`` are required.
@@ -660,16 +352,3 @@ class Triangulation(VisionOperation[SheetPoints]):
         if "polynomial" in values:
             values["polynomial"] = PlanePolynomial.from_dict(values["polynomial"])
         return cls(**values, precision=precision)
-
-
-def _linear_part(polynomial: PlanePolynomial) -> Matrix:
-    """Return the homography of the polynomial without its higher terms, for points in (u, v) order."""
-    rows: Matrix = numbers([*polynomial.affine[:, [1, 0, 2]], (0.0, 0.0, 1.0)], (3, 3), "Triangulation.homography")
-    return rows
-
-
-def _in_sensor_order(model: Lens | Camera | None, along: Along) -> Distortion | None:
-    """Return a distortion model for points in (u, v) order."""
-    if along == "rows" or model is None:
-        return model
-    return model.swapped() if isinstance(model, Lens) else ExchangedAxes(model)

@@ -9,7 +9,7 @@ from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.formats.camera_file import camera_of, check_calibrated_size, radial_lens, read_calibrated_size, read_lens
 from gpuvision.ranging.sheet import SampleAxes
-from gpuvision.ranging.triangulation import Along
+from gpuvision.ranging.triangulation_model import Along
 from gpuvision.schema import Section
 
 Frame = tuple[int, int]

@@ -7,7 +7,8 @@ from typing import Literal, cast
 from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.sheet import SampleAxes
-from gpuvision.ranging.triangulation import Along, Triangulation
+from gpuvision.ranging.triangulation import Triangulation
+from gpuvision.ranging.triangulation_model import Along
 from gpuvision.schema import Section
 from gpuvision.sensor.light_source import Light
 

@@ -54,7 +54,7 @@ from gpuvision.ranging.range_image import Limits
 from gpuvision.ranging.rotating_sigma import RotatingSheetSigma
 from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.sheet_motion import StraightTransport
-from gpuvision.ranging.triangulation import Along
+from gpuvision.ranging.triangulation_model import Along
 from gpuvision.schema import DescriptionError, Section, preset_names, read_preset
 from gpuvision.sensor.focus import FOCUS_PLACE, read_focus
 from gpuvision.sensor.light_source import Light, read_light

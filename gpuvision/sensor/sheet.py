@@ -11,7 +11,8 @@ import numpy as np
 
 from gpuvision.camera.polynomial import PlanePolynomial
 from gpuvision.ranging.sheet import BentSheet
-from gpuvision.ranging.triangulation import Along, Triangulation
+from gpuvision.ranging.triangulation import Triangulation
+from gpuvision.ranging.triangulation_model import Along
 from gpuvision.schema import Section
 from gpuvision.sensor.optics import Optics
 

@@ -14,7 +14,7 @@ from gpuvision.formats.encoder_file import read_encoder
 from gpuvision.ranging.encoder import EncoderStatistics, not_advancing, unwrapped_counts
 from gpuvision.ranging.rotating_sigma import RotatingSheetSigma
 from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport, Vector
-from gpuvision.ranging.triangulation import Along
+from gpuvision.ranging.triangulation_model import Along
 from gpuvision.schema import Section
 from gpuvision.sensor.optics import Optics
 

@@ -28,7 +28,7 @@ from gpuvision.ranging.background import (
     unlit_level,
 )
 from gpuvision.ranging.line import LineReadout
-from gpuvision.ranging.triangulation import Along
+from gpuvision.ranging.triangulation_model import Along
 from gpuvision.sensor.sensor import Background, Sensor
 
 Array = npt.NDArray[Any]

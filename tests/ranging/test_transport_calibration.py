@@ -60,6 +60,8 @@ def test_two_views_suffice_and_one_does_not(rng: np.random.Generator) -> None:
         fit_transport(views[:1], [0.0])
     with pytest.raises(ValueError, match="at different profiles"):
         fit_transport(views, [5.0, 5.0])
+    with pytest.raises(ValueError, match="2 transport views at the profiles"):
+        fit_transport(views, [5.0, 6.0, 7.0])
 
 
 def test_step_is_the_one_of_weighted_least_squares(rng: np.random.Generator) -> None:

@@ -31,6 +31,17 @@ def test_distances_are_those_to_the_nearest_line(device: Device) -> None:
         np.testing.assert_allclose(field_map.cells.level, level, atol=0.51)
 
 
+def test_searched_positions_are_centred_on_the_field(device: Device) -> None:
+    """Of a field of 2 m by 1 m with a margin of 0.5 m: 3 m by 2 m in cells of 0.5 m, and 1.2 m around them."""
+    field = Field(length=2.0, width=1.0, lines=((0.0, 0.0, 1.0, 0.0),))
+    field_map = DistanceMap(field=field, cell=0.5, margin=0.5, max_range=1.2, device=device)
+    assert field_map.positions == (4, 6)
+    assert field_map.border == 4
+    assert field_map.first_position == pytest.approx((-1.25, -0.75))
+    assert field_map.first == pytest.approx((-1.25 - 2.0, -0.75 - 2.0))
+    assert DistanceMap(field=field, cell=3.0, max_range=3.0, device=device).positions == (1, 1)
+
+
 def test_a_field_may_be_symmetric() -> None:
     msl = read_field("robocup_msl")
     assert msl.is_symmetric

@@ -8,6 +8,10 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.cmos_sensor import CmosSensor
+from gpuvision.camera.lens import Lens
+from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size, read_lens
 from gpuvision.formats.cmos_sensor_file import CMOS_SENSORS, read_cmos_sensor
 from gpuvision.host.reading import reason_of
 from gpuvision.schema import Section, read_preset, read_toml
@@ -43,14 +47,14 @@ def read_machine(path: str | Path, *, rate: float | None = None) -> Machine:
     OSError
         The file cannot be read.
     DescriptionError
-        A key is missing, unknown or has a wrong value, or the file of the sensor cannot be read; the message names the
-        key.
+        A key is missing, unknown or has a wrong value, or the file of the sensor or of the lens cannot be read; the
+        message names the key.
     """
     return _machine(read_preset(path, "machines", "machine"), rate)
 
 
 def named_files(path: str | Path) -> tuple[Path, ...]:
-    """Return the files that a machine file names: its camera preset, where it is not one of the package.
+    """Return the files that a machine file names: its camera file (lens), and its sensor preset, if not in the package.
 
     Raises
     ------
@@ -64,6 +68,8 @@ def named_files(path: str | Path) -> tuple[Path, ...]:
     camera = read_toml(Path(path)).section("camera")
     if camera.word("sensor", CMOS_SENSORS) is None:
         camera.file("sensor")
+    if "lens" in camera:
+        camera.file("lens")
     return camera.files
 
 
@@ -109,6 +115,7 @@ def _camera(table: Section) -> PlacementCamera:
     exposure = table.number("exposure", "s", above=0.0)
     electrons = table.number("electrons", "electrons", None, above=0.0)
     blur_px = table.number("blur_px", "px", 0.5, at_least=0.0)
+    lens = _lens(table, sensor)
     table.finish()
     with table.checking():
         if any(each != int(each) for each in window):
@@ -121,7 +128,30 @@ def _camera(table: Section) -> PlacementCamera:
             exposure=exposure,
             electrons=electrons,
             blur_px=blur_px,
+            lens=lens,
         )
+
+
+def _lens(table: Section, sensor: CmosSensor) -> Lens | Camera | None:
+    """Return the lens in pixels of an image of the whole sensor; None without a lens."""
+    has_file = table.text("lens", None) is not None
+    k1, k2 = table.number("k1", "px^-2", None), table.number("k2", "px^-4", None)
+    if (has_file and k1 is not None) or (k1 is None and k2 is not None):
+        raise table.error("camera: give lens, or k1 with k2 or without it")
+    rows, columns = sensor.shape
+    with table.checking():
+        if k1 is not None:
+            return Lens(k1=k1, k2=k2 or 0.0, centre=((columns - 1) / 2.0, (rows - 1) / 2.0))
+    if not has_file:
+        return None
+    path = table.file("lens")
+    try:
+        model, size = read_lens(path), read_calibrated_size(path)
+    except OSError as error:
+        raise table.error(f"camera.lens: {reason_of(error)}") from error
+    with table.checking():
+        check_calibrated_size(path, (columns, rows), size, hint="calibrate with images of the whole sensor")
+    return model
 
 
 def _calibration(table: Section) -> Transform:

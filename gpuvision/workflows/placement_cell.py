@@ -61,7 +61,7 @@ class PlacementCell:
 
     def __init__(self, artwork: Artwork, machine: Machine, plan: PlacementPlan, device: Device, seed: int) -> None:
         camera, tolerance = machine.camera, machine.tolerance
-        diagonal = float(np.hypot(*camera.window)) / 2.0 * (1.0 + tolerance.landing_angle) + _MARGIN_PX
+        diagonal = camera.reach_px * (1.0 + tolerance.landing_angle) + _MARGIN_PX
         half = diagonal * camera.pixel + 2.0 * tolerance.landing_zone
         centre = plan.camera_pose[:2]
         board = ReflectanceMap.of(

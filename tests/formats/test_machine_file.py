@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import tomli_w
 
-from gpuvision.formats.machine_file import MACHINES, read_machine
+from gpuvision.camera.lens import Lens
+from gpuvision.formats.camera_file import write_lens
+from gpuvision.formats.machine_file import MACHINES, named_files, read_machine
 from gpuvision.schema import DescriptionError, Section
 from gpuvision.servoing.placement.control import Control, Settling
 
@@ -105,6 +107,10 @@ def test_all_keys_of_loop_and_settling_are_read(tmp_path: Path) -> None:
             {"camera": PRESET["camera"] | {"pixel": 10.0}},
             "camera.pixel is 10.0 m, expected a number [m] above 0 and of",
         ),
+        ({"camera": PRESET["camera"] | {"k2": 1e-12}}, "camera: give lens, or k1 with k2 or without it"),
+        ({"camera": PRESET["camera"] | {"k1": 1e-9, "lens": "c.toml"}}, "camera: give lens, or k1 with k2 or without"),
+        ({"camera": PRESET["camera"] | {"lens": "missing.toml"}}, "camera.lens: "),
+        ({"camera": PRESET["camera"] | {"k1": -1e-4}}, "camera: lens: the model folds within the window"),
         ({"axes": {"z": {}}}, "unknown key 'axes.z'"),
         ({"axes": {"x": {"coulomb": 1.0}}}, "axes.x: an axis with friction"),
         ({"tolerance": PRESET["tolerance"] | {"max_refused": 0}}, "tolerance.max_refused is 0"),
@@ -113,6 +119,23 @@ def test_all_keys_of_loop_and_settling_are_read(tmp_path: Path) -> None:
 def test_wrong_files_are_refused_with_the_key(change: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(DescriptionError, match=re.escape(message)):
         read_machine(_written(tmp_path, PRESET | change))
+
+
+def test_a_lens_is_read_from_coefficients_or_a_camera_file(tmp_path: Path) -> None:
+    """The coefficients hold about the middle of the sensor, the camera file in pixels of the whole sensor."""
+    camera = PRESET["camera"] | {"window": [128, 256]}
+    found = read_machine(_written(tmp_path, PRESET | {"camera": camera | {"k1": 1e-8, "k2": 2e-14}})).camera
+    assert found.lens == Lens(k1=1e-8, k2=2e-14, centre=(511.5, 511.5))
+    assert found.window_lens == Lens(k1=1e-8, k2=2e-14, centre=(127.5, 63.5))
+    lens = Lens(k1=3e-8, centre=(500.0, 520.0))
+    write_lens(tmp_path / "lens.toml", lens, {"image": {"size": [1024, 1024]}})
+    path = _written(tmp_path, PRESET | {"camera": camera | {"lens": "lens.toml"}})
+    assert read_machine(path).camera.lens == lens
+    assert read_machine(path).camera.window_lens == Lens(k1=3e-8, centre=(116.0, 72.0))
+    assert named_files(path) == (tmp_path / "lens.toml",)
+    write_lens(tmp_path / "lens.toml", lens, {"image": {"size": [640, 480]}}, overwrite=True)
+    with pytest.raises(DescriptionError, match="calibrated at 640 x 480; calibrate with images of the whole sensor"):
+        read_machine(path)
 
 
 def _documented() -> set[tuple[str, str]]:

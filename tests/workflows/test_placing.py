@@ -17,6 +17,7 @@ import pytest
 import tomli_w
 
 from boards import LAYERS, board_folder
+from gpuvision.camera.lens import Lens
 from gpuvision.cli.main import application
 from gpuvision.formats.machine_file import read_machine
 from gpuvision.host import Device
@@ -43,6 +44,8 @@ PRESET = tomllib.loads(
 )
 # The camera looks at a pad of 1.2 mm and a trace beside it, 1.1 mm from the nozzle.
 TARGET = (14.8e-3 + 1.0e-3, 5.9e-3 + 0.5e-3, 0.0)
+# The camera looks at the rows of `narrow_pads`.
+NARROW = np.array([9.85e-3 + 1.0e-3, 8.0e-3 + 0.5e-3, 0.0])
 
 
 @pytest.fixture(scope="module")
@@ -224,6 +227,41 @@ def test_narrow_pads_are_landed_by_registration_and_tracked_by_short_rulers(tmp_
         assert min(each.arrived for each in placement.measurements) == pytest.approx(20e-3)
     assert np.all(np.abs(result.sources["vision and servo"][:, :2]) < 2e-6)
     assert result.report()["landing_s"] == 20e-3
+
+
+@pytest.mark.parametrize(
+    "is_narrow", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["rulers", "registration"]
+)
+def test_a_part_lands_as_exactly_behind_a_lens(
+    artwork: Artwork, machine: Machine, tmp_path: Path, device: Device, *, is_narrow: bool
+) -> None:
+    """Up to 3 px of distortion about a point beside the middle. A measurement without the lens is wrong."""
+    board, target = artwork, np.array(TARGET)
+    if is_narrow:
+        machine = read_machine("look_while_place")
+        layers = {name: LAYERS[name] for name in ("copper.gbr", "outline.gbr")}
+        clearance = edge_clearance(placement_imaging(machine))
+        board, target = read_artwork(narrow_pads(tmp_path), layers=layers, clearance=clearance), NARROW
+    rows, columns = machine.camera.window
+    lens = Lens(k1=3.0 / (0.5 * np.hypot(rows, columns)) ** 3, k2=1e-13, centre=(520.0, 500.0))
+    behind = dataclasses.replace(machine, camera=dataclasses.replace(machine.camera, lens=lens))
+    result = simulate_placements(board, target, behind, count=2, device=device)
+    assert (result.plan.landing is not None) == is_narrow
+    assert all(each.released for each in result.placements)
+    assert np.all(np.abs(result.sources["vision and servo"][:, :2]) < 2e-6)
+    assert np.all(np.abs(result.error) <= 5.0 * result.simulated_sigmas)
+    # The same frames, measured as if there were no lens.
+    cell = placement_cell.PlacementCell(board, behind, result.plan, device, 0)
+    seen = cell.rest(3)
+    cell._sensor = BoardPoseSensor(cell._camera, machine, result.plan, cell._camera.dtype, device=device)
+    assert np.all(np.abs(seen[:, :2]) < 1e-6)
+    if not is_narrow:
+        assert np.linalg.norm(cell.rest(3)[:, :2], axis=1).min() > 3e-6
+
+
+def test_a_lens_that_folds_within_the_window_is_refused(machine: Machine) -> None:
+    with pytest.raises(ValueError, match="lens: the model folds within the window"):
+        dataclasses.replace(machine.camera, lens=Lens(k1=-1e-4, centre=(511.5, 511.5)))
 
 
 @pytest.mark.parametrize("observer", ["smith", pytest.param("kalman", marks=pytest.mark.slow)])

@@ -15,7 +15,7 @@ def board_renderer(board: ReflectanceMap, camera: PlacementCamera, *, noise: boo
     board : ReflectanceMap
         Board in view.
     camera : PlacementCamera
-        Window, sensor, light and side of the board.
+        Window, sensor, lens, light and side of the board.
     noise : bool
         Add the noise of the sensor. Default True.
     seed : int
@@ -25,6 +25,7 @@ def board_renderer(board: ReflectanceMap, camera: PlacementCamera, *, noise: boo
         board=board,
         shape=camera.window,
         mirrored=camera.mirrored,
+        model=camera.window_lens,
         sensor=camera.sensor,
         electrons=camera.white_electrons,
         exposure=camera.exposure,

@@ -10,7 +10,9 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.camera.camera import Camera
 from gpuvision.camera.cmos_sensor import CmosSensor
+from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.matching.artwork.board_artwork import Side
 from gpuvision.servoing.axis import Axis
@@ -38,9 +40,9 @@ class PlacementCamera:
     sensor : CmosSensor
         Image sensor.
     pixel : float
-        Size of a pixel on the board [m], above 0.
+        Size of a pixel on the board [m], above 0; with a ``lens`` of the undistorted image.
     window : (int, int)
-        Rows and columns that are read.
+        Rows and columns that are read, in the middle of the sensor.
     exposure : float
         Exposure time [s], above 0.
     electrons : float, optional
@@ -49,11 +51,14 @@ class PlacementCamera:
         Standard deviation of the blur of the lens [px], without the extent of a pixel; default 0.5.
     mirrored : bool
         The camera sees the bottom side of the board, as `BoardView.mirrored`; see `Machine.for_side`. Default False.
+    lens : Lens or Camera, optional
+        Distortion of the lens, in pixels of an image of the whole sensor. Default: none. The camera frame is the one
+        of the undistorted image.
 
     Raises
     ------
     ValueError
-        A number is out of its range, or the window is larger than the sensor.
+        A number is out of its range, the window is larger than the sensor, or the lens model folds in the window.
     """
 
     sensor: CmosSensor
@@ -63,6 +68,7 @@ class PlacementCamera:
     electrons: float | None = None
     blur_px: float = 0.5
     mirrored: bool = False
+    lens: Lens | Camera | None = None
 
     def __post_init__(self) -> None:
         finite(self.pixel, "pixel", above=0.0)
@@ -72,6 +78,27 @@ class PlacementCamera:
             finite(self.electrons, "electrons", above=0.0)
         for size, most, name in zip(self.window, self.sensor.shape, ("rows", "columns"), strict=True):
             integer(size, f"window {name}", minimum=16, maximum=most)
+        if not math.isfinite(self.reach_px):
+            raise ValueError("lens: the model folds within the window")
+
+    @property
+    def window_lens(self) -> Lens | Camera | None:
+        """Lens in the pixels of the window; None without a lens."""
+        if self.lens is None:
+            return None
+        (rows, columns), (all_rows, all_columns) = self.window, self.sensor.shape
+        return self.lens.in_window(((all_columns - columns) // 2, (all_rows - rows) // 2))
+
+    @property
+    def reach_px(self) -> float:
+        """Distance of the farthest corner from the centre of the window, undistorted [px]; NaN beyond a fold."""
+        diagonal = float(np.hypot(*self.window)) / 2.0
+        if (lens := self.window_lens) is None:
+            return diagonal
+        rows, columns = self.window
+        border = [(x, y) for x in (-0.5, columns - 0.5) for y in (-0.5, rows - 0.5)]
+        away = lens.undistort(np.array(border)) - ((columns - 1) / 2.0, (rows - 1) / 2.0)
+        return float(np.maximum(diagonal, np.max(np.hypot(away[:, 0], away[:, 1]))))
 
     @property
     def white_electrons(self) -> float:
@@ -86,7 +113,9 @@ class PlacementCamera:
     def view(self, pose: Float64) -> BoardView:
         """Return the view of the board from a pose (3,) of the camera, x, y [m], theta [rad]."""
         x, y, theta = pose.tolist()
-        return BoardView(scale=self.pixel, shape=self.window, pose=(x, y, theta), mirrored=self.mirrored)
+        return BoardView(
+            scale=self.pixel, shape=self.window, pose=(x, y, theta), mirrored=self.mirrored, model=self.window_lens
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.camera.undistort_image import UndistortImage
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.board.edge_measurement import move_view
 from gpuvision.servoing.frames import compose_poses, invert_pose, move_covariance
@@ -155,8 +156,17 @@ class BoardPoseSensor:
         self._view, self._landing_time = machine.camera.view(plan.camera_pose), machine.landing
         self._calibrated = machine.pipette_in_camera.pose
         self._bound = plan.features.bind(
-            device, machine.camera.window, dtype, copper="bright", threshold=plan.threshold, noise=plan.noise
+            device,
+            machine.camera.window,
+            dtype,
+            copper="bright",
+            threshold=plan.threshold,
+            noise=plan.noise,
+            model=machine.camera.window_lens,
         )
+        # The coarse registration knows no lens. Beyond the frame the outermost pixels go on: a mask would be an edge.
+        lens = machine.camera.window_lens
+        self._undistort = None if lens is None else UndistortImage(model=lens, border="replicate")
         self.reset()
 
     def reset(self) -> None:
@@ -181,7 +191,10 @@ class BoardPoseSensor:
     def _land(self, frame: Frame) -> PoseMeasurement | None:
         """Register a frame coarsely; return a measurement only where the pose is refused."""
         assert self._plan.landing is not None
-        found = self._plan.landing(frame.image, device=self._device)
+        image = frame.image
+        if self._undistort is not None:
+            image = to_numpy(self._undistort(image, device=self._device).image)
+        found = self._plan.landing(image, device=self._device)
         self._ready = frame.arrived + self._landing_time
         self._has_landed = found.status == 0
         if self._has_landed:

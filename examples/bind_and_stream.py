@@ -48,7 +48,7 @@ source = PacedSource(ArraySource(np.concatenate([frames] * 16)), rate=2000.0)
 chosen = plan_stream(source, readout, device=device)
 print(chosen)
 latency = []
-with gv.Pipeline(source, readout, device=device, policy="drop_oldest", **chosen.settings) as stream:
+with gv.Pipeline(source, readout, policy="drop_oldest", **chosen.settings) as stream:
     for batch in stream:
         latency.extend(1e-6 * (batch.delivered - batch.arrived))
 report = stream.report()

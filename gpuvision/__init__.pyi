@@ -139,6 +139,9 @@ from .host import (
     clear_cache as clear_cache,
 )
 from .host import (
+    fastest_device as fastest_device,
+)
+from .host import (
     host_view as host_view,
 )
 from .host import (

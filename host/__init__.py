@@ -23,6 +23,7 @@ from gpuvision.host.launch import Launch, Precision, Spec, Specs, Variant, real_
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, table_offsets, type_defines
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Pipeline, PipelineLimits
+from gpuvision.host.placement import Placement, fastest_device
 from gpuvision.host.planning import Plan, PlanLimits, plan_stream
 from gpuvision.host.program import Define
 from gpuvision.host.reading import FileLimit
@@ -72,6 +73,7 @@ __all__ = [
     "PacedSource",
     "Pipeline",
     "PipelineLimits",
+    "Placement",
     "Plan",
     "PlanLimits",
     "Precision",
@@ -92,6 +94,7 @@ __all__ = [
     "capacity",
     "ceil_div",
     "clear_cache",
+    "fastest_device",
     "fitted_groups",
     "flags",
     "group_per_element",

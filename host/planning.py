@@ -7,11 +7,12 @@ device: a stream that waits for fewer threads has fewer stalls when other proces
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from gpuvision.host.errors import StreamError
 from gpuvision.host.memory import free_bytes
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Pipeline
+from gpuvision.host.placement import placement_devices
 from gpuvision.host.ring import Step, slot_bytes, steps_of, takes_single_frames
 from gpuvision.host.sources import ArraySource, Source
 from gpuvision.host.text import size_in_words
@@ -129,6 +131,8 @@ class Plan:
 
     Attributes
     ----------
+    device : Device
+        Device of the stream.
     batch, ring : int
         Frames per launch, and slots.
     inline : bool
@@ -140,9 +144,12 @@ class Plan:
     ring_bytes : int
         Memory of the slots, on host and device together [bytes].
     trials : tuple of Trial
-        Measurements; the last ones measured the chosen batch.
+        Measurements on the device; the last ones measured the chosen batch.
+    other_devices : mapping of str to float or None
+        Latency of the plan for each other measured device by its label [s]; ``None`` where it does not keep up.
     """
 
+    device: Device
     batch: int
     ring: int
     inline: bool
@@ -150,11 +157,17 @@ class Plan:
     stall: float
     ring_bytes: int
     trials: tuple[Trial, ...]
+    other_devices: Mapping[str, float | None] = field(default_factory=dict)
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Parameters of `Pipeline`: batch, ring and inline."""
-        return {"batch": self.batch, "ring": self.ring, "inline": self.inline}
+        """Parameters of `Pipeline`: device, batch, ring and inline."""
+        return {"device": self.device, "batch": self.batch, "ring": self.ring, "inline": self.inline}
+
+    @property
+    def latency(self) -> float:
+        """Time from the arrival of the first frame of a batch to its result [s]."""
+        return next(each.latency for each in reversed(self.trials) if each.inline == self.inline)
 
     def __str__(self) -> str:
         costs = {each.inline: each.processor_time for each in self.trials if each.batch == self.batch}
@@ -162,14 +175,20 @@ class Plan:
         chosen = f"kernels {names[self.inline]}, {1e6 * costs[self.inline]:.3g} us of processor time per frame"
         other = costs.get(not self.inline)
         against = "" if other is None else f" ({1e6 * other:.3g} us {names[not self.inline]})"
+        others = [
+            f"{label} {'does not keep up' if seconds is None else f'{1e3 * seconds:.3g} ms'}"
+            for label, seconds in self.other_devices.items()
+        ]
+        latency = f" with a latency of {1e3 * self.latency:.3g} ms ({', '.join(others)})" if others else ""
         return (
-            f"batches of {self.batch}, a ring of {self.ring} slots ({size_in_words(self.ring_bytes)}) for stalls of "
+            f"on {self.device.label}{latency}: batches of {self.batch}, a ring of {self.ring} slots ({size_in_words(self.ring_bytes)}) for stalls of "
             f"{self.stall:g} s at {self.rate:g} frames/s, {chosen}{against}"
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as dictionaries, lists and numbers for JSON."""
-        return asdict(self)
+        trials = [asdict(each) for each in self.trials]
+        return {**vars(self), "device": self.device.label, "trials": trials, "other_devices": dict(self.other_devices)}
 
 
 def plan_stream(
@@ -207,13 +226,16 @@ def plan_stream(
         Whether kernels run in the stream's thread instead of the worker threads of the device. Default: inline where
         this keeps up, a batch takes at most ``limits.max_inline_seconds``, and the processor time per frame is at most
         ``limits.max_inline_cost`` times the time of the worker threads; inline, too, where only this keeps up.
-    device, zero_copy
+    device : Device, optional
+        Device of the stream. Default: of the best GPU and the best CPU device the one with the lower latency, where both
+        exist and ``GPUVISION_DEVICE`` is not set. Frames with little work are often faster on the CPU.
+    zero_copy : bool, optional
         As for `Pipeline`.
     batches : sequence of int
         Batch sizes to try, ascending; 1 only where an operation takes single frames.
     measure : callable, optional
         Function that takes a batch size and whether kernels run inline, and returns a `Cost`; it replaces the
-        measurement on the device.
+        measurement on the device, and the choice between devices.
     limits : PlanLimits
         Limits of the measurements and of the memory.
 
@@ -239,7 +261,65 @@ def plan_stream(
         raise ValueError(f"rate is {rate}, expected the sensor's frames per second, > 0")
     if not 0.0 <= stall < math.inf:
         raise ValueError(f"stall is {stall}, expected seconds >= 0")
-    device = Device.best() if device is None else device
+    plan = functools.partial(
+        _plan_on,
+        source,
+        operation,
+        rate=rate,
+        latency=latency,
+        margin=margin,
+        stall=stall,
+        inline=inline,
+        zero_copy=zero_copy,
+        batches=batches,
+        measure=measure,
+        limits=limits,
+    )
+    if device is not None or measure is not None:
+        return plan(Device.best() if device is None else device)
+    devices = placement_devices()
+    return plan(devices[0]) if len(devices) == 1 else _fastest(plan, devices)
+
+
+def _fastest(plan: Callable[[Device], Plan], devices: Sequence[Device]) -> Plan:
+    """Return the plan of the device with the lowest latency.
+
+    Raises
+    ------
+    StreamError
+        No device keeps up; the error is the first device's.
+    """
+    plans: dict[str, Plan | None] = {}
+    failures: list[StreamError] = []
+    for device in devices:
+        try:
+            plans[device.label] = plan(device)
+        except StreamError as error:
+            plans[device.label] = None
+            failures.append(error)
+    best = min((each for each in plans.values() if each is not None), key=lambda each: each.latency, default=None)
+    if best is None:
+        raise failures[0]
+    others = {label: None if each is None else each.latency for label, each in plans.items() if each is not best}
+    return replace(best, other_devices=others)
+
+
+def _plan_on(
+    source: Source,
+    operation: Operation[Any] | Step | Sequence[Operation[Any] | Step],
+    device: Device,
+    *,
+    rate: float,
+    latency: float | None,
+    margin: float,
+    stall: float,
+    inline: bool | None,
+    zero_copy: bool | None,
+    batches: Sequence[int],
+    measure: Measure | None,
+    limits: PlanLimits,
+) -> Plan:
+    """Return the plan for one device; parameters as in `plan_stream`."""
     zero_copy = device.shares_memory if zero_copy is None else zero_copy
     modes = _modes(inline, device)
     steps = steps_of(operation)
@@ -260,7 +340,7 @@ def plan_stream(
             break  # larger batches have longer latencies
         sufficient = [each for each in quick if each.service_rate >= margin * rate]
         if sufficient:
-            return Plan(batch, ring, _runs_inline(sufficient, limits), rate, stall, ring_bytes, tuple(trials))
+            return Plan(device, batch, ring, _runs_inline(sufficient, limits), rate, stall, ring_bytes, tuple(trials))
     request = f"{rate:.0f} frames/s with a margin of {margin:g}"
     raise _too_slow(trials, request if latency is None else f"{request} within {latency * 1e3:.3g} ms")
 

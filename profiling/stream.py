@@ -148,7 +148,7 @@ def hold_loaded(frames: NDArray[np.uint8], device: Device, rate: float, seconds:
     """Run the planned stream at a rate [frames/s] beside a second process that loads one core half of the time."""
     source = PacedSource(ArraySource(frames, max(int(rate * seconds), 1)), rate)
     plan = plan_stream(source, READOUT, device=device)
-    stream = Pipeline(source, READOUT, device=device, policy="drop_oldest", **plan.settings)
+    stream = Pipeline(source, READOUT, policy="drop_oldest", **plan.settings)
     with _half_loaded_core():
         return Held(rate, stream.run(), source.late * 1e-9, plan)
 

@@ -262,7 +262,7 @@ def _pipeline(
     paced = PacedSource(source, rate)
     planned = plan_stream(paced, operation, device=device)
     setup: dict[str, Any] = {"profile": True, "trace": timeline, "policy": policy or "drop_oldest"}
-    return paced, Pipeline(paced, operation, device=device, **setup, **planned.settings)
+    return paced, Pipeline(paced, operation, **setup, **planned.settings)
 
 
 def _read_frames(

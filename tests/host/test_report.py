@@ -208,7 +208,7 @@ def test_a_measured_plan_runs(device: Device, inline: bool | None) -> None:
         assert trial.service_rate > 12.5
         assert 0.0 < trial.processor_time < 0.1
     source = PacedSource(ArraySource(currents_of(4), 20), 2000.0)
-    report = Pipeline(source, READOUT, device=device, **chosen.settings).run()
+    report = Pipeline(source, READOUT, **chosen.settings).run()
     assert report.frames == 20
     assert (report.batch, report.ring, report.inline) == (chosen.batch, chosen.ring, chosen.inline)
 
@@ -307,7 +307,7 @@ def test_small_frames_run_inline_by_the_measured_cost(workers: Cost, inline: Cos
         only = planned(rate=100.0, inline=forced, measure=cost, device=device)
         assert only.inline == forced
         assert {each.inline for each in only.trials} == {forced}
-        assert only.settings == {"batch": 1, "ring": 52, "inline": forced}
+        assert only.settings == {"device": device, "batch": 1, "ring": 52, "inline": forced}
 
 
 def test_a_device_without_inline_queues_is_measured_with_its_worker_threads() -> None:

@@ -43,6 +43,8 @@ from gpuvision.status import Status
 from gpuvision.validation import finite
 
 _BLOCK, _MOST_POINTS = 64, 4096
+# The kernel reads cosine and sine of the headings from constant memory, of which OpenCL guarantees 64 KiB.
+_MOST_HEADINGS = (64 << 10) // (2 * 4)
 MIN_SHIFTS = 1024
 """Least size of the kernels' array of shifts, so that searches with fewer points share programs."""
 # Shares of the rows per core, so that the cores finish together, and number of rows above which shifting a point takes
@@ -143,6 +145,8 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
             )
         if not len(self.angles):
             raise ValueError(f"FieldPoseSearch.headings is {self.headings}, expected one at least")
+        if len(self.angles) > _MOST_HEADINGS:
+            raise ValueError(f"FieldPoseSearch.headings has {len(self.angles)}, expected {_MOST_HEADINGS} at most")
 
     @property
     def angles(self) -> npt.NDArray[np.float64]:

@@ -353,6 +353,8 @@ def test_wrong_inputs_are_refused(device: Device) -> None:
         search(np.zeros((5000, 2), np.float32), device=device)
     with pytest.raises(ValueError, match="heading"):
         FieldPoseSearch(map=field_map, headings=0)
+    with pytest.raises(ValueError, match="headings has 8193, expected 8192 at most"):
+        FieldPoseSearch(map=field_map, headings=8193)
     with pytest.raises(ValueError, match="count"):
         refine.bind(device, (4, 2), np.float32)
     with pytest.raises(ValueError, match="initial_pose"):

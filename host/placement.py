@@ -1,0 +1,111 @@
+"""Choice between GPU and CPU for operations with little work, by measured times.
+
+A launch on a GPU and the copies to and from it take tens of microseconds. A CPU device solves the pose of a board in
+this time.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from gpuvision.host.arrays import HostArray
+from gpuvision.host.device import VARIABLE, Device
+from gpuvision.host.operation import Operation
+
+# Calls that bind the operation and fill the caches, and timed calls, of which the median counts. Chosen: pauses of a
+# shared machine hit a few calls.
+_WARM_UP, _CALLS = 3, 15
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Device on which an operation is fastest; ``str(placement)`` states it in one line.
+
+    Attributes
+    ----------
+    operation : str
+        Class of the operation.
+    device : Device
+    seconds : mapping of str to float
+        Median time of a call on NumPy arrays [s], by the label of each measured device.
+    """
+
+    operation: str
+    device: Device
+    seconds: Mapping[str, float]
+
+    def __str__(self) -> str:
+        others = ", ".join(
+            f"{label} {1e6 * s:.3g} us" for label, s in self.seconds.items() if label != self.device.label
+        )
+        against = f" ({others})" if others else ""
+        return f"{self.operation} on {self.device.label}, {1e6 * self.seconds[self.device.label]:.3g} us{against}"
+
+
+def placement_devices() -> tuple[Device, ...]:
+    """Return the devices to choose from: the best GPU and the best CPU device, best first.
+
+    Only the default device where the variable ``GPUVISION_DEVICE`` names it.
+
+    Raises
+    ------
+    NoDeviceError
+        There is no healthy device.
+    """
+    first = Device.best()
+    if os.environ.get(VARIABLE):
+        return (first,)
+    other = next((each for each in Device.all() if each.is_cpu is not first.is_cpu), None)
+    return (first,) if other is None else (first, other)
+
+
+def fastest_device(operation: Operation[Any], *inputs: HostArray, devices: Sequence[Device] = ()) -> Placement:
+    """Measure an operation on each device and return the fastest one.
+
+    Parameters
+    ----------
+    operation : Operation
+    *inputs : numpy.ndarray
+        Typical inputs.
+    devices : sequence of Device, optional
+        Devices to measure. Default: the best GPU and the best CPU device.
+
+    Returns
+    -------
+    Placement
+
+    Raises
+    ------
+    NoDeviceError
+        There is no healthy device.
+    TypeError, ValueError
+        The operation does not take such input.
+
+    Notes
+    -----
+    The time is the time of a call with copies to the device and back. With one device, it is measured, too.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import gpuvision as gv
+    >>> placement = gv.fastest_device(gv.PsdReadout(strip_length=6e-3), np.ones((1000, 2), np.float32))
+    >>> reading = gv.PsdReadout(strip_length=6e-3)(np.ones((1000, 2), np.float32), device=placement.device)
+    """
+    measured = {each: _seconds(operation, inputs, each) for each in devices or placement_devices()}
+    fastest = min(measured, key=measured.__getitem__)
+    return Placement(type(operation).__name__, fastest, {each.label: s for each, s in measured.items()})
+
+
+def _seconds(operation: Operation[Any], inputs: Sequence[HostArray], device: Device) -> float:
+    """Return the median time of a call [s]."""
+    times = []
+    for _ in range(_WARM_UP + _CALLS):
+        start = time.perf_counter()
+        operation(*inputs, device=device)
+        times.append(time.perf_counter() - start)
+    return sorted(times[_WARM_UP:])[_CALLS // 2]

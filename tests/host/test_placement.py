@@ -1,0 +1,110 @@
+"""Choice between a GPU and a CPU device by measured times, with a device that pretends to be a slow or fast GPU."""
+
+from __future__ import annotations
+
+import copy
+import json
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpuvision.host import (
+    ArraySource,
+    Device,
+    PlanLimits,
+    StreamError,
+    fastest_device,
+    placement,
+    plan_stream,
+    planning,
+)
+from gpuvision.host.planning import Cost
+from gpuvision.ranging.psd import PsdReadout
+from streams import READOUT, currents_of
+
+
+class SlowCalls(PsdReadout):
+    """Operation with a long launch on the devices named "gpu"."""
+
+    def __call__(self, *inputs: Any, device: Any = None, out: Any = None) -> Any:
+        if device.label == "gpu":
+            time.sleep(3e-2)  # longer than the pauses of a busy machine
+        return super().__call__(*inputs, device=device, out=out)
+
+
+@pytest.fixture
+def gpu(device: Device, monkeypatch: pytest.MonkeyPatch) -> Device:
+    """List a GPU before the CPU device."""
+    gpu = copy.copy(device)
+    gpu.label, gpu.is_cpu = "gpu", False
+    monkeypatch.delenv(placement.VARIABLE, raising=False)
+    monkeypatch.setattr(Device, "all", staticmethod(lambda: (gpu, gpu, device, device)))
+    monkeypatch.setattr(Device, "best", staticmethod(lambda: gpu))
+    return gpu
+
+
+def test_small_work_runs_on_the_cpu_beside_a_gpu(gpu: Device, device: Device) -> None:
+    found = fastest_device(SlowCalls(strip_length=6e-3), currents_of(3))
+    assert found.device is device
+    assert set(found.seconds) == {"gpu", device.label}
+    assert found.seconds["gpu"] > 3e-2 > found.seconds[device.label]
+    assert str(found).startswith(f"SlowCalls on {device.label}, ")
+    assert "(gpu 3" in str(found)
+
+
+def test_named_device_is_the_only_one(gpu: Device, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert placement.placement_devices() == (gpu, device)
+    monkeypatch.setenv(placement.VARIABLE, "gpu")
+    assert placement.placement_devices() == (gpu,)
+    assert fastest_device(READOUT, currents_of(3), devices=[device]).device is device
+
+
+def test_without_a_gpu_one_device_is_measured(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(placement.VARIABLE, raising=False)
+    monkeypatch.setattr(Device, "all", staticmethod(lambda: (device, copy.copy(device))))
+    monkeypatch.setattr(Device, "best", staticmethod(lambda: device))
+    assert placement.placement_devices() == (device,)
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, Cost]:
+    """Costs of a batch by the label of the device, instead of measurements."""
+    costs: dict[str, Cost] = {}
+
+    def measurement(source: Any, steps: Any, device: Device, zero_copy: bool, limits: PlanLimits) -> Any:
+        return lambda batch, inline: costs[device.label]
+
+    monkeypatch.setattr(planning, "_Measurement", measurement)
+    return costs
+
+
+def plan() -> Any:
+    source = ArraySource(np.zeros((300, 4, 2), np.float32))
+    return plan_stream(source, READOUT, rate=100.0, inline=False, limits=PlanLimits(max_bytes=1 << 40), batches=(1,))
+
+
+@pytest.mark.parametrize(("seconds", "label"), [(2e-4, "gpu"), (5e-5, "cpu")])
+def test_plan_takes_the_device_of_lower_latency(
+    gpu: Device, device: Device, measured: dict[str, Cost], seconds: float, label: str
+) -> None:
+    measured |= {"gpu": Cost(1e4, 1e-4, 1e-5), device.label: Cost(1e4, seconds, 1e-5)}
+    chosen = plan()
+    expected, other = (gpu, device) if label == "gpu" else (device, gpu)
+    assert chosen.device is expected
+    assert chosen.settings["device"] is expected
+    assert chosen.other_devices == {other.label: measured[other.label].seconds}
+    latency = f"on {expected.label} with a latency of {1e3 * chosen.latency:.3g} ms ({other.label} "
+    assert str(chosen).startswith(latency)
+    assert json.loads(json.dumps(chosen.to_dict()))["device"] == expected.label
+
+
+def test_plan_takes_the_device_that_keeps_up(gpu: Device, device: Device, measured: dict[str, Cost]) -> None:
+    measured |= {"gpu": Cost(1e4, 1e-2, 1e-5), device.label: Cost(50.0, 1e-5, 1e-5)}
+    chosen = plan()
+    assert (chosen.device, chosen.other_devices) == (gpu, {device.label: None})
+    assert f"({device.label} does not keep up)" in str(chosen)
+    measured["gpu"] = Cost(60.0, 1e-2, 1e-5)
+    with pytest.raises(StreamError, match="the fastest, 1 frames, does 60 frames/s"):
+        plan()

@@ -181,7 +181,8 @@ class Plan:
         ]
         latency = f" with a latency of {1e3 * self.latency:.3g} ms ({', '.join(others)})" if others else ""
         return (
-            f"on {self.device.label}{latency}: batches of {self.batch}, a ring of {self.ring} slots ({size_in_words(self.ring_bytes)}) for stalls of "
+            f"on {self.device.label}{latency}: batches of {self.batch}, a ring of {self.ring} slots "
+            f"({size_in_words(self.ring_bytes)}) for stalls of "
             f"{self.stall:g} s at {self.rate:g} frames/s, {chosen}{against}"
         )
 
@@ -227,8 +228,8 @@ def plan_stream(
         this keeps up, a batch takes at most ``limits.max_inline_seconds``, and the processor time per frame is at most
         ``limits.max_inline_cost`` times the time of the worker threads; inline, too, where only this keeps up.
     device : Device, optional
-        Device of the stream. Default: of the best GPU and the best CPU device the one with the lower latency, where both
-        exist and ``GPUVISION_DEVICE`` is not set. Frames with little work are often faster on the CPU.
+        Device of the stream. Default: of the best GPU and the best CPU device the one with the lower latency, where
+        both exist and ``GPUVISION_DEVICE`` is not set. Frames with little work are often faster on the CPU.
     zero_copy : bool, optional
         As for `Pipeline`.
     batches : sequence of int

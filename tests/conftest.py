@@ -4,7 +4,8 @@ The option ``--tier`` selects the tests. ``fast`` runs all tests without the mar
 smoke set on every other device: one test for each kernel. Of kernel tests with several parameters it runs a covering
 design, of both variants of a kernel a few tests for each file, and of hypothesis tests fewer examples, see `tiers`.
 ``full`` runs all tests on the best device; on every other device it runs no slow tests, and a covering design of
-products of three or more parameters. ``nightly`` runs all tests on every device, with more hypothesis examples.
+products of three or more parameters. ``nightly`` runs all tests on every device, with more hypothesis examples. No tier
+runs the cases that a device refuses: double precision without doubles, vectors on a runtime without them.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ import pytest
 from gpuvision.host import Device, debug
 from gpuvision.host.discovery import INSTALL_HINT
 from processor_time import record_test, table_of_files
-from tiers import LEFT, device_of, select_fast, select_full
+from tiers import LEFT, device_of, is_refused, select_fast, select_full
 
 ROOT = Path(__file__).resolve().parents[1]
 # Compiled kernels of all runtimes, verdicts of devices, fonts of matplotlib: kept in the clone, so that a second run is
@@ -73,6 +74,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect the tests that the tier omits; draw the tier's number of hypothesis examples."""
     tier = config.getoption("tier")
+    refused = {item for item in items if is_refused(item)}
+    if refused:
+        config.hook.pytest_deselected(items=list(refused))
+        items[:] = [item for item in items if item not in refused]
     _set_examples(items, EXAMPLES[tier])
     if tier == "nightly":
         return

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 from gpuvision.host import Device
-from tiers import collected_items, device_of, function_of, select_fast, without_other_variants
+from tiers import collected_items, device_of, function_of, is_refused, select_fast, without_other_variants
 
 ROOT = Path(__file__).resolve().parents[1]
 PLANTED = tomllib.loads((ROOT / "tests" / "mutants" / "planted.toml").read_text())["fault"]
@@ -42,3 +45,29 @@ def _values(items: list[pytest.Item]) -> set[tuple[object, ...]]:
         if hasattr(item, "callspec")
         for name, value in item.callspec.params.items()
     }
+
+
+@pytest.mark.parametrize(
+    ("parameters", "has_mark", "expected"),
+    [
+        ({"dtype": np.float32, "variant": "work_item"}, False, "nothing"),
+        ({"dtype": np.float64}, False, "doubles"),
+        ({"dtype": np.dtype(np.float64)}, False, "doubles"),
+        ({"precision": "double"}, False, "doubles"),
+        ({"operation": SimpleNamespace(precision="double", variant="auto")}, False, "doubles"),
+        ({"rows": 3}, True, "doubles"),
+        ({"variant": "vector"}, False, "vectors"),
+        ({"operation": SimpleNamespace(variant="vector")}, False, "vectors"),
+    ],
+    ids=repr,
+)
+def test_a_device_runs_no_case_that_it_refuses(parameters: dict[str, Any], has_mark: bool, expected: str) -> None:
+    for has_double in (False, True):
+        for prefers_vectors in (False, True):
+            device = SimpleNamespace(has_double=has_double, prefers_vectors=prefers_vectors)
+            item: Any = SimpleNamespace(
+                callspec=SimpleNamespace(params={"device": device, **parameters}),
+                get_closest_marker=lambda name: has_mark and name == "double",
+            )
+            lacking = {"doubles": not has_double, "vectors": not prefers_vectors}
+            assert bool(is_refused(item)) == lacking.get(expected, False)

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 
 from designs import covering
@@ -81,6 +82,33 @@ def select_fast(items: Sequence[pytest.Item], best: Collection[Device]) -> Selec
         if is_more and not _is_of_host(item) and item.path.parent.name not in _COMPOSED:
             selection.without_inline.add(item)
     return selection
+
+
+def is_refused(item: pytest.Item) -> bool:
+    """Return whether the device of a test lacks a property that the test needs.
+
+    Cases of float64 and double precision, and tests with the mark ``double``, need a device with doubles. Cases of the
+    vector variant need a runtime with vectors of 16: others may abort the process.
+    """
+    device = device_of(item)
+    if device is None:
+        return False
+    values = [value for name, value in _parameters_of(item).items() if name != "device"]
+    if not device.has_double and (item.get_closest_marker("double") or any(map(_is_double, values))):
+        return True
+    return not device.prefers_vectors and any(_variant_of(value) == "vector" for value in values)
+
+
+def _is_double(value: Any) -> bool:
+    if isinstance(value, str):
+        return value in ("double", "float64")
+    if isinstance(value, (type, np.dtype)):
+        return value in (np.float64, np.dtype(np.float64))
+    return getattr(value, "precision", None) == "double"
+
+
+def _variant_of(value: Any) -> Any:
+    return value if isinstance(value, str) else getattr(value, "variant", None)
 
 
 def collected_items(session: pytest.Session) -> list[pytest.Item]:

@@ -1,0 +1,63 @@
+"""Local memory and work-group size of a compiled kernel, compared with the limits of its device."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pyopencl as cl
+
+from gpuvision.host.errors import DeviceMemoryError
+from gpuvision.host.work_size import Shape
+
+
+def fit_group(kernel: Any, handle: Any, local_size: Shape | None, *, name: str, label: str) -> Shape | None:
+    """Return the work-group size with which a kernel runs on a device.
+
+    The work-items of a kernel without local memory do not depend on each other: its groups are halved until the device
+    has registers for them. A kernel with local memory is compiled for its group size.
+
+    Parameters
+    ----------
+    kernel : pyopencl.Kernel
+    handle : pyopencl.Device
+    local_size : tuple of int or None
+        Work-group size of the launch.
+    name, label : str
+        Names of the operation and of the device in messages.
+
+    Raises
+    ------
+    DeviceMemoryError
+        The kernel needs more local memory or a larger group than the device has.
+    """
+    needed, largest = _needs_of(kernel, handle)
+    available = int(handle.local_mem_size)
+    if needed > available:
+        raise DeviceMemoryError(
+            f"{name}: kernel {kernel.function_name} takes {needed} bytes of local memory, device {label} has "
+            f"{available}; give fewer elements (rulers, lines, points), or choose another device"
+        )
+    if local_size is None or math.prod(local_size) <= largest:
+        return local_size
+    if needed:
+        raise DeviceMemoryError(
+            f"{name}: kernel {kernel.function_name} takes groups of {math.prod(local_size)}, device {label} runs "
+            f"groups of up to {largest}; choose another device"
+        )
+    first, *others = local_size
+    while first % 2 == 0 and first * math.prod(others) > largest:
+        first //= 2
+    return (first, *others)
+
+
+def _needs_of(kernel: Any, handle: Any) -> tuple[int, int]:
+    """Return the local memory of a kernel [bytes] and the largest group with which the device runs it."""
+    info = cl.kernel_work_group_info
+    local_bytes = int(kernel.get_work_group_info(info.LOCAL_MEM_SIZE, handle))
+    largest = int(kernel.get_work_group_info(info.WORK_GROUP_SIZE, handle))
+    # Measured on rusticl of Mesa 22.3: it reports twice the local memory, and for every kernel groups of up to 32 (the
+    # width of a subgroup), while groups of 1024 run.
+    if handle.platform.name == "rusticl" and handle.driver_version.startswith("22."):
+        return local_bytes // 2, int(handle.max_work_group_size)
+    return local_bytes, largest

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shlex
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -132,8 +134,13 @@ def select(
         draw_features(inside / "features.png", artwork, features, box)
     echo(
         f"{features.summary()}\nlook at {out / 'features.png'}; next: "
-        f"gpuvision locate IMAGE --board {gerbers} --features {out / 'features.toml'}"
+        f"gpuvision locate IMAGE --board {gerbers} --features {out / 'features.toml'}{_repeated(layers)}"
     )
+
+
+def _repeated(layers: Sequence[str] | None) -> str:
+    """Return the options ``--layers`` of this command, for the next command."""
+    return "".join(f" --layers {shlex.quote(each)}" for each in layers or ())
 
 
 def _box(region: str) -> tuple[tuple[float, float], tuple[float, float]]:

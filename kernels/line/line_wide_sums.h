@@ -123,11 +123,11 @@ static inline big16 interleave_bigs(big8 e, big8 o) {
 }
 static inline uint16 uints_of_quarter(const uint16 *sums, int quarter) {
     const uint16 even = sums[quarter & ~1], odd = sums[quarter | 1];
-    return quarter & 1 ? interleave_uints(even.hi, odd.hi) : interleave_uints(even.lo, odd.lo);
+    return (quarter & 1) ? interleave_uints(even.hi, odd.hi) : interleave_uints(even.lo, odd.lo);
 }
 static inline big16 bigs_of_quarter(const big16 *sums, int quarter) {
     const big16 even = sums[quarter & ~1], odd = sums[quarter | 1];
-    return quarter & 1 ? interleave_bigs(even.hi, odd.hi) : interleave_bigs(even.lo, odd.lo);
+    return (quarter & 1) ? interleave_bigs(even.hi, odd.hi) : interleave_bigs(even.lo, odd.lo);
 }
 
 // Centroids of the 16 lanes of a quarter.

@@ -57,8 +57,8 @@ kernel void line_fit_sets(global const INPUT *restrict points,
 #endif
         x[i] = kept_where(good, px);
         y[i] = kept_where(good, py);
-        origin_x = good & ~found ? px : origin_x;
-        origin_y = good & ~found ? py : origin_y;
+        origin_x = (good & ~found) ? px : origin_x;
+        origin_y = (good & ~found) ? py : origin_y;
         found |= good;
         const reals far = (FABS(x[i]) + FABS(y[i])) * certainty[i];
         reach = far > reach ? far : reach;

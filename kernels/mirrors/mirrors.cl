@@ -163,7 +163,7 @@ INLINE masks guessed(Vector point, Fixed lens, global const MirrorTriangle *row,
     at_corner(point, lens, row, 1, &u1, &v1, &lens_sides, &above, &below);
     at_corner(point, lens, row, 2, &u2, &v2, &lens_sides, &above, &below);
     // At a silhouette lens and point may be on one side of the surface only between the corners.
-    const masks facing = (lens_sides & 1 ? above : (masks)0) | (lens_sides & 2 && row->one_sided == 0 ? below : (masks)0);
+    const masks facing = ((lens_sides & 1) ? above : (masks)0) | (((lens_sides & 2) && row->one_sided == 0) ? below : (masks)0);
     const reals a = u1 * v2 - u2 * v1, b = u2 * v0 - u0 * v2, c = u0 * v1 - u1 * v0, whole = a + b + c;
     const reals per = (real)1 / whole, least = -MARGIN;
     *x = b * per;

@@ -130,7 +130,7 @@ static void load_chunk(global const INPUT *rows, const uint *numbers, uint count
     for (uint first = 0; first < count; first += LANES) load_frames(rows, numbers, count, first, middle, all);
     for (uint left = all->lit; left;) {
         const uint lowest = left & -left;
-        const uint alike = lowest & all->unseen ? 0 : on_line_of(&all->each, lowest_bit(left), count) & ~all->unseen;
+        const uint alike = (lowest & all->unseen) ? 0 : on_line_of(&all->each, lowest_bit(left), count) & ~all->unseen;
         const uint members = (alike & left) | lowest;
         add_line(all, members);
         left &= ~members;

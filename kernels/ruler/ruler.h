@@ -211,7 +211,7 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
                                mask_of(peak.here * place->polarity < 0) & mask_of(gap >= place->nearest) &
                                mask_of(gap <= place->farthest);
             candidate &= ~place->is_pair | fits;
-            strength = place->is_pair & mask_of(weaker < strength) ? weaker : strength;
+            strength = (place->is_pair & mask_of(weaker < strength)) ? weaker : strength;
 #else
             candidate &= has_other & (mask_of(other.here > 0) ^ mask_of(peak.here > 0)) &
                          mask_of(gap >= table[RULER_NEAREST]) & mask_of(gap <= table[RULER_FARTHEST]);
@@ -245,7 +245,7 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
             wins = candidate & mask_of(strength > best);
 #endif
 #ifdef AMBIGUITY
-            rival = wins ? best : (candidate & mask_of(strength > rival) ? strength : rival);
+            rival = wins ? best : ((candidate & mask_of(strength > rival)) ? strength : rival);
 #endif
             best = wins ? strength : best;
             first = ruler_either(wins, from, first);

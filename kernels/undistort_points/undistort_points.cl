@@ -86,7 +86,7 @@ kernel void undistort_points(global const INPUT *restrict points, global real *r
             const masks good = ~mask_of(LANED(not_finite)(given_x)) & ~mask_of(LANED(not_finite)(given_y));
             x = nan_where(bad, x);
             y = nan_where(bad, y);
-            flags = bad & ~(good & mask_of(flags != 0)) ? (masks)STATUS_NOT_FINITE : flags;
+            flags = (bad & ~(good & mask_of(flags != 0))) ? (masks)STATUS_NOT_FINITE : flags;
         }
         store_points(x, y, moved_points, i);
         store_bytes(convert_bytes(flags), status + i);

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import shlex
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
@@ -176,6 +178,11 @@ def test_the_command_writes_features_and_a_picture(tmp_path: Path, run: Select) 
     code, out, _ = run(*arguments, "--out", tmp_path / "chosen")
     assert code == 0
     assert out.startswith("25 rulers")
+    # The proposed next command reads the same layers.
+    words = shlex.split(out.partition("next: ")[2])
+    assert [after for before, after in itertools.pairwise(words) if before == "--layers"] == [
+        f"{name}={layer}" for name, layer in LAYERS.items()
+    ]
     chosen = read_features(tmp_path / "chosen" / "features.toml")
     np.testing.assert_allclose(chosen.placement, (9e-3, 8e-3))
     assert len(chosen.length) == 25

@@ -190,7 +190,8 @@ def propose_layers(files: list[Path]) -> str:
     others = [each.name for each in files if each not in known]
     rest = f" (layers unknown: {_some_names(others)})" if others else ""
     example = line or f"--layers {shlex.quote(f'{glob.escape(files[0].name)}=top copper')}"
-    return f"the names of {len(files)} files do not determine the layers; name its files with layers: {example}{rest}"
+    names = "the name of the file does" if len(files) == 1 else f"the names of {len(files)} files do"
+    return f"{names} not determine the layers; name its files with layers: {example}{rest}"
 
 
 def _guess_layers(files: list[Path]) -> dict[str, list[Path]]:

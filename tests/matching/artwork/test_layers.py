@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import shlex
 import shutil
 from collections.abc import Callable
@@ -84,6 +85,13 @@ def test_few_files_give_the_options_to_copy(tmp_path: Path, capfd: pytest.Captur
     artwork = read_artwork(tmp_path, layers=proposed(error))
     assert (len(artwork.copper), len(artwork.mask), len(artwork.silk)) == (2, 2, 2)
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_single_file_gives_the_option_to_copy(tmp_path: Path) -> None:
+    written(tmp_path, "drawing.gbr")
+    with pytest.raises(ReadError, match="the name of the file does not determine the layers") as error:
+        read_artwork(tmp_path)
+    assert proposed(error) == {fnmatch.translate("drawing.gbr"): "top copper"}
 
 
 def test_a_file_above_the_limit_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -79,10 +79,11 @@ class PlacementResult(NamedTuple):
 
     @property
     def settling_band(self) -> Float64:
-        """Band (3,) of the settled error: the remainder of `ReleaseRule` and three sigmas of the source vision."""
+        """Band (3,) of the settled error: the remainder of `ReleaseRule`, three sigmas of vision and sampling."""
         tolerance = self.machine.tolerance
         limit = np.array([tolerance.position] * 2 + [tolerance.angle])
-        return np.asarray(REMAINDER * limit + 3.0 * self.budget.sigmas["vision"])
+        sigmas = self.budget.sigmas
+        return np.asarray(REMAINDER * limit + 3.0 * np.hypot(sigmas["vision"], sigmas["sampling"]))
 
     @property
     def settled(self) -> list[int | None]:

@@ -20,13 +20,14 @@ from boards import LAYERS, board_folder
 from gpuvision.camera.lens import Lens
 from gpuvision.cli.main import application
 from gpuvision.formats.machine_file import read_machine
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.features.feature_set import edge_clearance
 from gpuvision.matching.pose.motion import rotation
 from gpuvision.servoing.frames import Transform, compose_poses, invert_pose, move_covariance
 from gpuvision.servoing.loop import SimulatedClock
 from gpuvision.servoing.margins import margins
+from gpuvision.servoing.placement.board_renderer import board_renderer
 from gpuvision.servoing.placement.budget import predict_budget
 from gpuvision.servoing.placement.control import Control, Settling
 from gpuvision.servoing.placement.machine import Machine, ThermalDrift
@@ -160,6 +161,56 @@ def test_the_covariance_of_a_measured_pose_is_the_planned_one(
     ratio = np.sqrt(np.diag(reported) / np.diag(result.plan.reported))
     # Noise and residuals of one frame scale the reported covariance.
     np.testing.assert_allclose(ratio, 1.0, atol=0.15)
+
+
+def test_sampling_covariance_is_the_scatter_of_weighted_least_squares(artwork: Artwork, machine: Machine) -> None:
+    """Errors of 0.02 px of each ruler, poses by NumPy: the equations of the rulers are written here again."""
+    plan = plan_placement(artwork, TARGET, machine)
+    features, pixel = plan.features, machine.camera.pixel
+    assert len(features.fiducials.sigma) == 0
+    away = features.point - np.array(TARGET[:2])
+    rows = np.column_stack(
+        [
+            features.normal,
+            features.normal[:, 1] * away[:, 0] - features.normal[:, 0] * away[:, 1],
+            features.spacing == 0.0,
+        ]
+    )
+    error = 0.02 * pixel * np.random.default_rng(1).standard_normal((len(rows), 4000))
+    weight = 1.0 / (features.sigma**2 + (0.02 * pixel) ** 2)
+    bias = np.array([[0.0, 0.0, 0.0, 1.0 / features.imaging.etch_bias_sigma]])  # the prior of the etch bias
+    equations = np.concatenate([np.sqrt(weight)[:, None] * rows, bias])
+    values = np.concatenate([np.sqrt(weight)[:, None] * error, np.zeros((1, error.shape[1]))])
+    found = np.cov(np.linalg.lstsq(equations, values, rcond=None)[0][:3])
+    unit = np.sqrt(np.diag(plan.sampling))
+    # Standard error of a covariance of 4000 draws: 2.2 %.
+    np.testing.assert_allclose(found / np.outer(unit, unit), plan.sampling / np.outer(unit, unit), atol=0.1)
+    sources = predict_budget(machine, plan).sources
+    np.testing.assert_array_equal(sources["sampling"], plan.sampling)
+    assert np.all(np.diag(plan.sampling) < np.diag(plan.reported))
+
+
+@pytest.mark.slow
+def test_sampling_error_of_frames_without_noise_is_within_the_budget(
+    artwork: Artwork, machine: Machine, device: Device
+) -> None:
+    """0.02 px of each ruler is an upper estimate: a third of it is seen here."""
+    plan = plan_placement(artwork, TARGET, machine)
+    camera = dataclasses.replace(machine.camera, sensor=dataclasses.replace(machine.camera.sensor, prnu=0.0, dsnu=0.0))
+    centre, half = plan.camera_pose[:2], 2e-3
+    region = (centre - half, centre + half)
+    board = ReflectanceMap.of(artwork, pixel=camera.pixel, region=region, blur_px=camera.blur_px, nodes_per_pixel=2)
+    poses = plan.camera_pose + np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3)) * (60e-6, 60e-6, 3e-3)
+    rendered = board_renderer(board, camera, noise=False)(poses[:, None], np.zeros(60, np.uint32), device=device)
+    images = to_numpy(rendered.image)
+    bound = plan.features.bind(
+        device, camera.window, images.dtype, copper="bright", threshold=plan.threshold, noise=plan.noise
+    )
+    nozzle = machine.pipette_in_camera.pose
+    found = [np.array(bound(image, pose).pose, np.float64) for image, pose in zip(images, poses, strict=True)]
+    error = compose_poses(np.array(found), nozzle) - compose_poses(poses, nozzle)
+    ratio = np.sqrt(np.mean(error**2, axis=0) / np.diag(plan.sampling))
+    assert np.all((ratio > 0.1) & (ratio < 1.0)), ratio
 
 
 @pytest.mark.parametrize("observer", ["smith", pytest.param("kalman", marks=pytest.mark.slow)])

@@ -1,4 +1,4 @@
-"""Error budget of a placement: calibration, vision, etch bias, servo and thermal drift.
+"""Error budget of a placement: calibration, vision, sampling, etch bias, servo and thermal drift.
 
 References
 ----------
@@ -33,8 +33,8 @@ class ErrorBudget(NamedTuple):
     Attributes
     ----------
     sources : mapping of str to numpy.ndarray
-        Covariance (3, 3) of the pose of the nozzle on the board by source: "calibration", "vision", "etch bias",
-        "servo", "drift".
+        Covariance (3, 3) of the pose of the nozzle on the board by source: "calibration", "vision", "sampling",
+        "etch bias", "servo", "drift".
     total : numpy.ndarray
         (3, 3): sum of all sources.
     """
@@ -182,11 +182,12 @@ def predict_budget(machine: Machine, plan: PlacementPlan, frames: npt.ArrayLike 
     Calibration, etch bias and drift are common to all frames of a placement. "vision" is the motion by the errors of
     the measured poses, which the loop follows: it averages the noise from frame to frame (`noise_covariance`), but not
     the differences between the pixels, which are the same in all frames of a head at rest. The Kalman filter weights
-    the frames by `PlacementPlan.reported`. The error of the bilinear sampling is not in the budget. "servo" is the
-    rest of the step response that `ReleaseRule` allows, evenly distributed, and the step of the encoder. With the
-    rule "vibration" an axis that swings adds a swing at a random phase, with the largest amplitude that the rule
-    allows. With the rule "fixed" the rest is the error that a start in the landing zone leaves after the
-    fixed time; a vibration is not included.
+    the frames by `PlacementPlan.reported`. "sampling" is the error of the bilinear sampling, `PlacementPlan.sampling`:
+    it is the same in all frames of a head at rest, and is not averaged. It is an upper estimate: 0.02 px in each ruler.
+    "servo" is the rest of the step response that `ReleaseRule` allows, evenly distributed, and the step of the encoder.
+    With the rule "vibration" an axis that swings adds a swing at a random phase, with the largest amplitude that the
+    rule allows. With the rule "fixed" the rest is the error that a start in the landing zone leaves after the fixed
+    time; a vibration is not included.
     """
     turn, tolerance = plan.camera_to_board, machine.tolerance
     zone = np.array([tolerance.landing_zone] * 2 + [tolerance.landing_angle])
@@ -199,6 +200,7 @@ def predict_budget(machine: Machine, plan: PlacementPlan, frames: npt.ArrayLike 
         "etch bias": plan.etch_bias,
         "drift": turn @ machine.drift.covariance @ turn.T,
         "vision": moved + plan.fixed_pattern * plan.vision,
+        "sampling": plan.sampling,
         "servo": np.diag(_servo_variance(machine) + steps**2 / 12.0),
     }
     return ErrorBudget(sources, np.sum(list(sources.values()), axis=0))

@@ -64,10 +64,12 @@ class PlacementPlan:
     fixed_pattern : float
         Part of the variance of ``vision`` by the differences between the pixels, 0 to 1: frames of a head at rest have
         this error in common.
+    sampling : numpy.ndarray
+        (3, 3): predicted covariance of the pose of the nozzle by the bilinear sampling along rulers and by the error
+        that fiducials have without noise: common to the frames of a head at rest, different from place to place.
     reported : numpy.ndarray
-        (3, 3): predicted covariance of the pose of the nozzle that a measurement reports to the observer. It adds to
-        ``vision`` the error of the bilinear sampling along rulers and the error that fiducials have without noise:
-        common to the frames of a head at rest, different from place to place.
+        (3, 3): predicted covariance of the pose of the nozzle that a measurement reports to the observer, by noise and
+        sampling together.
     etch_bias : numpy.ndarray
         (3, 3): predicted covariance of the pose of the nozzle by the etch bias of the board, common to all frames.
     """
@@ -80,6 +82,7 @@ class PlacementPlan:
     noise: float
     vision: Float64
     fixed_pattern: float
+    sampling: Float64
     reported: Float64
     etch_bias: Float64
 
@@ -152,6 +155,7 @@ def plan_placement(
     except ValueError as error:
         raise ValueError(explain_refusal(str(error), artwork, place, camera_pose, machine, guidance)) from error
     noise, etch_bias = _split_covariance(features)
+    sampling, reported = _sampling_and_reported(features)
     bright = max(board.copper_masked, board.laminate_masked) * white
     total, temporal = (float(sensor.noise(bright, machine.camera.exposure, spatial=each)) for each in (True, False))
     return PlacementPlan(
@@ -163,7 +167,8 @@ def plan_placement(
         noise=total * sensor.gain,
         vision=move_covariance(noise, camera_pose, calibrated),
         fixed_pattern=1.0 - (temporal / total) ** 2,
-        reported=move_covariance(_reported_covariance(features), camera_pose, calibrated),
+        sampling=move_covariance(sampling, camera_pose, calibrated),
+        reported=move_covariance(reported, camera_pose, calibrated),
         etch_bias=move_covariance(etch_bias, camera_pose, calibrated),
     )
 
@@ -319,17 +324,20 @@ def _split_covariance(features: FeatureSet) -> tuple[Float64, Float64]:
     return noise[:3, :3], common[:3, :3]
 
 
-def _reported_covariance(features: FeatureSet) -> Float64:
-    """Return the covariance (3, 3) of the pose as `FeatureSet.bind` reports it: noise and sampling of the features."""
+def _sampling_and_reported(features: FeatureSet) -> tuple[Float64, Float64]:
+    """Return the covariance (3, 3) of the pose by the sampling of the features, and the one by sampling and noise.
+
+    `FeatureSet.bind` weights the features by both errors, and reports the second covariance.
+    """
     marks, pixel, limits = features.fiducials, features.imaging.pixel, FiducialLimits()
+    along = np.full(len(features.sigma), SAMPLING_SIGMA_PX * pixel)
     without_noise = np.where(marks.hole > 0.0, limits.edges_sigma_px, limits.matched_sigma_px) * pixel
-    sampled = replace(
-        features,
-        sigma=np.hypot(features.sigma, SAMPLING_SIGMA_PX * pixel),
-        fiducials=marks._replace(sigma=np.hypot(marks.sigma, without_noise)),
-    )
-    rows, prior = _weighted_rows(sampled)
-    return np.asarray(np.linalg.inv(rows.T @ rows + prior)[:3, :3])
+    sigma, mark_sigma = np.hypot(features.sigma, along), np.hypot(marks.sigma, without_noise)
+    rows, prior = _weighted_rows(replace(features, sigma=sigma, fiducials=marks._replace(sigma=mark_sigma)))
+    covariance = np.linalg.inv(rows.T @ rows + prior)
+    part = np.concatenate([along / sigma, without_noise / mark_sigma, without_noise / mark_sigma])
+    sampled = rows * part[:, None]
+    return (covariance @ sampled.T @ sampled @ covariance)[:3, :3], covariance[:3, :3]
 
 
 def _largest_leverage(features: FeatureSet) -> float:

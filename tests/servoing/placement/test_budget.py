@@ -32,6 +32,7 @@ def _plan() -> PlacementPlan:
         noise=1.0,
         vision=NOISE,
         fixed_pattern=0.0,
+        sampling=np.zeros((3, 3)),
         reported=REPORTED,
         etch_bias=np.zeros((3, 3)),
     )

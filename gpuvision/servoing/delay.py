@@ -35,7 +35,7 @@ Float64 = npt.NDArray[np.float64]
 # Points of the search for crossings of the unit circle, per root of the polynomial: the phase of the loop changes by
 # less than a tenth of a turn between two points.
 _POINTS_PER_ROOT = 64
-# Longest delay [frames] (chosen: a second at 1 kHz); memory and time of the analyses grow with it.
+# Longest delay and lag [frames] (chosen: a second at 1 kHz); memory and time of the analyses grow with it.
 _MAX_DELAY = 1000.0
 
 
@@ -65,8 +65,57 @@ class LoopPolynomials(NamedTuple):
     denominator: Float64
 
 
-def closed_loop(delay: float, gain: float, *, integral: float = math.inf, derivative: float = 0.0) -> LoopPolynomials:
-    """Return the closed loop of controller, integrating plant with hold, and delay.
+class HeldAxis(NamedTuple):
+    """Sampled axis whose velocity follows the command with a lag; q = 1/z is the delay of a frame.
+
+    Attributes
+    ----------
+    decay : float
+        Part of a velocity that remains after a frame: the poles are 1 and ``decay``.
+    now, seen : numpy.ndarray
+        Coefficients of the powers of q, lowest power first, of the position at the frame and at the exposure, over
+        ``(1 - q)(1 - decay q)``, for a command of 1 [frames].
+    """
+
+    decay: float
+    now: Float64
+    seen: Float64
+
+
+def held_axis(delay: float, lag: float = 0.0) -> HeldAxis:
+    """Return the axis ``lag v' = u - v, x' = v`` with commands that are held for a frame, sampled exactly.
+
+    Parameters
+    ----------
+    delay : float
+        Time from the exposure to the frame [frames], 0 or more; fractions are exact.
+    lag : float
+        Time constant of the velocity [frames], 0 to 1000; 0 (default) follows at once.
+
+    Notes
+    -----
+    In a time s the position moves by ``g v + (s - g) u`` with ``g = lag (1 - exp(-s / lag))``. Without a lag the
+    position is linear between two commands.
+    """
+    whole, part = delay_taps(delay)
+    if finite(lag, "lag", minimum=0.0, maximum=_MAX_DELAY) == 0.0:
+        now, seen, decay = np.array([0.0, 1.0]), np.array([0.0, 1.0 - part, part]), 0.0
+    else:
+        decay, moved, time = math.exp(-1.0 / lag), -lag * math.expm1(-1.0 / lag), 1.0 - part
+        faded = -lag * math.expm1(-time / lag)
+        driven, follows = time - faded, faded * (1.0 - decay)
+        now = np.array([0.0, 1.0 - moved, moved - decay])
+        last = moved - decay - follows + driven * decay
+        seen = np.array([0.0, driven, 1.0 - moved + follows - driven * (1.0 + decay), last])
+    if not part:
+        seen = now
+    return HeldAxis(decay, now, np.concatenate([np.zeros(whole), seen]))
+
+
+def closed_loop(
+    delay: float, gain: float, *, integral: float = math.inf, derivative: float = 0.0, lag: float = 0.0
+) -> LoopPolynomials:
+    """Return the closed loop of controller, integrating plant with hold and lag, and delay.
 
     Parameters
     ----------
@@ -79,29 +128,31 @@ def closed_loop(delay: float, gain: float, *, integral: float = math.inf, deriva
     derivative : float
         Time constant of the derivative part [frames], default 0. It acts on the commanded velocity of the last frame:
         the velocity that `SmithPredictor` and `PoseObserver` estimate.
+    lag : float
+        Time constant with which the velocity of the plant follows the command [frames], default 0.
 
     Notes
     -----
-    With q = 1/z, the delay D, and the controller B / A, the position is ``gain q B / ((1 - q) A + gain q B D)`` times
-    the target: ``B = 1, A = 1 + gain derivative q`` without integral part, and ``B = 1 + 1 / integral - q,
-    A = 1 - q + gain derivative q B`` with it.
+    With q = 1/z, the numerators N now and S at the exposure of `held_axis`, its decay e, and the controller B / A, the
+    position is ``gain N B / ((1 - q) A + gain S B)`` times the target. ``A = (1 - e q) + gain derivative (1 - e) q B``
+    and ``B = 1`` without integral part. With it, ``B = 1 + 1 / integral - q`` and the first term of A has the factor
+    ``1 - q``. Without lag, N = q and e = 0.
     """
-    whole, part = delay_taps(delay)
+    axis = held_axis(delay, lag)
     has_integral = math.isfinite(integral)
     front = np.array([1.0 + 1.0 / integral, -1.0] if has_integral else [1.0])
     back = np.array([1.0, -1.0] if has_integral else [1.0])
+    if lag:
+        back = np.convolve(back, [1.0, -axis.decay])
     if derivative:
-        back = np.pad(back, (0, len(front) + 1 - len(back)))
-        back[1:] += gain * derivative * front
-    taps = np.zeros(whole + 2)  # gain q D
-    taps[-1] = gain * (1.0 - part)
-    if part:
-        taps = np.append(taps, gain * part)
-    loop, own = np.convolve(taps, front), np.convolve([1.0, -1.0], back)
-    numerator, denominator = np.zeros((2, max(len(loop), len(own))))
+        back = np.pad(back, (0, max(len(front) + 1 - len(back), 0)))
+        back[1 : len(front) + 1] += gain * derivative * (1.0 - axis.decay) * front
+    loop, own = np.convolve(gain * axis.seen, front), np.convolve([1.0, -1.0], back)
+    forward = np.convolve(axis.now, gain * front)
+    numerator, denominator = np.zeros((2, max(len(loop), len(own), len(forward))))
     denominator[: len(own)] += own
     denominator[: len(loop)] += loop
-    numerator[1 : len(front) + 1] = gain * front
+    numerator[: len(forward)] = forward
     return LoopPolynomials(numerator, denominator)
 
 
@@ -196,6 +247,52 @@ def non_oscillating_gain(delay: float) -> float:
     roots = np.roots([-(whole + 1) * (1.0 - part), (whole + 1) * (1.0 - 2.0 * part) - 1.0, (whole + 1) * part])
     z = max(float(each.real) for each in roots if 0.0 < each.real < 1.0)
     return z ** (whole + 1) * (1.0 - z) / ((1.0 - part) * z + part)
+
+
+class LagGains(NamedTuple):
+    """Gains of the sampled loop of an axis with a lag, without a delay: the loop of a Smith predictor.
+
+    Attributes
+    ----------
+    limit : float
+        Gain from which on the loop is unstable: fraction of the error that one frame corrects.
+    critical : float
+        Largest gain without oscillation.
+    """
+
+    limit: float
+    critical: float
+
+
+def lag_gains(lag: float) -> LagGains:
+    """Return the gains that a lag of the axis allows, without a delay.
+
+    Parameters
+    ----------
+    lag : float
+        Time constant with which the velocity follows the command [frames], 0 to 1000.
+
+    Notes
+    -----
+    With ``e = exp(-1 / lag)``, ``a = 1 - lag (1 - e)`` and ``b = lag (1 - e) - e`` the characteristic polynomial is
+    ``z^2 - (1 + e - K a) z + e + K b``. It is stable below ``(1 - e) / b`` (a pair of complex roots) and below
+    ``2 (1 + e) / (a - b)`` (a root at -1), by Jury's criterion. The roots are real up to the smaller root of
+    ``a^2 K^2 - 2 (a (1 + e) + 2 b) K + (1 - e)^2 = 0``. For a long lag the limits are 2 and 1 / (4 lag).
+
+    Examples
+    --------
+    >>> lag_gains(0.0)
+    LagGains(limit=2.0, critical=1.0)
+    >>> round(lag_gains(1.0).critical, 3)
+    0.196
+    """
+    if finite(lag, "lag", minimum=0.0, maximum=_MAX_DELAY) == 0.0:
+        return LagGains(2.0, 1.0)
+    decay, lost = math.exp(-1.0 / lag), -math.expm1(-1.0 / lag)
+    a, b = 1.0 - lag * lost, lag * lost - decay
+    half = a * (1.0 + decay) + 2.0 * b
+    critical = lost**2 / (half + math.sqrt(max(half**2 - (a * lost) ** 2, 0.0)))
+    return LagGains(min(lost / b, 2.0 * (1.0 + decay) / (a - b)), critical)
 
 
 class ContinuousGains(NamedTuple):

@@ -53,7 +53,7 @@ def root_locus(delay: float, gains: npt.ArrayLike) -> npt.NDArray[np.complex128]
 
 
 def step_response(
-    delay: float, gain: float, frames: int, *, integral: float = math.inf, derivative: float = 0.0
+    delay: float, gain: float, frames: int, *, integral: float = math.inf, derivative: float = 0.0, lag: float = 0.0
 ) -> Float64:
     """Return the error in each frame after a step of the target by 1.
 
@@ -67,6 +67,8 @@ def step_response(
         Number of frames, 1 or more.
     integral, derivative : float
         Time constants of a PI or PID controller [frames], as for `closed_loop`. Default: a proportional controller.
+    lag : float
+        Time constant with which the velocity of the plant follows the command [frames], default 0.
 
     Returns
     -------
@@ -76,12 +78,18 @@ def step_response(
     """
     count = integer(frames, "frames", minimum=1)
     # The position x follows x[k+1] = x[k] + gain (1 - delayed x[k]) from x = 0.
-    numerator, denominator = closed_loop(delay, gain, integral=integral, derivative=derivative)
+    numerator, denominator = closed_loop(delay, gain, integral=integral, derivative=derivative, lag=lag)
     return 1.0 - np.asarray(lfilter(numerator, denominator, np.ones(count)), np.float64)
 
 
 def settling_frames(
-    delay: float, gain: float, tolerance: float, *, integral: float = math.inf, derivative: float = 0.0
+    delay: float,
+    gain: float,
+    tolerance: float,
+    *,
+    integral: float = math.inf,
+    derivative: float = 0.0,
+    lag: float = 0.0,
 ) -> int:
     """Return the number of frames after which the error of a step of 1 stays within a tolerance.
 
@@ -91,7 +99,7 @@ def settling_frames(
         As for `step_response`; the loop must be stable.
     tolerance : float
         Largest error as a fraction of the step, above 0 and below 1.
-    integral, derivative : float
+    integral, derivative, lag : float
         As for `step_response`.
 
     Raises
@@ -100,7 +108,7 @@ def settling_frames(
         The loop is not stable, the tolerance is out of range, or the search takes more than 3.6 million frames.
     """
     tolerance = finite(tolerance, "tolerance", above=0.0, maximum=1.0)
-    poles = np.roots(closed_loop(delay, gain, integral=integral, derivative=derivative).denominator)
+    poles = np.roots(closed_loop(delay, gain, integral=integral, derivative=derivative, lag=lag).denominator)
     slowest = float(np.abs(poles).max(initial=0.0)) if gain > 0.0 else 1.0
     if slowest >= 1.0 - 1e-12:  # rounding of np.roots at double roots is below 1e-7 of the root's distance
         raise ValueError(f"the loop with delay {delay:g} frames and gain {gain:g} is not stable: no settling time")
@@ -108,7 +116,7 @@ def settling_frames(
     count = math.ceil(2.0 * math.log(tolerance) / math.log(slowest)) if slowest > 0.0 else 0
     count += 4 * (math.ceil(delay) + 2)
     while count <= _MAX_FRAMES:
-        error = step_response(delay, gain, count, integral=integral, derivative=derivative)
+        error = step_response(delay, gain, count, integral=integral, derivative=derivative, lag=lag)
         outside = np.flatnonzero(np.abs(error) > tolerance)
         if outside.size == 0 or outside[-1] < count // 2:
             return int(outside[-1]) + 1 if outside.size else 0

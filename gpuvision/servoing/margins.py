@@ -19,7 +19,7 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import brentq
 
 from gpuvision.servoing.controllers import PidGains
-from gpuvision.servoing.delay import delay_taps
+from gpuvision.servoing.delay import delay_taps, held_axis, lag_gains
 from gpuvision.servoing.observer import MotionModel
 from gpuvision.validation import finite
 
@@ -132,7 +132,9 @@ def _first_root(function: Callable[[float], float], angles: Float64, values: Flo
     return float(brentq(function, angles[places[0]], angles[places[0] + 1])) if places.size else None
 
 
-def predictor_polynomial(gain: float, delay: float, model_delay: float, plant_gain: float = 1.0) -> Float64:
+def predictor_polynomial(
+    gain: float, delay: float, model_delay: float, plant_gain: float = 1.0, *, lag: float = 0.0
+) -> Float64:
     """Return the characteristic polynomial of a proportional loop with a Smith predictor and a wrong model.
 
     Parameters
@@ -143,18 +145,23 @@ def predictor_polynomial(gain: float, delay: float, model_delay: float, plant_ga
         Delay of the plant and of the predictor [frames]; fractions are exact.
     plant_gain : float
         Motion of the plant over motion of the model. Default 1.
+    lag : float
+        Time constant with which the velocities of plant and model follow the command [frames]. Default 0.
 
     Returns
     -------
     numpy.ndarray
-        Coefficients, highest power first, of z^n (z - 1 + gain (1 + plant_gain D(z) - M(z))), where D and M are the
-        taps of the two delays. With a right model it is z^n (z - 1 + gain): the loop without delay.
+        Coefficients, highest power first. Without lag, of z^n (z - 1 + gain (1 + plant_gain D(z) - M(z))), where D and
+        M are the taps of the two delays. With a right model it is z^n (z - 1 + gain): the loop without delay. With a
+        lag, the terms 1, D and M are the positions of `held_axis`.
     """
-    (whole, part), (known, known_part) = delay_taps(delay), delay_taps(model_delay)
-    polynomial = np.zeros(max(whole, known) + 3)
-    polynomial[:2] = 1.0, -1.0 + gain
-    polynomial[whole + 1 : whole + 3] += gain * plant_gain * np.array([1.0 - part, part])
-    polynomial[known + 1 : known + 3] -= gain * np.array([1.0 - known_part, known_part])
+    true, model = held_axis(delay, lag), held_axis(model_delay, lag)
+    own = np.convolve([1.0, -1.0], [1.0, -true.decay] if lag else [1.0])
+    polynomial = np.zeros(max(len(true.seen), len(model.seen), len(own)))
+    polynomial[: len(own)] = own
+    polynomial[: len(true.now)] += gain * true.now
+    polynomial[: len(true.seen)] += gain * plant_gain * true.seen
+    polynomial[: len(model.seen)] -= gain * model.seen
     return polynomial
 
 
@@ -175,25 +182,28 @@ class PredictorTolerance(NamedTuple):
     plant_gain: float
 
 
-def predictor_tolerance(gain: float, delay: float) -> PredictorTolerance:
+def predictor_tolerance(gain: float, delay: float, *, lag: float = 0.0) -> PredictorTolerance:
     """Return the errors of the model at which a loop with a Smith predictor becomes unstable.
 
     Parameters
     ----------
     gain : float
-        Fraction of the predicted error that one frame corrects, above 0 and below 2.
+        Fraction of the predicted error that one frame corrects, above 0 and below the limit of `lag_gains`: 2 without
+        lag.
     delay : float
         Delay of the predictor [frames].
+    lag : float
+        Time constant with which the velocities of plant and model follow the command [frames]. Default 0.
 
     Notes
     -----
     The errors are scanned in 200 steps, up to a delay of ``delay + 10`` frames and a gain of 10, and the first unstable
     one is refined by bisection.
     """
-    finite(gain, "gain", above=0.0, maximum=2.0)
+    finite(gain, "gain", above=0.0, maximum=lag_gains(lag).limit)
 
     def is_stable(error: float, factor: float) -> bool:
-        polynomial = predictor_polynomial(gain, max(delay + error, 0.0), delay, factor)
+        polynomial = predictor_polynomial(gain, max(delay + error, 0.0), delay, factor, lag=lag)
         return bool(np.abs(np.roots(polynomial)).max() < 1.0)
 
     return PredictorTolerance(

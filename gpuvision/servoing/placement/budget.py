@@ -49,7 +49,9 @@ class ErrorBudget(NamedTuple):
         return {name: np.sqrt(np.diag(covariance)) for name, covariance in each.items()}
 
 
-def noise_gain(delay: float, gain: float, *, integral: float = math.inf, derivative: float = 0.0) -> float:
+def noise_gain(
+    delay: float, gain: float, *, integral: float = math.inf, derivative: float = 0.0, lag: float = 0.0
+) -> float:
     """Return the variance of the position of a servo loop at rest over the variance of a measured position.
 
     Parameters
@@ -60,6 +62,8 @@ def noise_gain(delay: float, gain: float, *, integral: float = math.inf, derivat
         Fraction of the error that one frame corrects; the loop must be stable.
     integral, derivative : float
         Time constants of a PI or PID controller [frames], as for `closed_loop`. Default: a proportional controller.
+    lag : float
+        Time constant with which the velocity of the plant follows the command [frames], default 0.
 
     Notes
     -----
@@ -71,7 +75,7 @@ def noise_gain(delay: float, gain: float, *, integral: float = math.inf, derivat
     ValueError
         The loop is not stable, or the gain is 0.
     """
-    zeros, poles = closed_loop(delay, gain, integral=integral, derivative=derivative)
+    zeros, poles = closed_loop(delay, gain, integral=integral, derivative=derivative, lag=lag)
     total = 0.0
     while len(poles) > 1:
         if abs(poles[-1]) >= poles[0]:
@@ -157,7 +161,7 @@ def model_tolerance(machine: Machine, plan: PlacementPlan) -> ModelTolerance | N
     if machine.control.controller != "p":
         return None
     if machine.control.motion_sigma is None:
-        predictor = predictor_tolerance(gain, machine.response_frames)
+        predictor = predictor_tolerance(gain, delay, lag=machine.control_lag)
         return ModelTolerance(predictor.plant_gain, predictor.longer * period)
     ratio = np.array(machine.control.motion_sigma) / np.sqrt(np.diag(plan.reported))
     each = [observer_tolerance(gain, delay, lag=machine.lag / period, noise_ratio=float(one)) for one in ratio]

@@ -36,7 +36,7 @@ class Control:
     ----------
     observer : {"latest", "smith", "kalman"}
         Estimate of the pose: the latest measured pose (`LatestPose`, default), this pose and the motion that was
-        commanded during the known delay (`SmithPredictor`, for axes without a lag), or a Kalman filter
+        commanded during the known delay (`SmithPredictor`, with a model of the lag of the axes), or a Kalman filter
         (`PoseObserver`).
     controller : {"p", "pi", "pid"}
         Parts of the controller; default "p". The head integrates the commanded velocity, so "p" leaves no steady error.

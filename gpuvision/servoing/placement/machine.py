@@ -17,7 +17,7 @@ from gpuvision.camera.orthographic import BoardView
 from gpuvision.matching.artwork.board_artwork import Side
 from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.controllers import PidGains, simc_gains
-from gpuvision.servoing.delay import DelayBudget, closed_loop, gain_limit, non_oscillating_gain
+from gpuvision.servoing.delay import DelayBudget, closed_loop, gain_limit, lag_gains, non_oscillating_gain
 from gpuvision.servoing.delay_response import settling_frames, step_response
 from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform
 from gpuvision.servoing.placement.control import Control, Settling
@@ -223,8 +223,7 @@ class Machine:
     Raises
     ------
     ValueError
-        A frame or a number is wrong, the frame does not fit into its period, the gain makes the loop unstable, or an
-        axis of a machine with the observer "smith" has a lag.
+        A frame or a number is wrong, the frame does not fit into its period, or the gain makes the loop unstable.
     """
 
     camera: PlacementCamera
@@ -256,8 +255,6 @@ class Machine:
         for axis, swing in zip(self.axes, self.swing, strict=True):
             if finite(swing, "swing", minimum=0.0) and not axis.resonance:
                 raise ValueError("swing needs an axis with a resonance")
-        if self.lag and self.control.observer == "smith":
-            raise ValueError('the Smith predictor knows no lag of the axes; use observer = "kalman"')
         wait, most = self.settling.wait, self.tolerance.max_time
         if wait is not None and wait >= most:
             raise ValueError(f"settling.wait is {wait} s, expected less than tolerance.max_time, {most} s")
@@ -266,12 +263,14 @@ class Machine:
     def _check_stability(self) -> None:
         """Raise a `ValueError` for a gain that is unstable or too small."""
         gain, delay = self.control.gain, self.control_delay
-        # Below half a frame a delay raises the limit, a lag does not.
-        most = gain_limit(max(delay, 0.5) if self.lag else delay)
+        if self.control_lag:
+            most, cause = lag_gains(self.control_lag).limit, f"a lag of {self.control_lag:.2f} frames"
+        else:
+            # Below half a frame a delay raises the limit, a lag does not.
+            most, cause = gain_limit(max(delay, 0.5) if self.lag else delay), f"a delay of {delay:.2f} frames"
         if gain is not None and not (gain > 0.0 and (gain < most or self.control.controller != "p")):
             raise ValueError(
-                f"gain is {gain}, expected above 0 and below {most:.4g}, the limit of stability for a delay of "
-                f"{delay:.2f} frames"
+                f"gain is {gain}, expected above 0 and below {most:.4g}, the limit of stability for {cause}"
             )
         if gain is not None and gain < _MIN_GAIN:
             raise ValueError(f"gain is {gain}, expected {_MIN_GAIN} or more: the loop would hardly move")
@@ -281,8 +280,7 @@ class Machine:
         if not np.all(np.abs(np.roots(loop.denominator)) < 1.0):
             raise ValueError(
                 f"the controller {self.control.controller} with gain {self.loop_gain:.4g}, integral "
-                f"{gains.integral:.4g} s and derivative {gains.derivative:.4g} s is not stable with a delay of "
-                f"{delay:.2f} frames"
+                f"{gains.integral:.4g} s and derivative {gains.derivative:.4g} s is not stable with {cause}"
             )
 
     @property
@@ -322,12 +320,22 @@ class Machine:
     def control_delay(self) -> float:
         """Delay in frames that the controller sees: the part of `response_frames` that the observer does not predict.
 
-        The Smith predictor predicts the delay of axes without a lag. The Kalman filter predicts the delay by the time
-        stamps, and the lag remains.
+        The Smith predictor predicts the delay, and `control_lag` remains. The Kalman filter predicts the delay by the
+        time stamps, and the lag remains as a delay.
         """
         if self.control.observer == "latest":
             return self.response_frames
         return self.lag / self.period if self.control.observer == "kalman" else 0.0
+
+    @property
+    def control_lag(self) -> float:
+        """Longest lag of an axis in frames, where the theory of the loop has it as a lag: with the Smith predictor."""
+        return self.lag / self.period if self.control.observer == "smith" else 0.0
+
+    @property
+    def _smooth_gain(self) -> float:
+        """Largest proportional gain without oscillation."""
+        return lag_gains(self.control_lag).critical if self.control_lag else non_oscillating_gain(self.control_delay)
 
     @property
     def loop_gain(self) -> float:
@@ -335,7 +343,7 @@ class Machine:
         if self.control.gain is not None:
             return self.control.gain
         if self.control.controller == "p":
-            return non_oscillating_gain(self.control_delay)
+            return self._smooth_gain
         return self._rule.proportional * self.period
 
     @property
@@ -353,8 +361,11 @@ class Machine:
 
     @property
     def _rule(self) -> PidGains:
-        """Gains by the rule of Skogestad for the delay that the controller sees, with half a frame for the hold."""
-        return simc_gains((self.control_delay + 0.5) * self.period)
+        """Gains by the rule of Skogestad for the delay that the controller sees, with half a frame for the hold.
+
+        A lag counts as a delay.
+        """
+        return simc_gains((self.control_delay + self.control_lag + 0.5) * self.period)
 
     def error_after(self, frames: int) -> Float64:
         """Return the error (frames,) in each frame after a start error of 1, by theory."""
@@ -367,15 +378,15 @@ class Machine:
     @property
     def overshoot(self) -> float:
         """Overshoot of the step response as a fraction of the start error, by theory; 0 without oscillation."""
-        if self.control.controller == "p" and self.loop_gain <= non_oscillating_gain(self.control_delay):
+        if self.control.controller == "p" and self.loop_gain <= self._smooth_gain:
             return 0.0
         return max(-float(self.error_after(self.frames_to(_SETTLED) + 1).min()), 0.0)
 
     @property
     def time_constants(self) -> dict[str, float]:
-        """Time constants ``integral`` and ``derivative`` of the controller [frames]: arguments of `closed_loop`."""
-        gains = self.gains
-        return {"integral": gains.integral / self.period, "derivative": gains.derivative / self.period}
+        """Time constants ``integral``, ``derivative`` and ``lag`` [frames]: arguments of `closed_loop`."""
+        integral, derivative = self.gains.integral / self.period, self.gains.derivative / self.period
+        return {"integral": integral, "derivative": derivative, "lag": self.control_lag}
 
     def for_side(self, side: Side) -> Machine:
         """Return the machine over a side of the board.

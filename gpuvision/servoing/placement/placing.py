@@ -47,17 +47,17 @@ def make_observer(machine: Machine, target: npt.ArrayLike, start: float) -> Pose
         Time of the start of the loop [s].
     """
     zone = machine.tolerance
+    lags = (machine.axes[0].lag, machine.axes[1].lag, machine.axes[2].lag)
     prior = np.diag(_PRIOR * np.array([zone.landing_zone, zone.landing_zone, zone.landing_angle])) ** 2
     if machine.control.motion_sigma is not None:
         x, y, theta = (each**2 * machine.rate for each in machine.control.motion_sigma)
-        lags = (machine.axes[0].lag, machine.axes[1].lag, machine.axes[2].lag)
         history = 256 + 4 * math.ceil(machine.response_frames)
         kalman = PoseObserver(MotionModel(lag=lags, position_noise=(x, y, theta)), history=history)
         kalman.reset(start - machine.delay.latency - machine.period, target, prior)
         return kalman
     if machine.control.observer == "smith":
-        delay = machine.response_frames
-        observer = SmithPredictor(delay * machine.period, history=256 + math.ceil(delay))
+        delay = machine.delay
+        observer = SmithPredictor(delay.frames * machine.period, lag=lags, history=256 + math.ceil(delay.frames))
         observer.reset(-math.inf, target, prior)
         return observer
     latest = LatestPose()

@@ -334,10 +334,10 @@ def _sampling_and_reported(features: FeatureSet) -> tuple[Float64, Float64]:
     without_noise = np.where(marks.hole > 0.0, limits.edges_sigma_px, limits.matched_sigma_px) * pixel
     sigma, mark_sigma = np.hypot(features.sigma, along), np.hypot(marks.sigma, without_noise)
     rows, prior = _weighted_rows(replace(features, sigma=sigma, fiducials=marks._replace(sigma=mark_sigma)))
-    covariance = np.linalg.inv(rows.T @ rows + prior)
+    covariance = np.asarray(np.linalg.inv(rows.T @ rows + prior), np.float64)
     part = np.concatenate([along / sigma, without_noise / mark_sigma, without_noise / mark_sigma])
-    sampled = rows * part[:, None]
-    return (covariance @ sampled.T @ sampled @ covariance)[:3, :3], covariance[:3, :3]
+    moved = (rows * part[:, None]) @ covariance
+    return np.asarray(moved.T @ moved, np.float64)[:3, :3], covariance[:3, :3]
 
 
 def _largest_leverage(features: FeatureSet) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from gpuvision.servoing.controllers import PidController
 from gpuvision.servoing.loop import ServoLoop, SimulatedClock
 from gpuvision.servoing.observer import PoseMeasurement, PosePrediction
 from gpuvision.servoing.placement import rehearsal
-from gpuvision.servoing.placement.budget import noise_covariance
+from gpuvision.servoing.placement.budget import model_tolerance, noise_covariance
 from gpuvision.servoing.placement.control import Control, Settling
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.placing import (
@@ -356,11 +356,34 @@ def test_frames_of_axes_with_a_lag_are_those_of_theory(control: Control, lag: fl
     assert settled == pytest.approx(machine.frames_to(0.02), rel=0.15)
 
 
+@pytest.mark.parametrize("lag", [0.3e-3, 2e-3])
 @pytest.mark.parametrize("controller", ["p", "pi", "pid"])
-def test_a_smith_predictor_with_axes_that_lag_is_refused(controller: Any) -> None:
-    axes = (Axis(), Axis(lag=0.3e-3), Axis())
-    with pytest.raises(ValueError, match='knows no lag of the axes; use observer = "kalman"'):
-        dataclasses.replace(PRESET, control=Control(observer="smith", controller=controller), axes=axes)
+def test_a_smith_predictor_with_axes_that_lag_follows_the_theory(controller: Any, lag: float) -> None:
+    axes = (Axis(lag=lag),) * 3
+    machine = dataclasses.replace(PRESET, control=Control(observer="smith", controller=controller), axes=axes)
+    error = _free_run(machine, np.array([50e-6, 0.0, 0.0]), 60, axes=axes)[:, 0]
+    np.testing.assert_allclose(error / 50e-6, machine.error_after(60), atol=1e-9)
+    if controller == "p":
+        assert machine.overshoot == 0.0
+        assert error.min() > -1e-12
+        with pytest.raises(ValueError, match=rf"limit of stability for a lag of {1e3 * lag:.2f} frames"):
+            dataclasses.replace(machine, control=Control(observer="smith", gain=5.0))
+
+
+def test_a_smith_predictor_with_axes_that_lag_places_a_part() -> None:
+    axes = (Axis(lag=0.5e-3), Axis(lag=1e-3), Axis())
+    machine = dataclasses.replace(PRESET, control=Control(observer="smith"), axes=axes)
+    plant = SimulatedPlant(axes, start=(80e-6, -60e-6, 3e-3))
+    placement = place_part(machine, np.zeros(3), plant, _sensor(plant, machine, is_noisy=True), SimulatedClock())
+    assert placement.released
+    rest = plant.pose(placement.record.time[-1] + 20e-3)
+    assert np.hypot(*rest[:2]) < machine.tolerance.position
+    assert abs(rest[2]) < machine.tolerance.angle
+    slower = dataclasses.replace(machine, control=Control())
+    assert placement.predicted_frames < slower.frames_to(0.2 * 3e-6 / 100e-6)
+    tolerated = model_tolerance(machine, cast(Any, None))
+    assert tolerated is not None
+    assert tolerated.plant_gain > 2.0
 
 
 def test_a_fixed_wait_beyond_the_longest_time_is_refused() -> None:

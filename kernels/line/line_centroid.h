@@ -45,9 +45,10 @@ static inline void add_exactly(reals *sum, reals *error, reals value) {
 }
 
 // Add the block sums s and m (see above) of `steps` samples from index `first` on. Its moment is first * s + (steps * s
-// - m); the rounding error of the product is fma(first, s, -first * s).
+// - m); the rounding error of the product is fma(first, s, -first * s). The product itself is an fma with `poison`, which
+// is 0 for finite samples: a compiler could contract a plain product into the sum that the two-sum takes apart.
 static inline void add_block(Sums *sums, reals s, reals m, int first, int steps) {
-    const reals begin = (real)first, at_begin = begin * s;
+    const reals begin = (real)first, at_begin = fma(begin, s, sums->poison);
     add_exactly(&sums->total, &sums->total_error, s);
     add_exactly(&sums->moment, &sums->moment_error, at_begin);
     add_exactly(&sums->moment, &sums->moment_error, (real)steps * s - m);

@@ -129,12 +129,12 @@ INLINE void view_cut(reals v1, reals v2, reals *enter, reals *leave) {
 }
 
 // Interpolate between two corners on either side of the plane, times the sum of their distances from it (no division).
-// Both products are rounded before they are added, so that the result does not depend on the order of the corners.
-INLINE reals view_mix(reals one, reals off_one, reals two, reals off_two) {
-#pragma OPENCL FP_CONTRACT OFF
-    const reals first = one * off_two;
-    const reals second = two * off_one;
-    return first + second;
+// Adjacent triangles pass the corners of their common edge in either order and must get equal bits. A compiler that
+// contracts one of two products into their sum would round the sum differently in the other order, and not all compilers
+// obey FP_CONTRACT. Here each product is an explicit fma with `zero`, a zero that the compiler does not know: both products
+// are rounded before they are added, and nothing is left to contract.
+INLINE reals view_mix(reals one, reals off_one, reals two, reals off_two, reals zero) {
+    return lane_fma(one, off_two, zero) + lane_fma(two, off_one, zero);
 }
 
 // Dot product of one vector with LANES vectors, by fused multiply-adds.
@@ -159,13 +159,14 @@ INLINE masks view_lines(const view *view, global const real *leaf, reals *deep, 
     const reals deep_a = lane_dot(view->deep_x, view->deep_y, view->deep_z, ax, ay, az), deep_b = lane_dot(view->deep_x, view->deep_y, view->deep_z, bx, by, bz), deep_c = lane_dot(view->deep_x, view->deep_y, view->deep_z, cx, cy, cz);
     const reals along_a = lane_dot(view->along_x, view->along_y, view->along_z, ax, ay, az), along_b = lane_dot(view->along_x, view->along_y, view->along_z, bx, by, bz), along_c = lane_dot(view->along_x, view->along_y, view->along_z, cx, cy, cz);
     const reals far_a = fabs(off_a), far_b = fabs(off_b), far_c = fabs(off_c);
+    const reals unknown_zero = view->from - view->from; // no constant: the difference of NaN is NaN
     // Exactly two of the three edges are cut.
-    const reals deep_bc = view_mix(deep_b, far_b, deep_c, far_c);
-    const reals along_bc = view_mix(along_b, far_b, along_c, far_c);
-    deep[0] = cuts_ab ? view_mix(deep_a, far_a, deep_b, far_b) : deep_bc;
-    deep[1] = cuts_ca ? view_mix(deep_a, far_a, deep_c, far_c) : deep_bc;
-    along[0] = cuts_ab ? view_mix(along_a, far_a, along_b, far_b) : along_bc;
-    along[1] = cuts_ca ? view_mix(along_a, far_a, along_c, far_c) : along_bc;
+    const reals deep_bc = view_mix(deep_b, far_b, deep_c, far_c, unknown_zero);
+    const reals along_bc = view_mix(along_b, far_b, along_c, far_c, unknown_zero);
+    deep[0] = cuts_ab ? view_mix(deep_a, far_a, deep_b, far_b, unknown_zero) : deep_bc;
+    deep[1] = cuts_ca ? view_mix(deep_a, far_a, deep_c, far_c, unknown_zero) : deep_bc;
+    along[0] = cuts_ab ? view_mix(along_a, far_a, along_b, far_b, unknown_zero) : along_bc;
+    along[1] = cuts_ca ? view_mix(along_a, far_a, along_c, far_c, unknown_zero) : along_bc;
     weight[0] = far_b + (cuts_ab ? far_a : far_c);
     weight[1] = far_c + (cuts_ca ? far_a : far_b);
     return apart;

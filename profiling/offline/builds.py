@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike
 
-from gpuvision.host import Device
-from gpuvision.host.launch import Launchable, Shape
+from gpuvision.host import Device, Operation
+from gpuvision.host.launch import Shape
 from gpuvision.host.program import Define
 
 
@@ -22,7 +22,7 @@ class Example(NamedTuple):
     ----------
     name : str
         Name of the case, unique among the examples of a kernel file.
-    operation : Launchable
+    operation : Operation
     shape : tuple of int
         Shape of the first input.
     dtype : dtype
@@ -32,7 +32,7 @@ class Example(NamedTuple):
     """
 
     name: str
-    operation: Launchable
+    operation: Operation[Any]
     shape: Shape
     dtype: DTypeLike = np.float32
     has_double: bool = True

@@ -48,8 +48,10 @@ CAMERAS = {
     "14 terms": camera(*_ALL_TERMS),
 }
 LENSES = {
-    f"lens k{order}": Lens(**{f"k{each}": -1e-9 * 1e-7 ** (each - 1) for each in range(1, order + 1)})
-    for order in range(1, 5)
+    "lens k1": Lens(k1=-1e-9),
+    "lens k2": Lens(k1=-1e-9, k2=-1e-16),
+    "lens k3": Lens(k1=-1e-9, k2=-1e-16, k3=-1e-23),
+    "lens k4": Lens(k1=-1e-9, k2=-1e-16, k3=-1e-23, k4=-1e-30),
 }
 
 
@@ -201,8 +203,9 @@ def _heights() -> Iterator[Example]:
     for sigma in (False, True):
         words = " with sigma" if sigma else ""
         yield Example(f"merge{words}", MergeHeights(sigma=sigma), (500, 500))
-        for number, each in enumerate(Regrid(grid=grid, max_gap=1e-3, max_step=1e-3, sigma=sigma).passes, 1):
-            yield Example(f"pass {number}{words}", each, (512, 1024))
+        along_samples, along_profiles = Regrid(grid=grid, max_gap=1e-3, max_step=1e-3, sigma=sigma).passes
+        yield Example(f"along samples{words}", along_samples, (512, 1024))
+        yield Example(f"along profiles{words}", along_profiles, (512, 1024))
     yield Example("merge, double", MergeHeights(sigma=True), (500, 500), np.float64)
     deposits = MeasureDeposits(apertures=1000, cell_area=1e-10, threshold=2e-5)
     yield Example("deposits", deposits, (2000, 2000))

@@ -21,7 +21,7 @@ from gpuvision.host.operation import Operation
 _WARM_UP, _CALLS = 3, 15
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Placement:
     """Device on which an operation is fastest; ``str(placement)`` states it in one line.
 
@@ -30,6 +30,7 @@ class Placement:
     operation : str
         Class of the operation.
     device : Device
+        Fastest device.
     seconds : mapping of str to float
         Median time of a call on NumPy arrays [s], by the label of each measured device.
     """
@@ -98,7 +99,8 @@ def fastest_device(operation: Operation[Any], *inputs: HostArray, devices: Seque
     """
     measured = {each: _seconds(operation, inputs, each) for each in devices or placement_devices()}
     fastest = min(measured, key=measured.__getitem__)
-    return Placement(type(operation).__name__, fastest, {each.label: s for each, s in measured.items()})
+    seconds = {each.label: s for each, s in measured.items()}
+    return Placement(operation=type(operation).__name__, device=fastest, seconds=seconds)
 
 
 def _seconds(operation: Operation[Any], inputs: Sequence[HostArray], device: Device) -> float:

@@ -175,9 +175,9 @@ class CmosSensor:
 
         Parameters
         ----------
-        irradiance
+        irradiance : array_like
             (...) irradiance on the sensor [W/m^2]; see `gpuvision.camera.photons` for lux and the light of a lens.
-        exposure
+        exposure : float
             Exposure time [s].
         """
         area = self.pitch**2 * self.collecting
@@ -200,11 +200,11 @@ class CmosSensor:
 
         Parameters
         ----------
-        electrons
+        electrons : array_like
             (...) mean photoelectrons.
-        exposure
+        exposure : float
             Exposure time [s], for the dark current; default 0.
-        spatial
+        spatial : bool
             Whether the differences between pixels count: True (default) for one image of an unknown place of the
             sensor, False for the changes from frame to frame.
         """
@@ -229,11 +229,11 @@ class CmosSensor:
 
         Parameters
         ----------
-        shape
+        shape : pair of ints, optional
             Rows and columns of the region of interest; None: the whole sensor.
-        exposure
+        exposure : float, optional
             Exposure time, or length of the flash [s]; None only for direct-read pixels.
-        flash
+        flash : bool
             Whether a flash is the only light, see `SensorReadout.timing`.
 
         Raises

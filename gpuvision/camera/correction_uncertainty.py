@@ -99,7 +99,7 @@ def correction_sigma(fit: LensFit | CameraFit, points: npt.ArrayLike, measured: 
 
     Parameters
     ----------
-    fit, points, measured
+    fit, points, measured : LensFit or CameraFit, array_like
         As for `correction_covariance`.
     """
     found = correction_covariance(fit, points, measured)

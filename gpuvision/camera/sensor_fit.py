@@ -58,8 +58,8 @@ class SensorFit:
     used : (steps,) bool
         Steps of the fits: up to 0.7 of the saturation.
     reduced_chi_square : float
-        Squared deviations of the variances from K times the mean over those expected, per degree of freedom. Where it
-        exceeds 1, sigmas are larger by its square root.
+        Squared deviations of the variances from K times the mean, over the expected squared deviations, per degree of
+        freedom. Where it exceeds 1, sigmas are larger by its square root.
     """
 
     gain: Estimate
@@ -104,15 +104,15 @@ def fit_sensor(
 
     Parameters
     ----------
-    flat
+    flat : sequence of numpy.ndarray
         A stack (frames, rows, columns) of 2 frames or more for each irradiation, of evenly lit pixels, ascending.
-    dark
+    dark : sequence of numpy.ndarray
         A stack without light for each stack of ``flat``, with the same exposure time; or one stack for all.
-    photons
+    photons : array_like, optional
         (steps,) mean photons per pixel of the flat frames, for the quantum efficiency.
-    exposures
+    exposures : array_like, optional
         (steps,) exposure times [s], for the dark current. Default: all are equal.
-    quantised
+    quantised : bool
         Whether the grey levels are whole numbers: quantisation (1/12) is then not part of the dark noise.
 
     Returns

@@ -98,8 +98,9 @@ class UndistortImage(VisionOperation[UndistortedImage]):
     border_value : float
         Value of the constant border [grey levels]. Default 0.
     size : (int, int), optional
-        Columns and rows of the ideal image. Default: the size of the input, or of the map. region : (int, int, int,
-        int), optional (column, row, columns, rows): part of the ideal image to compute [px]. Default: all of it.
+        Columns and rows of the ideal image. Default: the size of the input, or of the map.
+    region : (int, int, int, int), optional
+        (column, row, columns, rows): part of the ideal image to compute [px]. Default: all of it.
     matrix : 3 x 3, optional
         ((fx, 0, cx), (0, fy, cy), (0, 0, 1)): camera matrix of the ideal image [px], for a `Camera`. Default: the
         matrix of ``model``.
@@ -183,7 +184,9 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         if self.coordinates == "computed" and not isinstance(self.model, Lens | Camera):
             raise TypeError("UndistortImage.coordinates='computed' needs a Lens or a Camera; use 'map'")
         if self.coordinates == "map" and self.precision is not None:
-            raise ValueError("UndistortImage.precision is that of computed coordinates; a map is made in double")
+            raise ValueError(
+                "UndistortImage.precision has no effect on a map, which is made in double; give coordinates='computed'"
+            )
 
     def source_positions(self, shape: tuple[int, int]) -> npt.NDArray[np.float64]:
         """Return the source position of every output pixel.

@@ -102,7 +102,7 @@ def main() -> None:
 
 @contextlib.contextmanager
 def _ending_by_signals() -> Iterator[None]:
-    """End the process with exit code 128 + number on SIGINT and SIGTERM, whatever the block does with the exception.
+    """End the process with exit code 128 + number on SIGINT and SIGTERM, even if the block catches the exception.
 
     The signal raises SystemExit in the main thread, so that half-written files are removed. Code that swallows the
     exception (an extension module that is being imported, a destructor) or that stays in a library call is cut off by

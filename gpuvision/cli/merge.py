@@ -59,8 +59,8 @@ MaxSigmas = Annotated[
 OnDisagreement = Annotated[
     Disagreement,
     typer.Option(
-        help="Height where the scans disagree: none (drop), that of one scan, the lower, the higher, or the mean. The "
-        "cell is flagged AMBIGUOUS."
+        help="Height where the scans disagree: none (drop), the height of one scan, the lower, the higher, the mean. "
+        "The cell is flagged AMBIGUOUS."
     ),
 ]
 RequireBoth = Annotated[

@@ -19,7 +19,7 @@ from gpuvision.schema import Section, read_toml
 
 
 def write_features(features: FeatureSet, path: str | Path, *, overwrite: bool = False) -> None:
-    """Write features as TOML. On an error the former file remains.
+    """Write features as TOML. On an error an existing file remains unchanged.
 
     Parameters
     ----------

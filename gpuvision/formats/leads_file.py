@@ -57,7 +57,9 @@ def read_leads(path: str | os.PathLike[str]) -> tuple[Aperture, ...]:
                 raise ReadError(f"{path}: line {number}: expected finite numbers and sides above 0 [m]")
             name = row[0].strip() or str(number - 1)
             if lines.setdefault(name, number) != number:
-                raise ReadError(f"{path}: line {number}: the name {name!r} is that of line {lines[name]}; give another")
+                raise ReadError(
+                    f"{path}: line {number}: the name {name!r} already stands in line {lines[name]}; give another one"
+                )
             cos, sin = math.cos(turn), math.sin(turn)
             corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array([width, height]) / 2
             outline = corners @ np.array([[cos, sin], [-sin, cos]]) + np.array([x, y])

@@ -93,7 +93,7 @@ def unwrapped_counts(counts: npt.ArrayLike, bits: int, what: str = "the encoder"
 def not_advancing(positions: npt.ArrayLike) -> npt.NDArray[np.bool_]:
     """Find the profiles that do not advance: the smallest set without which the positions are strictly monotone.
 
-    The direction is the one that needs the smaller set; of two equal sets it is the ascending one.
+    The direction is chosen so that the set is smallest; of two equally small sets, ascending.
 
     Parameters
     ----------

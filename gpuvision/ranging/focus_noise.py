@@ -15,7 +15,7 @@ Float64 = npt.NDArray[np.float64]
 
 BEND = (-1.0, 2.0, -1.0)
 """Weights of a second difference of neighbouring pixels."""
-_BEND_VARIANCE = 6.0  # sum of the squared weights: variance of a second difference over that of a pixel
+_BEND_VARIANCE = 6.0  # sum of the squared weights: variance of a second difference over the variance of a pixel
 # Sums of products of the weights with themselves, shifted by 0, 1 and 2 pixels along the same axis; and with the
 # weights along the other axis, shifted by -1, 0 and 1 pixel along one axis: the products of two of these.
 _SAME_AXIS = (6.0, -4.0, 1.0)

@@ -195,7 +195,11 @@ def merge_height_maps(
     first, second : (HeightMap, Grid)
         Maps with their grids, in one frame; the cells have one size, and the grids differ by whole cells. If both maps
         have standard deviations, they are used.
-    max_sigmas, tolerance, disagreement, require_both
+    max_sigmas, tolerance : float
+        As for `MergeHeights`.
+    disagreement : {"drop", "first", "second", "lower", "higher", "mean"}
+        As for `MergeHeights`.
+    require_both : bool
         As for `MergeHeights`.
     device : Device, optional
         Default `Device.best`.

@@ -170,7 +170,7 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
             v of the plane of symmetry for C4 [sensor unit], default 0.
         region : ((u_min, u_max), (v_min, v_max)), optional
             Region of the sensor; ``None``: the bounding box of the points.
-        along, lens, camera
+        along, lens, camera : {"columns", "rows"}, Lens or None, Camera or None
             As in the class.
         limits : HomographyLimits, optional
             Limits of rank and rounding.

@@ -25,7 +25,7 @@ Float64 = npt.NDArray[np.float64]
 class TriangulationModel:
     """Map from sensor coordinates (u, v) to sheet coordinates (G, H), with its covariance.
 
-    The parameters are those of `gpuvision.Triangulation`, which computes with the map on a device.
+    The parameters are the same as in `gpuvision.Triangulation`, which computes with the map on a device.
     """
 
     homography: Matrix
@@ -64,7 +64,9 @@ class TriangulationModel:
             if self.homography != linear_part(self.polynomial):
                 raise ValueError("Triangulation.homography is no linear part of the polynomial; use from_polynomial")
             if self.covariance is not None:
-                raise ValueError("Triangulation.covariance is that of a homography; a polynomial has one itself")
+                raise ValueError(
+                    "Triangulation.covariance belongs to a homography; a PlanePolynomial has its covariance itself"
+                )
         if not 0.0 < self.horizon < 1.0:
             raise ValueError(f"Triangulation.horizon is {self.horizon}, expected a number between 0 and 1")
         if self.sigma is not None and min(self.sigma) < 0.0:

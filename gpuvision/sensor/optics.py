@@ -91,7 +91,7 @@ def _window(table: Section) -> tuple[float, float]:
 
 
 def _check_size(table: Section, path: Path, frame: Frame | None, window: tuple[float, float]) -> None:
-    """Check that the frames are as large as the calibrated images, or that their window lies within those."""
+    """Check that the frames have the size of the calibrated images, or that their window lies within these images."""
     if frame is None:
         return
     part = (window, 1) if "window" in table else None

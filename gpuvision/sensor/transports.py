@@ -76,7 +76,7 @@ def read_transport(
     is_rotating : bool
         Whether the sheet of light turns.
     encoder_file : Path, optional
-        Encoder file of this recording, for the one that the table may name.
+        Encoder file of this recording; replaces the file that the table may name.
 
     Returns
     -------

@@ -39,7 +39,7 @@ _SLACK = 1.0 + 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class FineStage:
-    """Fine stage that rides on a long-stroke axis and does what the axis does not follow.
+    """Fine stage on a long-stroke axis: it moves by the difference between the command and the position of the axis.
 
     Parameters
     ----------
@@ -49,6 +49,11 @@ class FineStage:
         Largest displacement from the middle, in each direction [m] or [rad], above 0.
     recentring : float
         Velocity of the long stroke per displacement of the fine stage [1/s], 0 or more. Default 20.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
     """
 
     lag: float

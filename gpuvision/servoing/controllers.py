@@ -126,6 +126,11 @@ class PidController:
     feed_forward : float
         Part of the target's own velocity that is added, 0 to 1. Default 1.
 
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
+
     Notes
     -----
     The command is ``proportional (part + integral of part / integral) + feed_forward target'`` with ``part = error +
@@ -215,6 +220,11 @@ class SmithPredictor:
         Velocity of the plant per commanded velocity. Default 1.
     history : int
         Number of commands that are kept. Default 256.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
 
     Notes
     -----

@@ -182,6 +182,16 @@ def gain_limit(delay: float) -> float:
     delay : float
         Delay [frames], 0 or more; fractions are exact.
 
+    Returns
+    -------
+    float
+        Smallest gain (fraction of the error that a frame corrects) at which the loop is unstable.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
+
     Notes
     -----
     For a whole number d of frames the limit is 2 sin(pi / (2 (2 d + 1))). For a fraction the limit is the smallest
@@ -226,6 +236,16 @@ def non_oscillating_gain(delay: float) -> float:
     ----------
     delay : float
         Delay [frames], 0 or more; fractions are exact.
+
+    Returns
+    -------
+    float
+        Gain: fraction of the error that a frame corrects.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
 
     Notes
     -----

@@ -70,6 +70,11 @@ class LoopLimits:
         Default 5 (chosen).
     missed : int
         Number of late frames in a row after which the loop gives up. Default 10 (chosen).
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
     """
 
     hold_after: float = 0.01

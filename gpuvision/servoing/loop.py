@@ -109,6 +109,11 @@ class WallClock:
     start : float
         Time 0 of the clock, in seconds of `time.perf_counter`. Give it to `streamed_pose`: the measurements then have
         the times of this clock.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
     """
 
     def __init__(self, spin: float = 2e-4) -> None:

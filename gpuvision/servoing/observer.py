@@ -214,6 +214,11 @@ class PoseObserver:
         Squared Mahalanobis distance above which a measurement is not taken. Default 16.27: a valid measurement
         exceeds it with a probability of 0.001.
 
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
+
     Notes
     -----
     Memory is allocated once. A measurement costs one prediction and one correction, one prediction for each later

@@ -34,6 +34,11 @@ class SimulatedPlant:
         (3,): displacement of the payload against its axis at time 0 [m], [m], [rad]: the residual vibration of a move
         before. An axis with a resonance swings with this amplitude; it must be 0 for the others. Default: zeros.
 
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
+
     Notes
     -----
     Implements `Plant`. `pose` gives the true pose of the payload: hand it to a simulated camera. A step of three axes

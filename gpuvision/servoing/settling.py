@@ -211,6 +211,11 @@ class VibrationSettling:
         to the next. False for independent measurements, such as from `LatestPose` with a new pose in each frame.
         Default True.
 
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
+
     Notes
     -----
     Offset and amplitude are a linear least-squares fit. The error at the contact is taken as offset plus envelope,

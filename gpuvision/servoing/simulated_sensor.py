@@ -40,6 +40,11 @@ class SimulatedPoseSensor:
         Fault of each frame; see `Fault`.
     seed : int
         Seed of noise and jitter. Default 0.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
     """
 
     def __init__(

@@ -53,34 +53,34 @@ class LightPaths:
 
     Parameters
     ----------
-    view, sheet
+    view, sheet : SensorView, LightSheet
         Sensor and sheet of light, on the same transport.
-    scene, materials
+    scene, materials : Scene, sequence of Material
         Surfaces, and a material for every number in `Scene.material`.
-    paths
+    paths : sequence of str
         Light paths to model, out of `gpuvision.simulation.sensors.readings.PATHS`: "direct" (one diffuse reflection),
         "specular" (one glossy reflection, or a mirror straight into the lens), "diffuse-specular" (a mirror before or
         after a diffuse surface), "diffuse-diffuse" (two diffuse reflections), "multi-bounce" (three or more, by
         radiosity). Without "direct" there is no reading.
-    sub_sheets
+    sub_sheets : int
         Number of thin sheets that represent a thick one on the direct path, 1 or more. Secondary light is emitted from
         the middle of the sheet: for other surfaces the sheet is thin.
-    blur
+    blur : float
         Standard deviation of the image of a point along u [sensor unit]. It is not applied to diffuse secondary light,
         which varies slowly.
-    nodes
+    nodes : pair of ints
         Of `ViewRays`.
-    end_bins
+    end_bins : int
         Number of bins beyond either end of the samples in which direct light is imaged and blurred too, 0 or more: the
         light that the ends cut off is then known (`BEYOND_ENDS`), and the true points beyond the ends. Default 0.
-    patch_size
+    patch_size : float, optional
         Largest edge of the patches of the radiosity solution [m]; None: a sixteenth of the scene's diagonal. Towards
         concave edges the patches become smaller (`Patches.from_scene`).
-    tolerance
+    tolerance : float
         Range error that omitted secondary light may cause [m], 0 or more; 0: all light is computed. See the notes.
-    min_power
+    min_power : float
         Power of a sample below which it is not read [W].
-    device
+    device : Device, optional
         Device of the kernels; None: `Device.best`.
 
     Raises
@@ -279,9 +279,9 @@ class LightPaths:
 
         Parameters
         ----------
-        seen
+        seen : VisibleSurface
             Surface elements that the sensor sees, from `view_rays`.
-        segments
+        segments : LitSegments
             Lit segments.
         """
         return self._clustered.compute_all(segment_rows(segments), seen.receivers)

@@ -249,7 +249,7 @@ def simulate_placements(
 
     Notes
     -----
-    Every placement draws its own error of the calibration and its own drift from their covariances, and a start error
+    Every placement draws a new error of the calibration and a new drift from their covariances, and a start error
     that is evenly distributed in the landing zone. The board is rendered as it is drawn, without etch bias. An axis
     with a ``swing`` starts with a vibration, whose amplitude is evenly distributed. If the rule "vibration" has no
     frequencies, a move without a release finds them first. `ReleaseRule` waits for the predicted number of frames;

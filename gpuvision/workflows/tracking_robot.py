@@ -192,7 +192,7 @@ def track_robot(
     ValueError
         The rate is out of range, or the odometry has another number of rows than there are motions.
     RecordingError
-        A frame cannot be read, or there is none.
+        A frame cannot be read, or the recording is empty.
     """
     finite(rate, "rate", minimum=1e-3, maximum=1e7)
     device = Device.best() if device is None else device

@@ -44,7 +44,7 @@ typedef struct {
 } SheetTable;
 
 // Squared distance, in half extents of the sensor region, from which a coordinate counts as not finite. Smaller values do
-// not overflow. A comparison with NaN is false, whatever the sign of the NaN.
+// not overflow. A comparison with NaN is false for either sign of the NaN.
 #define SHEET_REACH ((real)1e12)
 
 #ifdef CAMERA

@@ -27,8 +27,8 @@ def test_rectangles_with_and_without_an_angle(tmp_path):
         ("name,x,y,width,height\nA,1,2,3\n", "line 2 has 4 cells, expected 5"),
         ("name,x,y,width,height\nA,1,2,3,0\n", "line 2: expected finite numbers and sides above 0"),
         ("name,x,y,width,height\nA,1,nan,3,1\n", "line 2: expected finite numbers"),
-        ("name,x,y,width,height\nA,1,2,3,1\nA,4,2,3,1\n", "line 3: the name 'A' is that of line 2"),
-        ("name,x,y,width,height\n2,1,2,3,1\n,4,2,3,1\n", "line 3: the name '2' is that of line 2"),
+        ("name,x,y,width,height\nA,1,2,3,1\nA,4,2,3,1\n", "line 3: the name 'A' already stands in line 2"),
+        ("name,x,y,width,height\n2,1,2,3,1\n,4,2,3,1\n", "line 3: the name '2' already stands in line 2"),
         ("name,x,y,width,height\nA,1,two,3,1\n", "not a readable CSV file of leads: could not convert"),
     ],
 )

@@ -94,5 +94,5 @@ def test_errors() -> None:
         replace(operation, lens=Lens(k1=1e-9))
     with pytest.raises(ValueError, match="no linear part of the polynomial; use from_polynomial"):
         replace(operation, homography=np.diag([1.0, 2.0, 1.0]))
-    with pytest.raises(ValueError, match="covariance is that of a homography"):
+    with pytest.raises(ValueError, match="covariance belongs to a homography"):
         replace(operation, covariance=np.eye(8))

@@ -35,7 +35,7 @@ class Centroids(NamedTuple):
     variance: Float64
     """(rows, columns, 2) variance of the covered pixels' column and row [px^2]."""
     contrast: Float64
-    """Grey level of the dot minus that of the background."""
+    """Grey level of the dot minus grey level of the background."""
     background_residual: Float64
     """Deviation of the background's four corners from a plane [contrasts]."""
 

@@ -56,7 +56,7 @@ class ChessboardLimits:
     max_candidates : int
         Largest number of saddle points in a level of the image pyramid; the strongest are used.
     min_saddle : float
-        Least curvature of a saddle point relative to that of the ``strongest``-th one.
+        Least curvature of a saddle point, relative to the curvature of the ``strongest``-th saddle point.
     strongest : int
         Rank of the saddle point that ``min_saddle`` refers to.
     max_asymmetry : float
@@ -103,9 +103,11 @@ def find_chessboard(
     image : numpy.ndarray
         (height, width) or (height, width, 3; blue, green, red) of uint8, uint16 or float32, with squares of at least
         8 px, the board rotated by at most 45 degrees.
-    inner_corners
+    inner_corners : pair of ints, optional
         Number of inner corners along both sides of the board, in any order; every row and column of them must be
         visible in part. Default: accept the board that is found.
+    limits : ChessboardLimits
+        Numerical limits of the detection.
 
     Returns
     -------

@@ -145,7 +145,7 @@ def fit_tsai(
 
     Parameters
     ----------
-    target, image, centre
+    target, image, centre : array_like, pair of floats
         As in `radial_alignment`.
     focal_length : float, optional
         Known f [px]. Default: estimated.

@@ -95,21 +95,26 @@ def read_artwork(
 
     Parameters
     ----------
-    path
+    path : str or Path
         Folder, or ZIP file, of Gerber and Excellon files.
-    side
+    side : {"top", "bottom"}
         Side of the board, "top" or "bottom".
-    layers
+    layers : mapping of str to str, optional
         Regular expressions of whole file names, and the layer of each: ``"top copper"``, ``"bottom mask"``, ``"top
         silk"``, ``"top paste"``, ``"mechanical outline"``, ``"drill plated"``, ``"drill nonplated"``, ``"drill
         unknown"``. Other files are then ignored. None: names and contents of the files determine the layers.
-    clearance
+    clearance : float
         Distance [m], above 0, default 50 um, that a visible edge keeps from silk, and over which there is copper on its
         one side, and bare laminate or mask on its other side.
-    via_drill
+    via_drill : float
         Rule for pads without attributes: a round pad with a plated hole up to this diameter [m] is a via, default 0.55
         mm. A round pad without a hole and without paste, in a mask opening of 1.5 diameters or more, is a fiducial. All
         others are component pads; so are regions in a mask opening, whose attributes gerbonara does not provide.
+
+    Returns
+    -------
+    Artwork
+        Outlines, edges and fiducials of the side, in the frame of the files [m].
 
     Raises
     ------

@@ -95,7 +95,7 @@ def find_other_pose(
     by_tile = _residuals_of_tiles(drawn, grey, margin, shift, is_bright=other_bright)
     by_tile -= _residuals_of_tiles(drawn, grey, margin, (0, 0), is_bright=is_bright)
     preference = float(by_tile.sum() / max(math.sqrt(float(np.sum(by_tile**2))), np.finfo(float).tiny))
-    # Image pixel p shows what the drawing has at p + shift: the centre of the image looks at that place of the board.
+    # Image pixel p corresponds to pixel p + shift of the drawing, so the image centre views that place of the board.
     x, y = view.to_plane(view.centre_px + np.array([column, row]))
     other = replace(view, pose=(float(x), float(y), view.pose[2]))
     return OtherPose(other, math.hypot(row, column) * view.scale, other_bright, preference)

@@ -131,7 +131,7 @@ class FindBlobs(VisionOperation[Blobs]):
     ratio : float
         Inner over outer radius of a ring; width over length of a bar of a cross; 0 to 1, exclusive, default 0.5.
     polarity : {"bright", "dark", "either"}
-        Contrast of the blobs; "either" lets each blob have its own.
+        Contrast of the blobs; "either": any contrast for each blob.
     search_px : float
         Largest distance of a blob from its expected place, and of an edge from the expected contour [px], above 0 to
         200, default 6.

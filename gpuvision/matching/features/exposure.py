@@ -31,20 +31,25 @@ def sensor_imaging(
 
     Parameters
     ----------
-    sensor
+    sensor : CmosSensor
         Sensor.
-    pixel
+    pixel : float
         Size of a pixel on the board [m].
-    white_electrons
+    white_electrons : float
         Photoelectrons of white board during the exposure, see `CmosSensor.electrons`.
-    exposure
+    exposure : float
         Exposure time for the dark current [s], default 0.
-    reflectance
+    reflectance : BoardReflectance, optional
         Reflectances of the board. Default: `BoardReflectance`.
-    spatial
+    spatial : bool
         Whether the differences between pixels count as noise, as in `CmosSensor.noise`. Default True.
     **options
         Other parameters of `Imaging`: blur_px, motion_px, width_px and so on.
+
+    Returns
+    -------
+    Imaging
+        Image quality with contrasts in units of the noise.
 
     Raises
     ------
@@ -93,22 +98,27 @@ def smallest_exposure(
 
     Parameters
     ----------
-    sensor
+    sensor : CmosSensor
         Sensor with integrating pixels.
-    sigma_px
+    sigma_px : float
         Wanted standard deviation of the position of one ruler's edge [px], above 0.
-    irradiance
+    irradiance : float
         Irradiance of the sensor by white board [W/m^2], above 0; see `gpuvision.camera.photons.image_irradiance`.
-    pixel
+    pixel : float
         Size of a pixel on the board [m].
-    speed
+    speed : float
         Speed of the board across its edges [m/s], default 0: motion blur.
-    bare
+    bare : bool
         True: edges of bare copper. Default False: edges under the mask.
-    reflectance
+    reflectance : BoardReflectance, optional
         Reflectances of the board. Default: `BoardReflectance`.
     **options
         Other parameters of `Imaging`: blur_px, width_px.
+
+    Returns
+    -------
+    float
+        Exposure time [s].
 
     Raises
     ------
@@ -125,7 +135,7 @@ def smallest_exposure(
     finite(irradiance, "irradiance [W/m^2]", above=0.0)
     finite(speed, "speed [m/s]", minimum=0.0)
     if sensor.pixel == "direct_read":
-        raise ValueError("direct-read pixels have no exposure; their noise is that of their response time")
+        raise ValueError("direct-read pixels have no exposure; the response time determines their noise")
     board = reflectance or BoardReflectance()
     per_second = float(sensor.electrons(irradiance, 1.0))
 

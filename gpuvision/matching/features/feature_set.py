@@ -365,21 +365,26 @@ def choose_features(
 
     Parameters
     ----------
-    artwork
+    artwork : Artwork
         The board's side.
-    region
+    region : array_like
         (2, 2) least and greatest x, y [m].
-    imaging
+    imaging : Imaging
         Image quality and search range.
-    placement
+    placement : array_like, optional
         (2,) point whose pose counts [m]; None: the centre of the region.
-    budget, unit
+    budget, unit : float, {"rulers", "px", "us"}
         Limit of the cost: number of "rulers" (a fiducial costs 16), "px" sampled pixels, or "us" microseconds on the
         device, measured now, with one launch.
-    missing
+    missing : float
         Expected share of features without a measurement, 0 to below 1.
-    device
+    device : Device, optional
         Device for microseconds; None: `Device.best`.
+
+    Returns
+    -------
+    FeatureSet
+        Chosen features, with the predicted covariance of the pose.
 
     Raises
     ------

@@ -110,7 +110,8 @@ def select_fiducials(
     imaging
         Image quality and search range.
     max_count
-        Largest number, in order: fiducials first, then the pads farthest from those selected before. None: all.
+        Largest number, in order: fiducials first, then the pads farthest from the pads that are already selected. None:
+        all.
     """
     box = np.asarray(region, np.float64)
     layers = visible_layers(artwork, imaging.registration)

@@ -96,9 +96,9 @@ class Imaging:
 
         Parameters
         ----------
-        bare
+        bare : array_like
             Whether the copper is bare; otherwise it is under the mask.
-        normal
+        normal : array_like
             (..., 2) unit normals.
 
         Notes

@@ -143,7 +143,7 @@ def best_smoothing(blur_px: float) -> float:
 
     Parameters
     ----------
-    blur_px
+    blur_px : float
         Standard deviation of the edge's blur [px].
 
     Returns

@@ -190,11 +190,11 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
 
         Parameters
         ----------
-        costs
+        costs : PoseCosts
             Result of this operation, NumPy arrays.
-        max_candidates
+        max_candidates : int
             Largest number of poses, default 8.
-        separation
+        separation : pair of floats, optional
             Distance [m] and angle [rad]: a pose within both of a better one is suppressed. None: twice the scale of the
             map, and 20 degrees.
         """

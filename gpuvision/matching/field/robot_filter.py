@@ -134,6 +134,11 @@ class RobotFilter:
     limits : RobotFilterLimits
         Probabilities and thresholds.
 
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
+
     Notes
     -----
     Motions are kept for ``limits.view_delay`` seconds, so that a late view counts at its time. Memory and time of a
@@ -163,7 +168,7 @@ class RobotFilter:
         ----------
         time : float
             End of the motion [s], after the end of the last one.
-        motion, covariance
+        motion, covariance : array_like
             As in `predict`.
 
         Raises

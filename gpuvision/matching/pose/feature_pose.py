@@ -332,8 +332,13 @@ class EstimateFeaturePose(OperationSequence[FeaturePose]):
         Measurement of the fiducials with and without ``match``; used where there are such fiducials.
     solver : SolvePose
         As in `SolveFeatures`.
-    ruler_sigma_px, matched_sigma_px, drilled_sigma_px, size_tolerance
+    ruler_sigma_px, matched_sigma_px, drilled_sigma_px, size_tolerance : float
         As in `SolveFeatures`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
 
     Notes
     -----

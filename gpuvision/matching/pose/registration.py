@@ -64,21 +64,22 @@ def prepare_board_registration(
 
     Parameters
     ----------
-    artwork
-        The side in view of the camera. board_to_image 3 x 3 homography from the board, where it is nominally, to the
-        (undistorted) image [m to px].
-    shape
+    artwork : Artwork
+        The side in view of the camera.
+    board_to_image : array_like
+        (3, 3): homography from the board at its nominal pose to the (undistorted) image [m to px].
+    shape : pair of ints
         Rows and columns of the images.
-    placement
-        Point of the artwork [m] to which the covariance refers; None: the one nominally at the image centre.
-    shift, angle
+    placement : pair of floats, optional
+        Point of the artwork [m] to which the covariance refers; None: the point that is nominally at the image centre.
+    shift, angle : float
         Search range: largest offset of the placement point in x and in y [m], default 2 mm, and largest angle of the
         board [rad], default 5 degrees.
-    blur_px
+    blur_px : float
         Standard deviation of the edges' blur [px], default 1.
-    threshold
+    threshold : float
         Least height of an edge [grey levels], default 10.
-    tolerance_px, cell_px
+    tolerance_px, cell_px : float, int
         As in `CoarseRegistration`; the tolerance should cover the etch bias too.
 
     Returns
@@ -208,23 +209,23 @@ def register_images(
 
     Parameters
     ----------
-    image, template
+    image, template : numpy.ndarray
         uint8, uint16 or float32 (rows, columns). Images of different size are expected to have the same centre.
-    placement
+    placement : pair of floats, optional
         Point of the template to which the covariance and the search range refer; None: its centre.
-    shift_px, angle
+    shift_px, angle : float
         Search range: largest offset of the placement point in x and in y [px], default 64, and largest angle [rad],
         default 10 degrees.
-    blur_px, threshold
+    blur_px, threshold : float
         As in `prepare_board_registration`.
-    transform, tolerance_px, cell_px
+    transform, tolerance_px, cell_px : {"rigid", "similarity", "affine"}, float, int
         As in `CoarseRegistration`. Images of two line cameras, or of two boards, also differ in their scales along x
         and y; the default is therefore "affine".
-    etch_bias_px
+    etch_bias_px : float
         Standard deviation of the displacement of all edges along their normals [px], above 0, default 1: copper etched
         wider or narrower, another threshold of a binary image. It is solved for; positive where bright areas are
         smaller than in the template.
-    device
+    device : Device, optional
         Where to run; None: `Device.best`.
 
     Returns

@@ -185,7 +185,7 @@ class ThermalDrift:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Machine:
-    """Placement machine: what a placement needs to know of it.
+    """Placement machine: camera, calibration, delay, control and tolerances.
 
     Parameters
     ----------

@@ -170,7 +170,7 @@ class RenderBoard(VisionOperation[BoardImage]):
         if self.electrons is not None:
             finite(self.electrons, "RenderBoard.electrons", above=0.0)
             if self.sensor is None:
-                raise ValueError("RenderBoard.electrons are those of a sensor; give the sensor")
+                raise ValueError("RenderBoard.electrons needs a sensor; give the sensor")
         for name in ("illumination", "glare"):
             given = getattr(self, name)
             if given is not None and (np.shape(given) != tuple(self.shape) or not np.isfinite(given).all()):
@@ -299,15 +299,20 @@ def exposure_poses(start: npt.ArrayLike, end: npt.ArrayLike, count: int) -> npt.
 
     Parameters
     ----------
-    start, end
+    start, end : array_like
         Poses (..., 3) at the begin and at the end of the exposure: x, y [m], theta [rad].
-    count
+    count : int
         Number of sub-poses, 1 or more; a motion blur of n pixels needs 2 n.
 
     Returns
     -------
     numpy.ndarray
         (..., count, 3) float64.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
     """
     share = (np.arange(integer(count, "count", minimum=1)) + 0.5) / count
     first, last = (np.asarray(each, np.float64)[..., None, :] for each in (start, end))

@@ -70,23 +70,23 @@ class ReflectanceMap:
 
         Parameters
         ----------
-        artwork
+        artwork : Artwork
             Side of a board.
-        pixel
+        pixel : float
             Size of a pixel on the board [m], above 0.
-        region
+        region : array_like, optional
             (2, 2) least and greatest x, y [m] that a camera may see; default: the bounds of the artwork. Beyond it
             images show the border of the map.
-        blur_px
+        blur_px : float
             Standard deviation of the blur of the lens (defocus and diffraction) [px], 0 or more, default 0.5. The area
             of a pixel is added.
-        nodes_per_pixel
+        nodes_per_pixel : int
             Nodes of the map per pixel along each axis, 1 or more, default 4.
-        reflectance
+        reflectance : BoardReflectance, optional
             Reflectances of the materials. Default: `BoardReflectance`.
-        etch_bias
+        etch_bias : float
             Distance from the drawn edges of the copper to its real edges [m], positive where copper is left over.
-        mask_shift, silk_shift
+        mask_shift, silk_shift : pair of floats
             Displacement x, y of the mask openings and of the silk [m].
 
         Returns

@@ -113,7 +113,7 @@ class ErrorAttribution:
 
         Parameters
         ----------
-        min_error
+        min_error : float
             Samples whose error is not larger than this have no dominant cause [m], 0 or more.
 
         Returns
@@ -160,7 +160,7 @@ class ErrorAttribution:
 
         Parameters
         ----------
-        limit
+        limit : float
             Samples with a larger error are outliers: they are counted, each for its dominant cause [m].
 
         Returns
@@ -228,23 +228,28 @@ def attribute_errors(
 
     Parameters
     ----------
-    simulator
+    simulator : PsdSimulator or CameraSimulator
         The sensor, with its mask and its ambient light.
-    exposures
+    exposures : mapping of str to Exposure
         Light by path, (..., samples, bins). With all three variants of the direct light (`UNIFORM`, `UNOCCLUDED`,
         `UNIFORM_UNOCCLUDED`), occlusion and reflectivity are causes in addition to shape; with `BEYOND_ENDS` and a PSD,
         clipped is one too.
-    truth
+    truth : GroundTruth
         Ground truth of the same samples.
-    seed, first_profile
+    seed, first_profile : int or None, int
         Seed of the noise and number of the first profile, as for `PsdSimulator.read`; ``seed=None``: no noise.
-    method
+    method : {"moments", "shapley"}, optional
         ``"moments"`` or ``"shapley"``, see the module's description. None: "moments" for PSDs, "shapley" for cameras.
         "shapley" counts a height that cannot be read as no error.
-    secondary_by_path
+    secondary_by_path : bool
         True: each path of secondary light is a cause. False: one cause "secondary".
-    device
+    device : Device, optional
         Device of the readouts; None: `Device.best`.
+
+    Returns
+    -------
+    ErrorAttribution
+        Errors of the readings [m], and the part of each cause.
 
     Raises
     ------

@@ -64,19 +64,19 @@ class SensorFusion:
 
     Parameters
     ----------
-    max_sigmas
+    max_sigmas : float
         Two readings agree if they differ by at most this many standard deviations of their difference; 0 or more.
-    tolerance
+    tolerance : float
         Additional allowed difference of agreeing readings [m]; 0 or more.
     rule : {"flag", "mean", "stronger", "narrower", "predicted"}
         Decision where the sensors disagree. ``"flag"``: no value. ``"mean"``: the plain mean; at a step of
         reflectivity, two sensors that face each other have opposite errors of equal size. ``"stronger"``: the sensor
         that receives more light. ``"narrower"``: the camera that sees the narrower line. ``"predicted"``: the first,
         the second or the mean, whichever has the smallest error in a simulation of the part.
-    min_ratio
+    min_ratio : float
         The chosen sensor must be better than the other by this factor, in the quantity of the rule; otherwise there
         is no value; 1 or more.
-    accept_single
+    accept_single : bool
         True: a value that only one of the sensors has is accepted.
 
     Raises
@@ -109,9 +109,9 @@ class SensorFusion:
 
         Parameters
         ----------
-        first, second
+        first, second : Reading
             Readings of the two sensors, (..., samples) each.
-        predicted
+        predicted : pair of array_like, optional
             Errors of both sensors that a simulation predicts, (..., samples) each [m]; for the rule "predicted". NaN:
             the simulation predicts no reading.
 

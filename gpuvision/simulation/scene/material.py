@@ -19,13 +19,13 @@ class Material:
 
     Parameters
     ----------
-    diffuse
+    diffuse : Lambert or OrenNayar
         `Lambert` or `OrenNayar`. Only this component sends secondary light to other surfaces.
-    gloss
+    gloss : Brdf, optional
         Glossy lobe (`Phong`, `Ggx`, `Ward`), or None.
-    mirror
+    mirror : float
         Reflectance of an ideal mirror in the surface, for all angles, 0 to 1.
-    name
+    name : str
         Name for reports.
 
     Raises

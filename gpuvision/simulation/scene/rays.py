@@ -136,14 +136,14 @@ class ClosestHit(_Rays[Hits]):
 
     Parameters
     ----------
-    scene
+    scene : Scene
         Scene that the rays intersect.
-    clearance
+    clearance : float
         Intersections closer to the origin are ignored [m], 0 or more. Triangles through the origin are always ignored.
-    precision
+    precision : {None, "single", "double"}
         "single" or "double" arithmetic and outputs; None: the type of the input. "single" takes float64 rays too: the
         centre of the scene is subtracted in double, and a distant ray is clipped to the scene.
-    variant
+    variant : {"auto", "vector", "work_item"}
         "vector" (one ray against 16 boxes per vector, for CPU runtimes), "work_item" (one work-item per ray, for GPUs)
         or "auto".
 
@@ -177,12 +177,12 @@ class AnyHit(_Rays[Occlusion]):
 
     Parameters
     ----------
-    scene
+    scene : Scene
         Scene that can occlude the segments.
-    clearance
+    clearance : float
         Intersections closer to either end are ignored [m], 0 or more: the surfaces on which the ends lie. Triangles
         through an end are ignored up to rounding.
-    precision, variant
+    precision, variant : {None, "single", "double"}, {"auto", "vector", "work_item"}
         As for `ClosestHit`.
 
     Raises

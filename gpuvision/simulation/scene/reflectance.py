@@ -84,8 +84,13 @@ class Lambert(Brdf):
 
     Parameters
     ----------
-    albedo
+    albedo : float
         Fraction of the light that is reflected, 0 to 1.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
     """
 
     kind: ClassVar[str] = "BRDF_LAMBERT"
@@ -109,10 +114,15 @@ class Phong(Brdf):
 
     Parameters
     ----------
-    albedo
+    albedo : float
         Albedo at normal incidence, 0 to 1; it is smaller for other angles.
-    exponent
+    exponent : float
         Exponent n, 0 to 1e6. With 0 the lobe is `Lambert`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
 
     References
     ----------
@@ -145,10 +155,15 @@ class OrenNayar(Brdf):
 
     Parameters
     ----------
-    albedo
+    albedo : float
         Upper bound of the reflected fraction of the light, 0 to 1.
-    roughness
+    roughness : float
         0 (`Lambert`) to 1, the roughest. `from_slope_sigma` computes it from a measured slope distribution.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
 
     Notes
     -----
@@ -171,9 +186,9 @@ class OrenNayar(Brdf):
 
         Parameters
         ----------
-        albedo
+        albedo : float
             0 to 1.
-        sigma
+        sigma : float
             Standard deviation of the slope angles of the facets [rad], 0 to pi / 2.
 
         Raises
@@ -218,10 +233,15 @@ class Ggx(Brdf):
 
     Parameters
     ----------
-    alpha
+    alpha : float
         Roughness of the GGX distribution, 1e-4 (nearly a mirror) to 1.
-    f0
+    f0 : float
         Fresnel reflectance at normal incidence, 0 to 1.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
 
     Notes
     -----
@@ -266,10 +286,15 @@ class Ward(Brdf):
 
     Parameters
     ----------
-    albedo
+    albedo : float
         Upper bound of the reflected fraction of the light, 0 to 1.
-    alpha_x, alpha_y
+    alpha_x, alpha_y : float
         Roughness along x and y, 1e-4 to 1.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter has a wrong type or is out of its range.
 
     References
     ----------
@@ -322,11 +347,11 @@ class Reflectance(VisionOperation[Reflected]):
 
     Parameters
     ----------
-    model
+    model : Brdf
         Reflectance model.
-    precision
+    precision : {None, "single", "double"}
         "single" or "double" arithmetic and outputs; None: the type of the input.
-    variant
+    variant : {"auto", "vector", "work_item"}
         "vector" (16-wide vectors, for CPU runtimes), "work_item" (one work-item per pair, for GPUs) or "auto".
 
     Raises

@@ -59,9 +59,9 @@ class Scene:
 
     Parameters
     ----------
-    corners
+    corners : numpy.ndarray
         (n, 3, 3), corners of the triangles [m]; n may be 0.
-    material
+    material : numpy.ndarray, optional
         Integers (n,), index of the material of each triangle, 0 or more; None: all 0.
 
     Attributes
@@ -114,9 +114,9 @@ class Scene:
 
         Parameters
         ----------
-        meshes
+        meshes : Any
             Meshes of trimesh.
-        metres
+        metres : float
             Length unit of the meshes [m]: 1e-3 for millimetres. Default 1.
 
         Raises
@@ -137,9 +137,9 @@ class Scene:
 
         Parameters
         ----------
-        path
+        path : str or os.PathLike[str]
             The file.
-        metres
+        metres : float
             Length unit of the file [m]: 1e-3 for millimetres. Default 1.
 
         Raises

@@ -40,29 +40,29 @@ class CameraSimulator:
 
     Parameters
     ----------
-    view
+    view : SensorView
         View of the camera; its bins along u are the pixels of a profile.
-    readout
+    readout : LineReadout
         Readout of the line. Without a triangulation it takes the triangulation of the view.
-    exposure_time
+    exposure_time : float
         Exposure time [s], 0 or more.
-    responsivity
+    responsivity : float
         Responsivity of the pixels [A/W], 0 or more. The number of electrons is the charge over the elementary charge.
-    gain
+    gain : float
         Conversion gain [grey levels per electron], > 0.
-    offset
+    offset : float
         Grey level without light, 0 or more.
-    read_noise
+    read_noise : float
         Standard deviation of a pixel without light [electrons], 0 or more.
-    full_well
+    full_well : float
         Capacity of a pixel [electrons], > 0. Infinite: only the number of bits limits the grey level.
-    bits
+    bits : {8, 10, 12, 14, 16}
         Bits of a grey level: 8, 10, 12, 14 or 16. Frames of more than 8 bits are uint16.
-    ambient
+    ambient : float
         Power of the ambient light on every profile, uniform along u [W], 0 or more.
-    mask
+    mask : Mask, optional
         Mask before the pixels, for example a region of interest that follows the line.
-    limits
+    limits : AlignmentLimits
         Allowed differences between view and readout.
 
     Raises
@@ -128,12 +128,12 @@ class CameraSimulator:
 
         Parameters
         ----------
-        exposures
+        exposures : mapping of str to Exposure
             Light by path behind the lens, before the mask, (..., samples, bins).
-        seed
+        seed : int, optional
             Seed of the noise, 0 or more: frames of uint8 or uint16 with photon, read and quantisation noise. None:
             expected grey levels, float32.
-        first_profile
+        first_profile : int
             Number of the first profile of the block. The noise of a profile depends on the seed and its number only.
         """
         if seed is None:
@@ -163,9 +163,9 @@ class CameraSimulator:
 
         Parameters
         ----------
-        exposures, seed, first_profile
+        exposures, seed, first_profile : mapping of str to Exposure, int or None, int
             As for `frames`.
-        device
+        device : Device, optional
             Device of the readout; None: `Device.best`.
 
         Returns

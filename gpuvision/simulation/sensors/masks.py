@@ -62,12 +62,12 @@ class Mask:
 
     Parameters
     ----------
-    windows
+    windows : numpy.ndarray, optional
         Lower and upper end of each window [sensor unit], float64 (samples, 2), or (profiles, samples, 2) for a mask
         that follows the part. None: no windows. A window with equal ends is closed.
-    leak
+    leak : float
         Fraction of the light outside the window that passes, 0 to 1.
-    transmission
+    transmission : numpy.ndarray, optional
         Transmission of each bin, float64 (samples, bins), 0 to 1. None: 1.
 
     Raises
@@ -102,13 +102,13 @@ class Mask:
 
         Parameters
         ----------
-        view
+        view : SensorView
             View of the sensor.
-        truth
+        truth : GroundTruth
             Expected points, (samples,) or (profiles, samples). Samples without a point have a closed window.
-        half_height
+        half_height : float
             Height above and below the profile that passes [m], > 0. Windows are clipped to the sensor.
-        limits
+        limits : MaskLimits
             Limits of the iteration.
 
         Raises
@@ -137,9 +137,9 @@ class Mask:
 
         Parameters
         ----------
-        exposure
+        exposure : Exposure
             (..., samples, bins).
-        u_edges
+        u_edges : array_like
             Edges of the bins, (bins + 1,) [sensor unit].
 
         Raises
@@ -277,21 +277,21 @@ def optimise_mask(
 
     Parameters
     ----------
-    view
+    view : SensorView
         View of the sensor.
-    exposures
+    exposures : mapping of str to Exposure
         Light by path, (profiles, samples, bins), before the mask. "direct" is the valid light.
-    truth
+    truth : GroundTruth
         Ground truth, (profiles, samples).
-    fixed
+    fixed : bool
         True: one window per sample for all profiles. False: one per sample and profile, a mask that follows the part.
-    objective
+    objective : {"max", "rms"}
         Minimised quantity over the profiles of a sample: ``"rms"`` or ``"max"`` of the errors. With "max", one profile
         that no mask can improve leaves the other profiles as they are.
-    min_passed_fraction
+    min_passed_fraction : float
         Fraction of the valid light that must pass in every profile, > 0 and at most 1. At most half of the rest is cut
         at either end.
-    margin
+    margin : float
         Distance of the window's ends from the valid light, for a mask with a positioning tolerance [sensor unit], 0
         or more.
 

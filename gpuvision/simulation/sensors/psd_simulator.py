@@ -43,24 +43,24 @@ class PsdSimulator:
 
     Parameters
     ----------
-    view
+    view : SensorView
         View of the sensor. Its samples are the strips; its first and last edge along u are the electrodes of the
         strips. Light outside the edges is lost.
-    readout
+    readout : PsdReadout
         Readout of the currents, layout "pairs". Dark level, gain, load, linearity and noise of the readout are
         simulated. Without a triangulation it takes the triangulation of the view.
-    responsivity
+    responsivity : float
         Responsivity of the strips [A/W], 0 or more.
-    ambient
+    ambient : float
         Power of the ambient light on every strip, uniform along u [W], 0 or more. Above 0 it replaces the background
         photocurrent of the readout's noise model; that one is simulated as shot noise that no mask stops.
-    modulated
+    modulated : bool
         True: the light is modulated and demodulated, so that ambient light adds its shot noise only.
-    mask
+    mask : Mask, optional
         Mask before the strips.
-    quantised
+    quantised : bool
         True: an analogue-to-digital converter makes uint16 codes of the currents, with a step of `readout.ampere`.
-    limits
+    limits : AlignmentLimits
         Allowed differences between view and readout.
 
     Raises
@@ -115,12 +115,12 @@ class PsdSimulator:
 
         Parameters
         ----------
-        exposures
+        exposures : mapping of str to Exposure
             Light by path behind the lens, before the mask, (..., samples, bins).
-        seed
+        seed : int, optional
             Seed of the noise, 0 or more; the quantisation to codes is part of the noise. None: expected currents,
             float64.
-        first_profile
+        first_profile : int
             Number of the first profile of the block.
         """
         signal = self.signal(total_exposure(self.detected_light(exposures)))
@@ -154,9 +154,9 @@ class PsdSimulator:
 
         Parameters
         ----------
-        exposures, seed, first_profile
+        exposures, seed, first_profile : mapping of str to Exposure, int or None, int
             As for `currents`. Without a seed, the noiseless currents are read; sigma is the same.
-        device
+        device : Device, optional
             Device of the readout; None: `Device.best`.
 
         Returns

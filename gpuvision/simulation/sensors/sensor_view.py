@@ -76,23 +76,23 @@ class SensorView:
 
     Parameters
     ----------
-    triangulation
+    triangulation : Triangulation
         Triangulation from the sensor to the sheet, with the distortion of a lens or a camera.
-    transport
+    transport : StraightTransport
         Motion of sheet and sensor over the scene.
-    lens
+    lens : sequence of 3 floats
         Position of the pinhole in the scene at transport 0, (3,) [m].
-    u_edges
+    u_edges : numpy.ndarray
         Edges of the bins along u, (bins + 1,), ascending [sensor unit]. For a PSD, the first and the last edge are the
         ends of the strips; for a camera, each bin is a pixel.
-    v_edges
+    v_edges : numpy.ndarray
         Edges of the strips or columns along v, (samples + 1,), ascending [sensor unit].
-    aperture
+    aperture : float
         Diameter of the lens' aperture [m], > 0.
-    axis
+    axis : sequence of 3 floats, optional
         Direction of the lens' optical axis in the scene, (3,). None: towards the point of the sheet that the centre of
         the sensor sees.
-    limits
+    limits : ViewLimits
         Limits of the blur and of the lens' position.
 
     Raises
@@ -245,9 +245,9 @@ class SensorView:
 
         Parameters
         ----------
-        u, v
+        u, v : array_like
             Positions of the spots [sensor unit].
-        power
+        power : array_like
             Power of the spots [W]; all three are broadcast.
         """
         u, v, power = (np.ravel(each) for each in np.broadcast_arrays(u, v, power))
@@ -265,9 +265,9 @@ class SensorView:
 
         Parameters
         ----------
-        exposure
+        exposure : Exposure
             (samples, bins). The light of a bin is treated as a spot at its centroid.
-        sigma
+        sigma : float
             Standard deviation of the image of a point [sensor unit], 0 or more.
 
         Notes

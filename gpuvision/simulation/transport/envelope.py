@@ -122,7 +122,7 @@ def _heights_at(x: Float64, height: Float64, at: Float64) -> Float64:
 
 
 def _highest_rows(begin: Integers, count: Integers, here: Float64, there: Float64) -> Integers:
-    """Return the row that is highest ``here`` in each run of rows; among equals the one that is highest ``there``."""
+    """Return the row with the largest ``here`` in each run; of equal rows, the row with the largest ``there``."""
     best = here == np.repeat(np.maximum.reduceat(here, begin), count)
     there = np.where(best, there, -np.inf)
     best &= there == np.repeat(np.maximum.reduceat(there, begin), count)

@@ -105,22 +105,22 @@ class LightSheet:
 
     Parameters
     ----------
-    transport
+    transport : StraightTransport
         Position of the sheet, and its motion over the scene.
-    power
+    power : float
         Power per metre of G [W/m], 0 or more; of a fan, at H = 0. Default 1.
-    sigma
+    sigma : float
         Standard deviation of the light across the sheet, along the transport [m]; 0 (default) is a thin sheet. A thick
         sheet is modelled as parallel thin sheets side by side.
-    source
+    source : pair of floats, optional
         (G, H) of the point source of a fan [m], H > 0. The fan lights surfaces that lie below the source by more than a
         thousandth of its H; surfaces nearer to the source do not occlude. None (default): parallel light.
-    g_limits
+    g_limits : pair of floats, optional
         Range of G [m] with light; of a fan, at H = 0. None (default): no limits.
-    profile
+    profile : sequence of pairs of floats, optional
         Rows (G [m], factor) of the power per metre, G ascending, interpolated linearly and 0 beyond the ends; of a fan,
         at H = 0. None (default): even light.
-    uniformity
+    uniformity : float
         A segment is split where its power per metre changes by more than this share of the largest on it;
         `LitLine.power` is its mean, so the energy is exact. At least 1e-4, default 0.05.
 
@@ -180,11 +180,11 @@ class LightSheet:
 
         Parameters
         ----------
-        scene
+        scene : Scene
             Surfaces.
-        L
+        L : float
             Transport [m].
-        offset
+        offset : float
             Distance across the sheet, along the transport, added to L [m].
         """
         return self.illuminate_all(scene, [L + offset])[0]
@@ -194,9 +194,9 @@ class LightSheet:
 
         Parameters
         ----------
-        scene
+        scene : Scene
             Surfaces.
-        transports
+        transports : array_like
             (k,): transports [m].
 
         Returns

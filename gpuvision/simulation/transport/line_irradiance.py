@@ -55,13 +55,13 @@ class LitSegments:
 
     Parameters
     ----------
-    ends
+    ends : numpy.ndarray
         (m, 2, 3): start and end [m]. A segment without length emits nothing.
-    normals
+    normals : numpy.ndarray
         (m, 3): normals of the lit surfaces on the side that emits, of any length, perpendicular to the segment.
-    exitance
+    exitance : numpy.ndarray
         (m,): power that leaves a metre of the line [W/m], 0 or more: albedo times the power that arrives on it.
-    limits
+    limits : SegmentLimits
         Tolerance of the check of the normals.
 
     Raises
@@ -156,12 +156,12 @@ class LineIrradiance(VisionOperation[Irradiance]):
 
     Parameters
     ----------
-    segments
+    segments : LitSegments
         The emitters.
-    precision
+    precision : {None, "single", "double"}
         Precision of arithmetic and outputs; None follows the input. "single" takes float64 receivers too: positions are
         subtracted in double before they are rounded, so they keep their digits near a line and far from the origin.
-    variant
+    variant : {"auto", "vector", "work_item"}
         "vector" (16-wide vectors, for CPU runtimes), "work_item" (a work-item per receiver, for GPUs), or "auto".
 
     Raises

@@ -87,27 +87,27 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
 
     Parameters
     ----------
-    scene
+    scene : Scene
         Triangles that may occlude, on both sides, in the frame of receivers and segments.
-    segments
+    segments : int
         Number of rows of `segments`, 1 or more.
-    selected
+    selected : int, optional
         Length of the input `selected`; None: every receiver gets light from all segments.
-    visibility
+    visibility : {"intervals", "rays", "none"}
         "intervals" (exact: the triangles' shadows on each segment, projected from the receiver in one traversal of the
         tree), "rays" (shadow rays to the middles of ``samples`` parts of each segment: an independent, slower method,
         of first order in the length of a part), "none" (nothing occludes).
-    samples
+    samples : int
         Parts of a segment for "rays", 1 or more. Default 64.
-    clearance
+    clearance : float, optional
         Height above the lit surface, or above the receiver's plane, below which nothing occludes [m]: this excludes the
         surfaces on which both lie, as far as they are flat. None: 4e-6 of the scene's reach from the origin with
         positions in single, 1e-12 in double. A smaller clearance lets surfaces occlude points on themselves; so a scene
         of metres with details of micrometres needs double.
-    precision
+    precision : {None, "single", "double"}
         Precision of arithmetic and outputs; None follows the input. "single" takes float64 positions, too: they are
         subtracted before they are rounded.
-    variant
+    variant : {"auto", "vector", "work_item"}
         "vector" (a work-item for several strips, 16 boxes at once, for CPU runtimes), "work_item" (a work-group per
         strip, a work-item per receiver, for GPUs), or "auto".
 

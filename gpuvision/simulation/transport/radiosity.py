@@ -68,18 +68,18 @@ class Radiosity:
 
     Parameters
     ----------
-    patches
+    patches : Patches
         Surfaces that exchange light.
-    albedo
+    albedo : numpy.ndarray
         (count,): albedo of each patch, 0 to 1.
-    scene
+    scene : Scene, optional
         Triangles that may occlude; None: nothing occludes (the inside of a convex room).
-    device
+    device : Device, optional
         Device of the form factors, in double where it has it; None: `Device.best`.
-    max_dense
+    max_dense : int
         Up to this number of patches the matrix is kept in double and factored once for all lights. With more patches it
         is kept in single, four bytes per pair of patches, and each light is solved iteratively (GMRES). Default 4096.
-    limits
+    limits : RadiosityLimits
         Numerical limits.
 
     Raises
@@ -140,15 +140,15 @@ class Radiosity:
 
         Parameters
         ----------
-        scene, albedo
+        scene, albedo : Scene, sequence of float
             The scene, and an albedo for every number in `Scene.material`.
-        size, both_sides
+        size, both_sides : float, bool or None
             As of `Patches.from_scene`; size in metres.
-        refinements
+        refinements : int
             Number of times that patches close to others are halved (`refine_corners`). Default 0.
-        graded
+        graded : bool
             Whether patches become smaller towards concave edges, as `Patches.from_scene` says. Default False.
-        device, max_dense, limits
+        device, max_dense, limits : Device or None, int, RadiosityLimits
             As of `Radiosity`.
 
         Raises
@@ -192,7 +192,7 @@ class Radiosity:
 
         Parameters
         ----------
-        arrival
+        arrival : array_like
             (count,): irradiance straight from the light [W/m^2].
 
         Raises
@@ -212,11 +212,11 @@ class Radiosity:
 
         Parameters
         ----------
-        receivers
+        receivers : numpy.ndarray
             (..., 6), float32 or float64: position [m] and normal.
-        exitance
+        exitance : numpy.ndarray
             (count,): exitance of the patches [W/m^2].
-        min_exitance
+        min_exitance : float
             Patches of less exitance are omitted [W/m^2]. With exact visibility no receiver loses more than this,
             because its form factors to patches that do not overlap add up to at most 1; sampled visibility
             (`FormFactors`) may exceed that.

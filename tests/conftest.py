@@ -45,6 +45,8 @@ hypothesis.configuration.set_hypothesis_home_dir(CACHE / "hypothesis")
 LEFT_COUNTS = pytest.StashKey[dict[str, int]]()
 WITHOUT_INLINE = pytest.StashKey[bool]()
 TIERS = ("fast", "full", "nightly")
+Draws = Callable[..., int]
+"""Type of the fixture ``draws``."""
 # Factor on the examples of every hypothesis test by tier. The fast tier draws 10 at least, or all of fewer.
 EXAMPLES = {"fast": 0.3, "full": 1, "nightly": 20}
 LEAST_EXAMPLES = 10
@@ -193,10 +195,10 @@ def _counts(labels: Mapping[str, int]) -> str:
 
 
 @pytest.fixture
-def draws(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
-    """Number of draws of a statistic by tier: ``draws(fast, full)``."""
-    in_fast = request.config.getoption("tier") == "fast"
-    return lambda fast, full: fast if in_fast else full
+def draws(request: pytest.FixtureRequest) -> Draws:
+    """Number of draws of a statistic by tier: ``draws(fast, full)``, or ``draws(fast, full, nightly)``."""
+    place = TIERS.index(request.config.getoption("tier"))
+    return lambda *counts: counts[min(place, len(counts) - 1)]
 
 
 @pytest.fixture

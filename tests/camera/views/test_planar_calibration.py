@@ -68,8 +68,9 @@ def test_a_cold_start_never_fails(kind, tilt, draws):
 @pytest.mark.slow
 @pytest.mark.parametrize("tilt", TILTS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_200_cold_starts_never_fail(kind, tilt):
-    for seed in range(200):
+def test_many_cold_starts_never_fail(kind, tilt, draws):
+    """A failure rate of 0.4 % is found with a probability of 97 %, of 0.1 % in the nightly tier."""
+    for seed in range(draws(50, 50, 200)):
         made, views, sigma = random_scene(kind, tilt, 1000 + seed)
         check(made, fit_camera(views, made.size, model="tilt"), sigma)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from scipy.stats import chi2
 
 from board_fixes import GROSS, KINDS, BoardFix
 from board_images import SAMPLES, BoardPicture, View, board_image
+from conftest import Draws
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 
@@ -77,9 +77,7 @@ def assert_as_promised(ratios: np.ndarray, limits: np.ndarray) -> None:
     assert (ratios < limits[1]).all(), ratios
 
 
-def test_errors_are_those_promised(
-    drawn: BoardFix, device: Device, rng: np.random.Generator, draws: Callable[[int, int], int]
-) -> None:
+def test_errors_are_those_promised(drawn: BoardFix, device: Device, rng: np.random.Generator, draws: Draws) -> None:
     count = draws(60, 100)
     fixes = drawn.fixes(drawn.sharp(draws(1, 2), rng), count, device, rng)
     assert fixes.good.all()
@@ -90,7 +88,7 @@ def test_errors_are_those_promised(
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_wrong_pose_of_a_disturbed_board(
-    drawn: BoardFix, kind: str, device: Device, rng: np.random.Generator, draws: Callable[[int, int], int]
+    drawn: BoardFix, kind: str, device: Device, rng: np.random.Generator, draws: Draws
 ) -> None:
     count = draws(30, 60)
     board = replace(drawn, motion_px=5.0) if kind == "motion" else drawn  # with the rulers that it has selected
@@ -155,29 +153,34 @@ def test_a_real_board_s_errors_are_those_promised(
 @pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", TOOLS)
-def test_a_thousand_fixes_of_a_real_board(data: Path, name: str, device: Device, rng: np.random.Generator) -> None:
+def test_many_fixes_of_a_real_board(
+    data: Path, name: str, device: Device, rng: np.random.Generator, draws: Draws
+) -> None:
+    """400 draws determine a standard deviation to 3.5 %: a ratio of 1.06 stays below the limit, 1.25 does not."""
     board = of_tool(data / "gerber" / name, TOOLS[name])
-    fixes = board.fixes(board.sharp(10, rng), 1000, device, rng)
+    fixes = board.fixes(board.sharp(draws(4, 4, 10), rng), draws(400, 400, 1000), device, rng)
     assert np.mean(fixes.good) > 0.99
     assert fixes.squares.max() < GROSS
     assert_as_promised(fixes.scatter / board.chosen.sigmas, np.array([0.85, 1.15]))
-    assert_beats_random_sets(board, board.sharp(1, rng), 100, device, rng)
+    assert_beats_random_sets(board, board.sharp(1, rng), draws(50, 50, 100), device, rng)
 
 
 @pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", TOOLS)
-def test_no_wrong_pose_in_a_thousand_of_disturbed_real_boards(
-    data: Path, name: str, kind: str, device: Device, rng: np.random.Generator
+def test_no_wrong_pose_of_disturbed_real_boards(
+    data: Path, name: str, kind: str, device: Device, rng: np.random.Generator, draws: Draws
 ) -> None:
+    """In 3 x 4 x 250 poses a rate of wrong poses of 0.1 % is found with a probability of 95 %, 0.025 % nightly."""
+    count = draws(250, 250, 1000)
     board = replace(of_tool(data / "gerber" / name, TOOLS[name]), motion_px=5.0 if kind == "motion" else 0.0)
-    pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else 20)]
-    fixes = board.fixes(pictures, 1000, device, rng)
+    pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else draws(5, 5, 20))]
+    fixes = board.fixes(pictures, count, device, rng)
     assert not (fixes.squares > GROSS).any()
     if kind == "reversed":
         assert not fixes.good.any()
-        fixes = board.fixes(pictures, 1000, device, rng, polarity="rising")
+        fixes = board.fixes(pictures, count, device, rng, polarity="rising")
         assert not (fixes.squares > GROSS).any()
-    if fixes.good.sum() > 100:
+    if fixes.good.sum() > count // 10:
         assert_as_promised(fixes.scatter / fixes.predicted, band(int(fixes.good.sum())))

@@ -18,10 +18,11 @@ GREY = Material(diffuse=Lambert(albedo=0.5))
 PATHS = ("direct", "diffuse-diffuse")
 
 
-def corner(moved: float = 0.0) -> Scene:
+def corner(moved: float = 0.0, width: float = 0.2) -> Scene:
     """Return a floor and a wall across the end of the sheet: the line on the floor ends at the wall x = 20 mm."""
-    floor = np.array([[-0.1, -0.1, 0.0], [0.02, -0.1, 0.0], [0.02, 0.1, 0.0], [-0.1, 0.1, 0.0]])
-    wall = np.array([[0.02, -0.1, 0.0], [0.02, 0.1, 0.0], [0.02, 0.1, 0.05], [0.02, -0.1, 0.05]])
+    y = 0.5 * width
+    floor = np.array([[-0.1, -y, 0.0], [0.02, -y, 0.0], [0.02, y, 0.0], [-0.1, y, 0.0]])
+    wall = np.array([[0.02, -y, 0.0], [0.02, y, 0.0], [0.02, y, 0.05], [0.02, -y, 0.05]])
     corners = np.concatenate([floor, wall])
     corners[:, 1] += moved
     return Scene.of(trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], process=False))
@@ -98,10 +99,9 @@ def test_further_bounces_come_on_top(device):
 
 
 def test_patches_are_a_sixteenth_of_the_diagonal_by_default(device):
-    bounds = (0.12, 0.2, 0.05)
-    made = {size: paths(corner(), device, paths=(*PATHS, "multi-bounce"), patch_size=size) for size in (None, 0.02)}
-    diagonal = math.hypot(*bounds)
-    made[diagonal] = paths(corner(), device, paths=(*PATHS, "multi-bounce"), patch_size=diagonal / 16.0)
+    scene, diagonal = corner(width=0.04), math.hypot(0.12, 0.04, 0.05)
+    sizes = {None: None, 0.02: 0.02, diagonal: diagonal / 16.0}
+    made = {key: paths(scene, device, paths=(*PATHS, "multi-bounce"), patch_size=size) for key, size in sizes.items()}
     power = {size: each.profile(0.0).exposures["multi-bounce"].power for size, each in made.items()}
     np.testing.assert_array_equal(power[None], power[diagonal])
     assert np.any(power[None] != power[0.02])

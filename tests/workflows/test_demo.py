@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,18 @@ import pytest
 from gpuvision.cli import main as cli
 from gpuvision.host import Device
 from gpuvision.workflows.demo import SENSORS, make_scan_task
+from gpuvision.workflows.light_cache import SimulationTask
 from gpuvision.workflows.scanning import scan
 from gpuvision.workflows.simulated_recording import simulate_recording
 from gpuvision.workflows.simulating import simulate
 
-PROFILES = 40  # the middle of the part, 10 mm: a tenth of the box, a half of the cylinder, most of the steps
+PROFILES = 20  # every second one of the middle of the part, 10 mm: a tenth of the box, half of the cylinder, most steps
+
+
+def task_of(name: str) -> SimulationTask:
+    """Return the scan of the middle of the part, with every second profile."""
+    task = make_scan_task(name, 2 * PROFILES)
+    return replace(task, transports=task.transports[::2])
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +44,7 @@ def away_from_edges(height: Any) -> Any:
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_scan_of_the_recording_is_what_was_predicted(name: str, light: Path, device: Device) -> None:
-    task = make_scan_task(name, PROFILES)
+    task = task_of(name)
     recording = simulate_recording(task, light, seed=7)
     shape = {"camera_line": (PROFILES, 64, 480), "psd_line": (PROFILES, 96, 2)}[name]
     assert (recording.shape, recording.dtype) == (shape, np.uint8 if name == "camera_line" else np.uint16)
@@ -47,24 +55,24 @@ def test_a_scan_of_the_recording_is_what_was_predicted(name: str, light: Path, d
 
 
 def test_a_camera_finds_the_part_again(light: Path) -> None:
-    attribution = simulate(make_scan_task("camera_line", PROFILES), light, seed=7).attribution
+    attribution = simulate(task_of("camera_line"), light, seed=7).attribution
     smooth = away_from_edges(attribution.truth.h) & np.isfinite(attribution.error)
-    assert smooth.sum() > 8000
+    assert smooth.sum() > 3500
     # 0.03 pixel at 0.24 mm per pixel; a windowed centre of gravity of this line reaches 0.01 to 0.02.
     assert np.sqrt(np.mean(attribution.error[smooth] ** 2)) < 0.03 * 0.24e-3
 
 
 def test_the_noise_is_what_the_sensor_predicts(light: Path) -> None:
-    attribution = simulate(make_scan_task("psd_line", PROFILES), light, seed=7).attribution
+    attribution = simulate(task_of("psd_line"), light, seed=7).attribution
     noise, sigma = attribution.causes["noise"], attribution.reading.sigma
     known = np.isfinite(noise) & np.isfinite(sigma) & away_from_edges(attribution.truth.h)
-    assert known.sum() > 1100
+    assert known.sum() > 500
     assert np.sqrt(np.mean((noise[known] / sigma[known]) ** 2)) == pytest.approx(1.0, abs=0.1)
 
 
 def test_what_the_lens_does_not_see_is_dark(light: Path) -> None:
     """The box covers the plate on the side away from the lens."""
-    done = simulate(make_scan_task("camera_line", PROFILES), light, seed=7)
+    done = simulate(task_of("camera_line"), light, seed=7)
     y = done.task.transports
     in_shadow = np.flatnonzero((y > 1.2e-3) & (y < 3.7e-3))  # the box ends at 4 mm, and covers 6 mm x 80/144
     columns = slice(70, 160)  # x from -18 to -8 mm

@@ -78,7 +78,7 @@ def part() -> trimesh.Trimesh:
     """Return a plate with a cap of a sphere and a wedge [m], larger than the field of view."""
     plate = trimesh.creation.box((0.2, 0.06, 4e-3))
     plate.apply_translation((0.0, 0.0, -2e-3))
-    ball = trimesh.creation.icosphere(5, 30e-3)
+    ball = trimesh.creation.icosphere(4, 30e-3)
     ball.apply_translation((2e-3, 3e-3, -24e-3))
     wedge = trimesh.creation.box((40e-3, 80e-3, 12e-3))
     wedge.apply_transform(trimesh.transformations.rotation_matrix(0.15, (0.0, 1.0, 0.0)))

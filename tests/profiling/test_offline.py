@@ -13,11 +13,12 @@ import pytest
 from typer.testing import CliRunner
 
 from gpuvision.cli.main import application
+from gpuvision.host import Device
 from gpuvision.host.debug import flatten_includes
 from gpuvision.host.errors import GpuVisionError
 from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.profiling.offline import check, registry, targets
-from gpuvision.profiling.offline.builds import KernelBuild
+from gpuvision.profiling.offline.builds import GpuModel, KernelBuild
 from gpuvision.profiling.offline.check import LIMITS, check_builds, fault_of, one_build_each
 from gpuvision.profiling.offline.targets import TARGETS, CompilerError, Usage, usage_of_amd, usage_of_ptxas
 
@@ -112,6 +113,13 @@ def test_builds_are_work_item_variants_without_duplicates() -> None:
     assert len(names) == len(set(names))
     assert {each.source for each in one_build_each(known_builds())} == {each.source for each in known_builds()}
     assert one_build_each(known_builds())[0] is known_builds()[0]
+
+
+def test_model_of_a_gpu_has_the_properties_that_launches_read() -> None:
+    device, model = Device.best(), GpuModel()
+    needs_a_handle = {"handle", "context", "queue", "inline_device"}
+    properties = {name for name in vars(device) if not name.startswith("_")} - needs_a_handle
+    assert properties - set(vars(model)) == set()
 
 
 def test_report_of_ptxas() -> None:

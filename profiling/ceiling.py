@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -24,24 +25,41 @@ def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[
     The arguments `read` and `written` are numbers of bytes. The time of this copy is a lower limit for a kernel with
     the same traffic in the same cache or memory; it includes the launch.
     """
+    launch = mover(device, device.queue, read, written)
+
+    def run() -> None:
+        for _ in range(repeats):
+            event = launch()
+        device.wait(event)
+
+    run()
+    return run
+
+
+def mover(device: Device, queue: Any, read: int, written: int) -> Callable[[], Any]:
+    """Return a function that enqueues a kernel which reads and writes memory sequentially, and returns its event.
+
+    Parameters
+    ----------
+    device : Device
+    queue : pyopencl.CommandQueue
+    read, written : int
+        Traffic [bytes].
+    """
     reads, writes = max(read // _VECTOR, 1), written // _VECTOR
     source = device.empty((reads * 16,), np.float32)
     target = device.empty((max(writes, 1) * 16,), np.float32)
     source.set(np.ones(source.shape, np.float32))
     target.set(np.ones(target.shape, np.float32))  # maps the pages before the first timed run
-    kernel = cl.Kernel(
-        build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "move" if device.prefers_vectors else "move_items"
-    )
+    vectors = device.prefers_vectors
+    kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "move" if vectors else "move_items")
     kernel.set_args(memory_of(source), memory_of(target), np.int64(reads), np.int64(writes))
-    items = device.compute_units * _ITEMS_PER_UNIT * (1 if device.prefers_vectors else 64)
+    items = device.compute_units * _ITEMS_PER_UNIT * (1 if vectors else 64)
 
-    def run(kept: object = (source, target)) -> None:
-        for _ in range(repeats):
-            event = cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.prefers_vectors else None)
-        device.wait(event)
+    def launch(kept: object = (source, target)) -> Any:
+        return cl.enqueue_nd_range_kernel(queue, kernel, (items,), (1,) if vectors else None)
 
-    run()
-    return run
+    return launch
 
 
 def flop_rate(device: Device, *, seconds: float = 0.15) -> float:

@@ -195,6 +195,7 @@ FLOORS = (
     ("workflows",),
     ("profiling.offline",),
     ("profiling",),
+    ("profiling.gpu_run",),
     ("cli",),
     ("__main__",),
 )

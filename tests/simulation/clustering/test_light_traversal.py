@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -62,64 +64,80 @@ def some_triangles(rng: np.random.Generator) -> NDArray[Any]:
     return np.concatenate([above, low]) @ TURN.T
 
 
-def compare(
-    device: Device,
-    variant: Any,
-    segments: NDArray[Any],
-    receivers: NDArray[Any],
-    costs: NDArray[Any],
-    shares: NDArray[Any],
-    *,
-    triangles: NDArray[Any] | None = None,
-    clusters: bool = True,
-) -> list[Traversal]:
-    """Run the kernel and the oracle, compare all blocks, and return the oracle's results.
+class Inputs(NamedTuple):
+    """Scene of a traversal: receivers (strips, n, 6) with their costs, and the share of each strip."""
 
-    The kernel computes in single: the scenes have no bound within 1e-5 of a limit.
-    """
-    scene = None if triangles is None else Scene(triangles + MIDDLE)
-    # The kernel computes relative to the middle of the frame. Tree and segments are given so, receivers are not.
+    segments: NDArray[Any]
+    receivers: NDArray[Any]
+    costs: NDArray[Any]
+    shares: NDArray[Any]
+    triangles: NDArray[Any] | None = None
+    clusters: bool = True
+
+
+class Task(NamedTuple):
+    """Scene, tree and segments relative to the middle of the frame, and the oracle's results of all blocks."""
+
+    scene: Scene | None
+    middle: NDArray[Any]
+    tree: LightTree
+    placed: NDArray[Any]
+    expected: list[Traversal]
+
+
+@cache
+def task_of(make: Callable[[], Inputs]) -> Task:
+    """Return the task of some inputs; the oracle runs once for all variants of the kernel."""
+    inputs = make()
+    scene = None if inputs.triangles is None else Scene(inputs.triangles + MIDDLE)
     middle = MIDDLE if scene is None else scene.bvh.middle
     shift = middle - MIDDLE
-    segments = segments - np.concatenate([shift, shift, np.zeros(4)])
+    segments = inputs.segments - np.concatenate([shift, shift, np.zeros(4)])
     tree = LightTree.build(segments)
     placed = np.zeros((len(tree.spans) // 2, sum(module._SEGMENT_SIZES.values())), np.float32)
     placed[: len(segments)] = module._segment_rows(segments[tree.order], np.zeros(3))
+    nodes, lits = named(tree.rows.astype(np.float32), NODE_SIZES), named(placed, module._SEGMENT_SIZES)
+    triangles = None if inputs.triangles is None else inputs.triangles - shift
+    expected = []
+    for strip, first in np.ndindex(len(inputs.receivers), -(-inputs.receivers.shape[1] // BLOCK)):
+        here = strip, slice(first * BLOCK, first * BLOCK + BLOCK)
+        block = Block.of(inputs.receivers[here], inputs.costs[here], shift)
+        limits = inputs.shares[strip], ROUNDING, triangles, MARGIN
+        expected.append(traverse(block, nodes, tree.spans, lits, *limits, clusters=inputs.clusters))
+    return Task(scene, middle, tree, placed, expected)
+
+
+def compare(device: Device, variant: Any, make: Callable[[], Inputs]) -> list[Traversal]:
+    """Run the kernel, compare all blocks with the oracle, and return the oracle's results.
+
+    The kernel computes in single: the scenes have no bound within 1e-5 of a limit.
+    """
+    inputs, task = make(), task_of(make)
     operation = module._SelectLights(
-        nodes=len(tree.spans),
-        segments=len(placed),
+        nodes=len(task.tree.spans),
+        segments=len(task.placed),
         capacity=CAPACITY,
-        scene=scene,
+        scene=task.scene,
         clearance=MARGIN,
-        clusters=clusters,
+        clusters=inputs.clusters,
         variant=variant,
     )
-    given = receivers + np.append(MIDDLE, np.zeros(3))
-    rows, frame = tree.rows.astype(np.float32), np.append(middle, ROUNDING)
-    found = operation(
-        given, costs.astype(np.float32), shares.astype(np.float32), rows, tree.spans, placed, frame, device=device
-    )
-    selected, errors, counts, sums, tallies = map(to_numpy, found)
-    nodes, lits = named(rows, NODE_SIZES), named(placed, module._SEGMENT_SIZES)
-    expected = []
-    blocks = -(-receivers.shape[1] // BLOCK)
-    for number in range(len(receivers) * blocks):
-        strip, first = number // blocks, number % blocks * BLOCK
-        block = Block.of(receivers[strip, first : first + BLOCK], costs[strip, first : first + BLOCK], shift)
-        local = None if triangles is None else triangles - shift
-        each = traverse(block, nodes, tree.spans, lits, shares[strip], ROUNDING, local, MARGIN, clusters=clusters)
-        assert counts[number] == len(each.entries)
-        np.testing.assert_array_equal(selected[number, : counts[number]], each.entries)
-        np.testing.assert_allclose(errors[number, : counts[number]], each.errors, rtol=3e-5)
-        np.testing.assert_allclose(sums[number], each.sums, rtol=3e-5)
-        np.testing.assert_array_equal(tallies[number], each.tallies)
-        expected.append(each)
-    return expected
+    # The receivers are not relative to the middle of the frame.
+    given = inputs.receivers + np.append(MIDDLE, np.zeros(3))
+    costs, shares, rows = (each.astype(np.float32) for each in (inputs.costs, inputs.shares, task.tree.rows))
+    frame = np.append(task.middle, ROUNDING)
+    found = operation(given, costs, shares, rows, task.tree.spans, task.placed, frame, device=device)
+    for selected, errors, count, sums, tallies, each in zip(*map(to_numpy, found), task.expected, strict=True):
+        assert count == len(each.entries)
+        np.testing.assert_array_equal(selected[:count], each.entries)
+        np.testing.assert_allclose(errors[:count], each.errors, rtol=3e-5)
+        np.testing.assert_allclose(sums, each.sums, rtol=3e-5)
+        np.testing.assert_array_equal(tallies, each.tallies)
+    return task.expected
 
 
-@TWO_WAYS
-def test_bounds_without_occluders(device: Device, variant: Any) -> None:
-    """Shares from 0, where all single segments are kept, to 1e9 / m^2, where the root is omitted."""
+def without_occluders() -> Inputs:
+    """Return shares from 0, where all single segments are kept, to 1e9 / m^2, where the root is omitted."""
     rng = np.random.default_rng(0)
     near, far = (strips_around(rng, *size) for size in ((24, BLOCK + 5, (0.02, 0.3)), (8, BLOCK + 5, (0.4, 3.0))))
     receivers = np.concatenate([near, far])
@@ -127,20 +145,37 @@ def test_bounds_without_occluders(device: Device, variant: Any) -> None:
     receivers[3, 4, 3:] = 0.0
     costs[5, BLOCK:] = 0.0
     shares = np.tile([0.0, 1e9, 0.3, 3.0, 30.0, 0.05], 6)[:32]
-    expected = compare(device, variant, lit_segments(rng, 21, 0.03), receivers, costs, shares)
+    return Inputs(lit_segments(rng, 21, 0.03), receivers, costs, shares)
+
+
+def with_occluders() -> Inputs:
+    """Return a scene whose most distant strips have more clusters to test than a block tests at most."""
+    rng = np.random.default_rng(0)
+    receivers = np.concatenate([strips_around(rng, 20, BLOCK, (0.1, 0.4)), strips_around(rng, 3, BLOCK, (1.0, 2.0))])
+    costs = rng.uniform(0.5, 2.0, receivers.shape[:2])
+    triangles = some_triangles(rng)
+    shares = np.append(np.tile([0.0, 0.3, 3.0, 0.1], 5), np.full(3, 2e-3))
+    return Inputs(lit_segments(rng, 100, 0.03), receivers, costs, shares, triangles)
+
+
+def without_clusters() -> Inputs:
+    """Return a distant strip, which takes clusters where they are allowed."""
+    rng = np.random.default_rng(1)
+    receivers = strips_around(rng, 2, BLOCK, (1.0, 2.0))
+    costs = rng.uniform(0.5, 2.0, receivers.shape[:2])
+    return Inputs(lit_segments(rng, 8, 0.03), receivers, costs, np.full(2, 0.1), clusters=False)
+
+
+@TWO_WAYS
+def test_bounds_without_occluders(device: Device, variant: Any) -> None:
+    expected = compare(device, variant, without_occluders)
     assert sum(each.tallies[1] > 0 for each in expected) >= 10
     assert sum(0 < each.tallies[0] < 21 for each in expected) >= 10
 
 
 @TWO_WAYS
 def test_triangles_that_may_occlude(device: Device, variant: Any) -> None:
-    """The most distant strips have more clusters to test than a block tests at most."""
-    rng = np.random.default_rng(0)
-    receivers = np.concatenate([strips_around(rng, 20, BLOCK, (0.1, 0.4)), strips_around(rng, 3, BLOCK, (1.0, 2.0))])
-    costs = rng.uniform(0.5, 2.0, receivers.shape[:2])
-    corners = some_triangles(rng)
-    shares = np.append(np.tile([0.0, 0.3, 3.0, 0.1], 5), np.full(3, 2e-3))
-    expected = compare(device, variant, lit_segments(rng, 100, 0.03), receivers, costs, shares, triangles=corners)
+    expected = compare(device, variant, with_occluders)
     assert sum(any(k < 0 for k in each.entries) for each in expected) >= 5
     assert sum(any(k >= 1 << 30 for k in each.entries) for each in expected) >= 3
     assert sum(each.tests == 0 for each in expected) >= 1
@@ -148,8 +183,4 @@ def test_triangles_that_may_occlude(device: Device, variant: Any) -> None:
 
 @pytest.mark.slow
 def test_clusters_switched_off(device: Device) -> None:
-    rng = np.random.default_rng(1)
-    receivers = strips_around(rng, 2, BLOCK, (1.0, 2.0))
-    costs = rng.uniform(0.5, 2.0, receivers.shape[:2])
-    expected = compare(device, "vector", lit_segments(rng, 8, 0.03), receivers, costs, np.full(2, 0.1), clusters=False)
-    assert not any(each.tallies[1] for each in expected)
+    assert not any(each.tallies[1] for each in compare(device, "vector", without_clusters))

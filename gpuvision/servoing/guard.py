@@ -53,8 +53,9 @@ class LoopLimits:
         Largest travel beyond the error of a measured pose [standard deviations of this pose].
         Default 3.
     overshoot : tuple of float
-        Travel beyond the error of a measured pose by the overshoot of the step response [m], [m], [rad]. Default 0: a
-        controller with an integral part is slower then, because the guard cuts the overshoot that empties this part.
+        Travel beyond the error of a measured pose by the overshoot of the step response [m], [m], [rad], which is
+        allowed only in frames with a new trusted pose. Default 0: a controller with an integral part is slower then,
+        because the guard cuts the overshoot that empties this part.
     lag : tuple of float
         Time constants with which the axes follow the commanded velocity [s]. The travel includes the motion that
         remains from the velocity at the exposure. Default 0.
@@ -117,8 +118,10 @@ class TravelGuard:
 
     Notes
     -----
-    Without a new pose each axis moves at most by the distance of the last trusted pose from the target, plus the
-    margin and the overshoot. The guard bounds the integral of the commands since the exposure plus lag times the
+    In a frame without a new trusted pose, no axis gets a command that moves it, since the last trusted exposure, by
+    more than the distance of this pose from the target plus the margin. An axis that moved further stands still. It can
+    only have moved further by commands that a new trusted pose answered in their frame: by the overshoot at most. The
+    guard bounds the integral of the commands since the exposure plus lag times the
     velocity at the exposure: the position at which an axis with this lag comes to rest. The swing of a resonance is not
     included.
 
@@ -139,6 +142,7 @@ class TravelGuard:
         self._exposed: float = -math.inf
         self._pose = np.zeros(3)
         self._margin = np.zeros(3)
+        self._has_new = False  # a pose was trusted since the last command
 
     @property
     def exposed(self) -> float:
@@ -149,13 +153,15 @@ class TravelGuard:
         """Take an accepted measurement; one that was exposed before the last one has no effect."""
         if measurement.exposed <= self._exposed:
             return
-        self._exposed, self._pose = measurement.exposed, measurement.pose.copy()
-        self._margin = self._sigmas * np.sqrt(np.diagonal(measurement.covariance)) + self._overshoot
+        self._exposed, self._pose, self._has_new = measurement.exposed, measurement.pose.copy(), True
+        self._margin = self._sigmas * np.sqrt(np.diagonal(measurement.covariance))
         while len(self._commands) > 1 and self._commands[1][0] <= self._exposed:
             self._commands.popleft()
 
     def limit(self, time: float, velocity: Float64, target: Float64, period: float) -> Float64:
         """Return a velocity (3,), cut so that the motion until the next frame stays within the bound.
+
+        Call it once in each frame: the first call after `trust` allows the overshoot.
 
         Parameters
         ----------
@@ -175,7 +181,8 @@ class TravelGuard:
         """
         if math.isinf(self._exposed):
             return np.zeros(3)
-        bound = np.abs(pose_difference(target, self._pose)) + self._margin
+        bound = np.abs(pose_difference(target, self._pose)) + self._margin + self._has_new * self._overshoot
+        self._has_new = False
         travelled = self._travelled(time)
         low, high = (-bound - travelled) / period, (bound - travelled) / period
         cut = np.clip(velocity, np.minimum(low, 0.0), np.maximum(high, 0.0))

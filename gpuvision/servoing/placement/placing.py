@@ -273,8 +273,10 @@ def place_part(
     -----
     A guard bounds the travel since the newest measured pose by the error of this pose, three standard deviations, and
     the overshoot of the step response from the edge of the landing zone: from a start in the zone the loop follows the
-    theory (`Machine.error_after`). With an integral part, and with a gain that oscillates, the head may so travel by
-    `Machine.overshoot` times the landing zone beyond the target while poses are missing.
+    theory (`Machine.error_after`). The overshoot is allowed only in frames with a new trusted pose. When poses are
+    missing, the head moves at most to the target and three standard deviations beyond it, or stands still where it is.
+    With an integral part, and with a gain that oscillates, it may already have passed the target by `Machine.overshoot`
+    times the landing zone at most, by commands that answered trusted poses.
     """
     x, y, theta = (axis.lag for axis in machine.axes)
     side = machine.overshoot * machine.tolerance.landing_zone

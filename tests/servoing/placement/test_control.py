@@ -356,6 +356,51 @@ def test_frames_of_axes_with_a_lag_are_those_of_theory(control: Control, lag: fl
     assert settled == pytest.approx(machine.frames_to(0.02), rel=0.15)
 
 
+OVERSHOOTING = [
+    Control(controller="pi"),
+    Control(gain=0.5),
+    Control(observer="smith", controller="pi", gain=0.4, integral=4e-3),
+    Control(observer="smith", gain=1.6),
+]
+
+
+@pytest.mark.parametrize("control", OVERSHOOTING, ids=["pi", "p", "smith-pi", "smith-p"])
+def test_missing_poses_stop_a_head_at_the_error_of_the_last_pose(control: Control) -> None:
+    """The camera is blind from each of the frames of the step response on.
+
+    The overshoot is allowed in frames with a new pose only: later the head moves on at most to the error of the last
+    pose plus three standard deviations, or stands still where it is.
+    """
+    machine = dataclasses.replace(PRESET, control=control)
+    start = np.array([80e-6, -60e-6, 4e-3])
+    margin, period = 3.0 * np.sqrt(np.diag(COVARIANCE)), machine.period
+    zone = np.array([machine.tolerance.landing_zone] * 2 + [machine.tolerance.landing_angle])
+    passed = np.zeros(3)
+    for last in range(14):
+        plant = SimulatedPlant(start=start)
+        sensor = SimulatedPoseSensor(
+            plant.pose,
+            period=period,
+            delay=machine.delay.latency,
+            covariance=COVARIANCE,
+            is_noisy=False,
+            fault=lambda frame, seen, last=last: [seen] if frame <= last else [],
+        )
+        placement = place_part(machine, np.zeros(3), plant, sensor, SimulatedClock())
+        if placement.released:
+            break
+        seen = plant.pose(last * period - machine.delay.latency)
+        answered = np.abs(plant.pose((last + 1) * period) - seen)  # by the command that answers the last pose
+        times = np.linspace((last + 1) * period, placement.record.time[-1] + 10.0 * period, 300)
+        moved = np.abs(plant.pose(times) - seen)
+        # The plant counts time in ns: 0.1 nm at 0.1 m/s.
+        assert np.all(moved <= np.maximum(answered, np.abs(seen) + margin) + 1e-3 * margin)
+        passed = np.maximum(passed, (-plant.pose(times) * np.sign(start)).max(axis=0))
+    assert last > 4
+    assert np.all(passed <= machine.overshoot * zone + margin)
+    assert np.any(passed > 2.0 * margin)  # an overshoot that trusted poses asked for
+
+
 @pytest.mark.parametrize("lag", [0.3e-3, 2e-3])
 @pytest.mark.parametrize("controller", ["p", "pi", "pid"])
 def test_a_smith_predictor_with_axes_that_lag_follows_the_theory(controller: Any, lag: float) -> None:

@@ -12,6 +12,7 @@ import pytest
 from gpuvision.formats.machine_file import read_machine
 from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.controllers import PidController
+from gpuvision.servoing.guard import Outcome
 from gpuvision.servoing.loop import ServoLoop, SimulatedClock
 from gpuvision.servoing.observer import PoseMeasurement, PosePrediction
 from gpuvision.servoing.placement import rehearsal
@@ -124,13 +125,17 @@ def test_true_error_settles_in_the_frames_of_theory(control: Control) -> None:
     """The count of the true error is apart from the release rule: a machine that is slower shows it."""
     machine, start = dataclasses.replace(PRESET, control=control), np.array([70e-6, -40e-6, 3e-3])
     expected = predicted_settling(machine, start, BAND)
-    counted = {}
+    counted, outcome = {}, {}
     for lag in (0.0, 2e-3):
         placement, plant = _place(machine, start, (Axis(lag=lag),) * 3)
         counted[lag] = settled_frames(plant.pose(placement.record.time), BAND)
+        outcome[lag] = placement.record.outcome
+    assert outcome[0.0] is Outcome.ARRIVED
     assert counted[0.0] is not None
     assert abs(counted[0.0] - expected) <= 1
-    assert counted[2e-3] is None or counted[2e-3] >= expected + 3
+    # The Kalman filter with the PID controller refuses the poses: the loop ends without a release.
+    is_refused = control is CONTROLS[6] and outcome[2e-3] is Outcome.INCONSISTENT
+    assert is_refused or counted[2e-3] is None or counted[2e-3] >= expected + 3
 
 
 @pytest.mark.parametrize(

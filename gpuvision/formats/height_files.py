@@ -78,7 +78,8 @@ class HeightMapFile(NamedTuple):
     grid
         Grid of the heights.
     sigma
-        Random standard deviation of each height [m], (rows, columns); None if the file has none.
+        Standard deviation of each height [m], (rows, columns); None if the file has none. Of a scan: its random error
+        and the error of the line's phase in its pixel (``map_sigma`` and ``map_phase``) together.
     """
 
     z: npt.NDArray[Any]
@@ -136,8 +137,8 @@ def scanned_map(arrays: Mapping[str, npt.NDArray[Any]], path: Path) -> HeightMap
     """
     with reading(path, "NPZ file of a scan"):
         x, y, z = (arrays[name] for name in ("map_x", "map_y", "map_z"))
-        sigma = arrays.get("map_sigma")
-        for name in ("map_x", "map_y", "map_z", "map_sigma"):
+        sigma, phase = arrays.get("map_sigma"), arrays.get("map_phase")
+        for name in ("map_x", "map_y", "map_z", "map_sigma", "map_phase"):
             if name in arrays and arrays[name].dtype.kind not in "iuf":
                 raise ReadError(f"{path}: {name} has the type {arrays[name].dtype}, expected real numbers")
         if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
@@ -145,9 +146,11 @@ def scanned_map(arrays: Mapping[str, npt.NDArray[Any]], path: Path) -> HeightMap
         if (
             (x.ndim, y.ndim, z.ndim) != (1, 1, 2)
             or z.shape != (len(y), len(x))
-            or (sigma is not None and sigma.shape != z.shape)
+            or any(each is not None and each.shape != z.shape for each in (sigma, phase))
         ):
             raise ReadError(f"{path}: map_z has shape {z.shape}, expected one row per map_y and one column per map_x")
+        if sigma is not None and phase is not None:
+            sigma = np.hypot(sigma, np.where(np.isfinite(phase), phase, 0.0)).astype(sigma.dtype)
         return HeightMapFile(z, _even_grid(x.astype(np.float64), y.astype(np.float64), path), sigma)
 
 

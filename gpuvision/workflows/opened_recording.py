@@ -167,7 +167,7 @@ def _threshold(frames: Array, background: Background | Path, image: Array | None
     middle = median_background(frames[:, 0]) if image is None else image
     few = frames[:: math.ceil(len(frames) / _NOISE_FRAMES)]
     few = few.astype(np.float32 if few.dtype.itemsize < 4 else np.float64)
-    noise_factor, level = 1.0, 0.0
+    noise_factor, level, integer = 1.0, 0.0, np.issubdtype(frames.dtype, np.integer)
     if background == "dark_after":
         differences = few[:, 0] - few[:, 1]
     elif background == "dark_before":
@@ -181,10 +181,9 @@ def _threshold(frames: Array, background: Background | Path, image: Array | None
         level = unlit_level(middle)
         lines, unlit = _profiles(few[:, 0], along), _profiles(middle, along)
         beside = beside_line(unlit)
-        if line_stands_still(light, lines, unlit_level(unlit[beside])):
-            level, differences = unlit_level(unlit[beside]), light[:, beside]
-            light = lines - level
-    integer = np.issubdtype(frames.dtype, np.integer)
+        darker, noise = unlit_level(unlit[beside]), noise_threshold(light[:, beside], integer=integer)
+        if level > darker + noise and line_stands_still(light, lines, darker):
+            level, differences = darker, light[:, beside]  # the median contains the line, which is no background
     noise = noise_factor * noise_threshold(differences, integer=integer)
     threshold = level + line_threshold(light, noise)
     return math.ceil(threshold) if integer else threshold

@@ -1,7 +1,8 @@
 """Predicted and measured errors of a scan: standard deviations of its points, and the error budget of the report.
 
 Random errors differ from sample to sample or from profile to profile: the noise of the readout, the jitter of the
-transport. Systematic errors are the same in all profiles: the calibration. The two are never added.
+transport. Systematic errors are the same in all profiles: the calibration. The error by the phase of the line in its
+pixel is the same wherever the line has the same place. The three are never added.
 """
 
 from __future__ import annotations
@@ -18,11 +19,14 @@ import numpy.typing as npt
 from gpuvision.host import Device, to_numpy
 from gpuvision.normal_distribution import MAD_TO_SIGMA
 from gpuvision.ranging.focus_stack import FocusPeak, FocusStack
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.line_phase import estimate_line_shape, phase_error
 from gpuvision.ranging.polygon_scan import PolygonScan
 from gpuvision.ranging.range_image import RangeImage, RangePoints
 from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.transports import Transport
+from gpuvision.status import Status
 
 Array = npt.NDArray[Any]
 
@@ -63,6 +67,11 @@ class ScanErrors:
         Systematic error by the covariance of the calibration; None if the sensor file gives no covariance.
     map_systematic : numpy.ndarray, optional
         Systematic error of the height map [m], over the cells.
+    phase : PointSigma, optional
+        Systematic error of a camera's readout by the place of the line in its pixel: the same in all profiles that have
+        the line at one place, see `gpuvision.ranging.line_phase.phase_error`. Not part of ``systematic``.
+    map_phase : numpy.ndarray, optional
+        ``phase`` of the height map [m], over the cells.
     """
 
     position: Array
@@ -71,6 +80,8 @@ class ScanErrors:
     random: PointSigma
     systematic: PointSigma | None
     map_systematic: Array | None = None
+    phase: PointSigma | None = None
+    map_phase: Array | None = None
 
 
 def sigma_outputs(sensor: Sensor) -> tuple[str, ...]:
@@ -131,7 +142,12 @@ def predict_errors(
         systematic = _rotating_systematic(sensor, sensor.transport, points, position, transports, device)
     random = PointSigma(*(np.hypot(*each) for each in zip(readout, transport, strict=True)))
     return ScanErrors(
-        position=fields["sigma"], readout=readout, transport=transport, random=random, systematic=systematic
+        position=fields["sigma"],
+        readout=readout,
+        transport=transport,
+        random=random,
+        systematic=systematic,
+        phase=_phase(sensor, fields, readout, device),
     )
 
 
@@ -164,6 +180,21 @@ def focus_errors(sensor: Sensor, stack: FocusStack, peak: FocusPeak, points: Ran
     readout = PointSigma(*(np.where(known, step, np.nan).astype(dtype) for step in steps))
     transport = PointSigma(*(np.where(known, 0.0, np.nan).astype(dtype) for _ in "xyz"))
     return ScanErrors(position=peak.sigma, readout=readout, transport=transport, random=readout, systematic=None)
+
+
+def _phase(sensor: Sensor, fields: Mapping[str, Array], readout: PointSigma, device: Device) -> PointSigma | None:
+    """Return the errors by the place of the line in its pixel: they move a point as the noise of the readout does."""
+    if not isinstance(sensor.readout, LineReadout) or "width" not in fields:
+        return None
+    good = fields["status"] == Status.OK
+    outputs = (fields[name][good] for name in ("peak", "width", "total"))
+    shape = estimate_line_shape(*outputs, sensor.readout.threshold)
+    error = None if shape is None else phase_error(sensor.readout, shape, fields["peak"], device)
+    if error is None:
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = error / fields["sigma"]
+    return PointSigma(*((share * each).astype(each.dtype) for each in readout))
 
 
 def _jitter(sensor: Sensor) -> float:
@@ -275,14 +306,22 @@ def error_budget(errors: ScanErrors | None, z: Array, map_sigma: Array | None, *
     -------
     dict
         ``random``: ``readout``, ``transport`` and ``total``, each with x, y and z; ``systematic``: ``calibration``;
-        ``map``: ``random`` and ``systematic`` of the heights; ``position``: of the readout [px or m]; ``measured``:
+        ``phase``: of the line in its pixel, with x, y and z; ``map``: ``random``, ``systematic`` and ``phase`` of the
+        heights; ``position``: of the readout [px or m]; ``measured``:
         ``scatter`` of z about a local plane, its ``ratio`` to the predicted readout noise, and ``speckle``, the value
         of ``[line] speckle`` [px] that explains a ratio above 1.
     """
     scatter = _finite(scatter_about_plane(z))
     measured: dict[str, Any] = {"scatter": scatter, "ratio": None, "speckle": None}
     if errors is None:
-        return {"random": None, "systematic": None, "map": None, "position": None, "measured": measured}
+        return {
+            "random": None,
+            "systematic": None,
+            "phase": None,
+            "map": None,
+            "position": None,
+            "measured": measured,
+        }
     predicted, position = _median(errors.readout.z), _median(errors.position)
     if scatter is not None and predicted and position is not None:
         measured["ratio"] = scatter / predicted
@@ -295,7 +334,12 @@ def error_budget(errors: ScanErrors | None, z: Array, map_sigma: Array | None, *
             "total": _medians(errors.random),
         },
         "systematic": None if errors.systematic is None else {"calibration": _medians(errors.systematic)},
-        "map": {"random": _median(map_sigma), "systematic": _median(errors.map_systematic)},
+        "phase": None if errors.phase is None else _medians(errors.phase),
+        "map": {
+            "random": _median(map_sigma),
+            "systematic": _median(errors.map_systematic),
+            "phase": _median(errors.map_phase),
+        },
         "position": position,
         "measured": measured,
     }

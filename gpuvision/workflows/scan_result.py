@@ -332,6 +332,7 @@ class Scan:
         maps = {
             "map_sigma": self.heights.sigma,
             "map_systematic": None if self.errors is None else self.errors.map_systematic,
+            "map_phase": None if self.errors is None else self.errors.map_phase,
         }
         held |= {name: (array, "m") for name, array in maps.items() if array is not None}
         return {name: array for name, (array, _) in held.items()}, {name: unit for name, (_, unit) in held.items()}

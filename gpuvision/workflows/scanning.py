@@ -122,10 +122,16 @@ def scan(
     middle = time.perf_counter()
     sigma = None if errors is None else errors.random.z
     heights, grid = resample_heights(sensor, points, intensity, stream.device, max_cells=limits.max_cells, sigma=sigma)
-    if errors is not None and errors.systematic is not None:
-        # Linear interpolation of the systematic error, as of the intensity: the errors of neighbours are the same.
-        of_map, _ = resample_heights(sensor, points, errors.systematic.z, stream.device, max_cells=limits.max_cells)
-        errors = dataclasses.replace(errors, map_systematic=to_numpy(of_map.intensity))
+    if errors is not None:
+        # Linear interpolation of systematic errors, as of the intensity: the errors of neighbours are the same.
+        maps = {
+            f"map_{name}": to_numpy(
+                resample_heights(sensor, points, each.z, stream.device, max_cells=limits.max_cells)[0].intensity
+            )
+            for name, each in (("systematic", errors.systematic), ("phase", errors.phase))
+            if each is not None
+        }
+        errors = dataclasses.replace(errors, **maps)
     if timeline is not None:
         timeline.write_file()
     seconds = {"assemble": middle - start, "resample": time.perf_counter() - middle}
@@ -242,9 +248,10 @@ def _with_range_outputs(sensor: Sensor, precision: Precision) -> LineReadout | P
     assert not isinstance(sensor.readout, FocusStack)  # it has no stream of profiles
     positions = ("position",) if isinstance(sensor.transport, RotatingSheet) else ("g", "h")
     light = "peak" if sensor.kind == "camera" else "total"
-    return dataclasses.replace(
-        sensor.readout, outputs=(*positions, light, "status", *sigma_outputs(sensor)), precision=precision
-    )
+    errors = sigma_outputs(sensor)
+    shape = ("width", "total") if errors and sensor.kind == "camera" else ()  # of the line, for the error of its phase
+    outputs = (*positions, light, "status", *shape, *errors)
+    return dataclasses.replace(sensor.readout, outputs=outputs, precision=precision)
 
 
 def _pipeline(

@@ -95,9 +95,14 @@ def test_the_commands_of_the_page_measure_the_volumes(
     assert np.all(np.abs(volume - true) < 3 * np.hypot(sigma, systematic))
     # The systematic sigma of 0.1 % of heights and of lengths, which count twice.
     np.testing.assert_allclose(systematic, np.abs(volume) * math.hypot(1e-3, 2e-3), rtol=1e-9)
-    # The sigma of the heights is that of the scan, which the noise of the camera gives.
+    # The sigma of the heights is that of the scan: the noise of the camera, and the phase of the line in its pixel.
     report = json.loads(Path("scan", "report.json").read_text())
     assert report["error_budget"]["measured"]["ratio"] == pytest.approx(1.0, abs=0.1)
-    noise = json.loads(Path("paste", "report.json").read_text())["noise_m"]
-    assert noise == pytest.approx(np.nanmedian(read_npz(Path("scan", "range_image.npz"))[0]["map_sigma"]), rel=0.1)
+    inspected, arrays = (
+        json.loads(Path("paste", "report.json").read_text()),
+        read_npz(Path("scan", "range_image.npz"))[0],
+    )
+    noise = inspected["noise_m"]
+    assert noise == pytest.approx(np.nanmedian(np.hypot(arrays["map_sigma"], arrays["map_phase"])), rel=0.1)
+    assert 0.9 < inspected["board_scatter_m"] / noise < 1.15
     assert [each["verdict"] for each in rows] == ["pass"] * 3 + ["low"] + ["pass"] * 3 + ["low"]

@@ -130,8 +130,8 @@ def test_a_line_that_stands_still(step: float, along: Any) -> None:
         frames = np.ascontiguousarray(frames.swapaxes(1, 2))
     camera = dataclasses.replace(sensor(), readout=LineReadout(along=along), frame=frames.shape[1:])
     threshold = open_for_scan(frames, camera).sensor.readout.threshold
-    # The unlit level and a quarter of the line's peak.
-    assert threshold == pytest.approx(10.0 + 25.0, abs=4.0)
+    # The unlit level and 6.2 standard deviations of the noise; the slow line adds to the differences.
+    assert 10.0 + 6.0 * NOISE <= threshold <= 10.0 + 14.0 * NOISE
 
 
 @pytest.mark.realdata

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 import tifffile
 
 from gpuvision.camera.camera import Camera
+from gpuvision.formats.height_files import read_heights
 from gpuvision.formats.range_image import read_ply
 from gpuvision.host import Device, to_numpy
 from gpuvision.ranging.range_image import RangeImage
@@ -316,3 +318,32 @@ def test_sensor_file_gives_noise_and_jitter(tmp_path: Path, kind: str) -> None:
     path.write_text(text.replace('kind = "straight"', 'kind = "straight"\njitter = -3e-6'))
     with pytest.raises(DescriptionError, match="jitter"):
         Sensor.from_section(read_toml(path))
+
+
+@pytest.mark.parametrize(("threshold", "more"), [(25.0, 1.1), pytest.param(46.0, 2.0, marks=pytest.mark.slow)])
+def test_the_map_scatters_by_noise_and_phase(
+    device: Device, threshold: float, more: float, tmp_path: Path, draws: Callable[[int, int], int]
+) -> None:
+    """A flat board: all profiles have the line at one place in the pixels, and noise alone is too small a sigma."""
+    sensor = noisy_camera(threshold=threshold, minimum_peak=None)
+    sensor = dataclasses.replace(sensor, readout=dataclasses.replace(sensor.readout, gain=0.0))
+    for seed in range(draws(1, 12)):
+        rng = np.random.default_rng([14, seed])
+        rows = 30.0 + rng.uniform() + (0.01 + 0.01 * rng.uniform()) * np.arange(480.0)
+        light = 8.0 + 150.0 * np.exp(-0.5 * ((np.arange(64)[:, None] - rows) / 1.4) ** 2)
+        frames = np.clip(np.rint(light + rng.normal(0.0, READ_NOISE, (40, 64, 480))), 0, 255).astype(np.uint8)
+        made = scan(frames, sensor, device=device)
+        made.write(tmp_path / str(seed))
+        read = read_heights(tmp_path / str(seed) / "range_image.npz")
+        z = read.z[5:-5, 20:-20].astype(np.float64)
+        x, y = np.meshgrid(np.linspace(-1.0, 1.0, z.shape[1]), np.linspace(-1.0, 1.0, z.shape[0]))
+        design = np.stack([np.ones(z.size), x.ravel(), y.ravel(), x.ravel() ** 2], axis=1)
+        known = np.isfinite(z.ravel())
+        residual = z.ravel()[known] - design[known] @ np.linalg.lstsq(design[known], z.ravel()[known])[0]
+        assert read.sigma is not None
+        assert 0.9 < np.std(residual) / np.sqrt(np.mean(read.sigma[5:-5, 20:-20].ravel()[known] ** 2)) < 1.15
+        assert made.heights.sigma is not None
+        assert np.std(residual) > more * np.nanmedian(to_numpy(made.heights.sigma))
+        budget = made.report()["error_budget"]
+        assert budget["map"]["phase"] == pytest.approx(np.nanmedian(made.errors.map_phase))
+        assert budget["measured"]["ratio"] < 1.1  # neighbouring profiles share the error of the phase

@@ -25,6 +25,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
 import hypothesis
 import hypothesis.configuration
 import numpy as np
@@ -199,6 +200,17 @@ def draws(request: pytest.FixtureRequest) -> Draws:
     """Number of draws of a statistic by tier: ``draws(fast, full)``, or ``draws(fast, full, nightly)``."""
     place = TIERS.index(request.config.getoption("tier"))
     return lambda *counts: counts[min(place, len(counts) - 1)]
+
+
+@pytest.fixture
+def unrendered_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw figures without rendering them in the fast tier: for commands whose pictures other tests look at.
+
+    Rendering and compressing a page takes 0.3 s of processor time, up to half of such a test.
+    """
+    if request.config.getoption("tier") == "fast":
+        blank = cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes()
+        monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda _figure, file, **_options: file.write(blank))
 
 
 @pytest.fixture

@@ -24,6 +24,8 @@ from gpuvision.workflows.simulating import load_part, prepare_simulation
 from mesh_heights import mesh_heights
 from scanning import Ran, check_refused
 
+pytestmark = pytest.mark.usefixtures("unrendered_pictures")
+
 Float64 = npt.NDArray[np.float64]
 
 
@@ -219,7 +221,7 @@ def test_the_threshold_of_the_recording(commands: Commands, noise: str) -> None:
     commands.table["line"] |= {"threshold": "auto"}
     commands.table["recording"] = {"background": "median"}  # the simulated frames have no background
     commands.write("sensor.toml", commands.table)
-    ran = commands.simulate("--profiles", 20, noise)
+    ran = commands.simulate("--profiles", 5, noise)
     assert ran.code == 0, ran.err
     sim = commands.folder / "sim"
     scanned = commands.scan(sim)

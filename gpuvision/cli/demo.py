@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 import tempfile
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gpuvision.cli.arguments import DeviceLabel, Overwrite, echo, named_path, progress_bar
+
+if TYPE_CHECKING:
+    from gpuvision.host import Device
+    from gpuvision.workflows.light_cache import SimulationTask
 
 
 def demo(
@@ -25,7 +29,6 @@ def demo(
     Light between the walls of the part's concave corners shifts the PSD readings; a mask computed for the part reduces
     the shift.
     """
-    import numpy as np
     from trimesh.exchange.ply import export_ply
 
     from gpuvision.host import Device
@@ -33,8 +36,6 @@ def demo(
     from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.demo import SENSORS, make_part, make_scan_task
     from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES
-    from gpuvision.workflows.scanning import scan
-    from gpuvision.workflows.simulated_recording import simulate_recording
     from gpuvision.workflows.simulating import simulate
     from gpuvision.workflows.simulation_result import simulation_files
 
@@ -51,16 +52,7 @@ def demo(
             file.write(export_ply(make_part()))
         for name in SENSORS:
             task = make_scan_task(name)
-            with progress_bar(f"{name}: simulating") as progress:
-                known = simulate(task, light_folder, seed=seed, device=chosen, progress=progress)
-            recording = simulate_recording(task, light_folder, seed=seed, device=chosen)
-            done = scan(recording, task.sensor, device=chosen)
-            known.write(inside / name)
-            done.write(inside / name, overwrite=True)  # the scan's range image takes the name of the simulated one
-            with atomic_write(inside / name / "recording.npy") as file:
-                np.save(file, recording)
-            results[name] = {"predicted": known.report(), **done.report()}
-            echo(f"{name}: {done.summary()}\n  {known.summary()}")
+            results[name] = _simulate_and_scan(name, task, inside / name, light_folder, seed, chosen)
         masked = simulate(task, light_folder, seed=seed, mask="best", device=chosen)
         masked.write(inside / masked_folder)
         results[masked_folder] = {"predicted": masked.report()}
@@ -76,3 +68,26 @@ def demo(
         f"{out / name / 'errors.png'} and causes.png in the same folder; with a mask: "
         f"{out / masked_folder / 'errors.png'}."
     )
+
+
+def _simulate_and_scan(
+    name: str, task: SimulationTask, folder: Path, light_folder: str, seed: int, device: Device
+) -> dict[str, Any]:
+    """Simulate the sensor over the part, scan the simulated recording, write both, and return the report."""
+    import numpy as np
+
+    from gpuvision.host.files import atomic_write
+    from gpuvision.workflows.scanning import scan
+    from gpuvision.workflows.simulated_recording import simulate_recording
+    from gpuvision.workflows.simulating import simulate
+
+    with progress_bar(f"{name}: simulating") as progress:
+        known = simulate(task, light_folder, seed=seed, device=device, progress=progress)
+    recording = simulate_recording(task, light_folder, seed=seed, device=device)
+    done = scan(recording, task.sensor, device=device)
+    known.write(folder)
+    done.write(folder, overwrite=True)  # the scan's range image takes the name of the simulated one
+    with atomic_write(folder / "recording.npy") as file:
+        np.save(file, recording)
+    echo(f"{name}: {done.summary()}\n  {known.summary()}")
+    return {"predicted": known.report(), **done.report()}

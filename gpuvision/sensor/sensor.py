@@ -227,6 +227,13 @@ class Sensor:
             if encoder_file is not None:
                 raise top.error("a focus stack has no transport; an encoder file has no effect on it")
             return cls._read_focus(top, name, recording)
+        return cls._read_sheet_of_light(top, kind, name, recording, encoder_file)
+
+    @classmethod
+    def _read_sheet_of_light(
+        cls, top: Section, kind: str, name: str, recording: Recording, encoder_file: Path | None
+    ) -> Sensor:
+        """Read a camera or PSD strips that view a sheet of light."""
         readout = top.section("line" if kind == "camera" else "psd")
         along: Along = readout.choice("along", ("columns", "rows"), "columns") if kind == "camera" else "columns"
         frame = _frame(top) if kind == "camera" else (readout.integer("strips", 1, at_least=1), 2)

@@ -120,18 +120,7 @@ def scan(
     points, errors = _points(sensor, fields, frame_numbers, stream.device)
     intensity = fields["peak" if sensor.kind == "camera" else "total"]
     middle = time.perf_counter()
-    sigma = None if errors is None else errors.random.z
-    heights, grid = resample_heights(sensor, points, intensity, stream.device, max_cells=limits.max_cells, sigma=sigma)
-    if errors is not None:
-        # Linear interpolation of systematic errors, as of the intensity: the errors of neighbours are the same.
-        maps = {
-            f"map_{name}": to_numpy(
-                resample_heights(sensor, points, each.z, stream.device, max_cells=limits.max_cells)[0].intensity
-            )
-            for name, each in (("systematic", errors.systematic), ("phase", errors.phase))
-            if each is not None
-        }
-        errors = dataclasses.replace(errors, **maps)
+    heights, grid, errors = _height_map(sensor, points, intensity, errors, stream.device, limits.max_cells)
     if timeline is not None:
         timeline.write_file()
     seconds = {"assemble": middle - start, "resample": time.perf_counter() - middle}
@@ -352,6 +341,28 @@ def _drop_ambiguous(sensor: Sensor, points: RangePoints) -> None:
         ambiguous = (to_numpy(points.status) & Status.AMBIGUOUS) != 0
         for coordinate in (points.x, points.y, points.z):
             to_numpy(coordinate)[ambiguous] = np.nan
+
+
+def _height_map(
+    sensor: Sensor,
+    points: RangePoints,
+    intensity: Array,
+    errors: ScanErrors | None,
+    device: Device,
+    max_cells: int,
+) -> tuple[HeightMap, Grid, ScanErrors | None]:
+    """Return the height map with its grid, and the errors with the systematic errors of the map."""
+    sigma = None if errors is None else errors.random.z
+    heights, grid = resample_heights(sensor, points, intensity, device, max_cells=max_cells, sigma=sigma)
+    if errors is not None:
+        # Linear interpolation of systematic errors, as of the intensity: the errors of neighbours are the same.
+        maps = {
+            f"map_{name}": to_numpy(resample_heights(sensor, points, each.z, device, max_cells=max_cells)[0].intensity)
+            for name, each in (("systematic", errors.systematic), ("phase", errors.phase))
+            if each is not None
+        }
+        errors = dataclasses.replace(errors, **maps)
+    return heights, grid, errors
 
 
 def resample_heights(

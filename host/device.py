@@ -342,6 +342,7 @@ class Device:
                 f"an array of shape {tuple(shape)} and dtype {dtype} takes {size_in_words(size)}, device {self.label} "
                 f"allocates at most {size_in_words(self.max_allocation)} at once; split the input"
             )
+        memory: Any
         try:
             if self.shares_memory:
                 memory = cl.SVMAllocation(self.context, size, 0, SHARED_FLAGS, queue)

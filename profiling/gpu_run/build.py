@@ -35,7 +35,7 @@ def run(device: Device, seconds: float) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     end = time.monotonic() + seconds
     with Worker() as worker:
-        count = worker.call(example_count, seconds=_SECONDS).value or 0
+        count = worker.call(example_count, device.label, seconds=_SECONDS).value or 0
         for number in range(count):
             if time.monotonic() > end:
                 break
@@ -46,21 +46,31 @@ def run(device: Device, seconds: float) -> dict[str, Any]:
 
 
 @functools.cache
-def _examples() -> list[Example]:
-    return [*ranging_builds.examples(), *matching_builds.examples(), *simulation_builds.examples()]
+def _examples(label: str) -> list[Example]:
+    """Return the examples with different sources or macros on a device, and the examples that the device refuses."""
+    device = Device.named(label)
+    found: dict[Any, Example] = {}
+    for example in (*ranging_builds.examples(), *matching_builds.examples(), *simulation_builds.examples()):
+        try:
+            launch = example.operation.launch(device, example.shape, np.dtype(example.dtype))
+        except (TypeError, ValueError):
+            found[example.name, type(example.operation)] = example
+        else:
+            found.setdefault((launch.source, tuple(options(launch.defines))), example)
+    return list(found.values())
 
 
-def example_count() -> int:
-    """Return the number of examples."""
-    return len(_examples())
+def example_count(label: str) -> int:
+    """Return the number of builds for a device."""
+    return len(_examples(label))
 
 
 def build_example(label: str, number: int) -> dict[str, Any]:
     """Build an example without the caches of pyopencl and return its row."""
-    device, example = Device.named(label), _examples()[number]
+    device, example = Device.named(label), _examples(label)[number]
     try:
         launch = example.operation.launch(device, example.shape, np.dtype(example.dtype))
-    except ValueError as error:  # such as float64 on a device without doubles
+    except (TypeError, ValueError) as error:  # such as float64 on a device without doubles
         return {"case": example.name, "operation": type(example.operation).__name__, "refused": str(error)}
     row: dict[str, Any] = {"case": example.name, "source": launch.source, "kernel": launch.kernel}
     verbose = ["-cl-nv-verbose"] if device.kind == "nvidia" else []

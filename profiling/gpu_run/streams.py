@@ -73,6 +73,7 @@ def overlap(events: Iterable[dict[str, Any]]) -> dict[str, float]:
     Returns
     -------
     dict
+        Empty where the runtime gives no device times (all events of rusticl have the same times).
         ``upload_share``, ``compute_share``, ``download_share``: time of the stage over the time from the first start to
         the last end. ``busy_share``: share of the time in which at least one stage runs. ``overlap``: 1 - busy time /
         sum of the stages' times: 0 where no two stages run at the same time, 2/3 where all three always do.
@@ -82,14 +83,14 @@ def overlap(events: Iterable[dict[str, Any]]) -> dict[str, float]:
         for stage in _STAGES
     }
     everything = sorted(span for each in spans.values() for span in each)
-    if not everything:
+    if not any(end > start for start, end in everything):
         return {}
     whole = max(max(end for _, end in everything) - everything[0][0], 1e-9)
     sums = {stage: sum(end - start for start, end in each) for stage, each in spans.items()}
     busy = _union(everything)
     shares = {f"{stage}_share": round(each / whole, 4) for stage, each in sums.items()}
-    together = 1.0 - busy / sum(sums.values()) if sum(sums.values()) else 0.0
-    return {**shares, "busy_share": round(busy / whole, 4), "overlap": round(together, 4)}
+    together = round(1.0 - busy / sum(sums.values()), 4)
+    return {**shares, "busy_share": round(busy / whole, 4), "overlap": together}
 
 
 def _union(spans: Sequence[tuple[float, float]]) -> float:
@@ -106,7 +107,7 @@ def upload_rate(device: Device, size: int, repeats: int = 10) -> float:
     queue, flags = device.new_queue(), cl.mem_flags
     pinned = cl.Buffer(device.context, flags.READ_WRITE | flags.ALLOC_HOST_PTR, size)
     access: Any = cl.map_flags.READ | cl.map_flags.WRITE
-    host = cl.enqueue_map_buffer(queue, pinned, access, 0, (size,), np.uint8)[0]
+    host = cl.enqueue_map_buffer(queue, pinned, access, 0, (size,), np.dtype(np.uint8))[0]
     host.fill(1)
     target = cl.Buffer(device.context, flags.READ_WRITE, size)
     times = []

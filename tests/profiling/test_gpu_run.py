@@ -6,6 +6,7 @@ import json
 import os
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -85,6 +86,7 @@ def test_overlap_of_stages() -> None:
     assert streams.overlap(gap)["busy_share"] == 0.5
     assert streams.overlap(gap)["overlap"] == pytest.approx(1 - 20 / 25)
     assert streams.overlap([]) == {}
+    assert streams.overlap([event("upload", 3, 0), event("compute", 3, 0)]) == {}, "a runtime without device times"
 
 
 @pytest.mark.slow
@@ -102,6 +104,20 @@ def test_device_times_and_the_copy(device: Device) -> None:
     assert (row["operation"], row["size"]) == ("psd", "1e+05")
     assert row["us"] > 0.0
     assert row["copy_us"] > 0.0
+
+
+def test_a_runtime_without_device_times_is_measured_by_the_host() -> None:
+    class Event:
+        profile = SimpleNamespace(start=5, end=5)
+
+        def wait(self) -> None:
+            time.sleep(1e-3)
+
+    seconds, clock = times.launch_seconds(Event)
+    assert clock == "host"
+    assert seconds > 1e-3
+    Event.profile = SimpleNamespace(start=5, end=2005)
+    assert times.launch_seconds(Event) == (pytest.approx(2e-6), "device")
 
 
 def test_every_operation_has_three_sizes() -> None:

@@ -69,6 +69,7 @@ MODULES = (
     "gpuvision.ranging.focus",
     "gpuvision.ranging.focus_noise",
     "gpuvision.ranging.focus_stack",
+    "gpuvision.ranging.line_phase",
     "gpuvision.ranging.polygon",
     "gpuvision.ranging.polygon_scan",
     "gpuvision.ranging.encoder",
@@ -199,7 +200,7 @@ def _mentioned(value: Any) -> Iterator[type]:
     for part in parts:
         inside = vars(part).items() if inspect.isclass(part) else ()
         members = [each for name, each in inside if name[0] != "_" or name in ("__init__", "__call__")]
-        for base in getattr(part, "__orig_bases__", ()):
+        for base in (*getattr(part, "__orig_bases__", ()), *getattr(part, "__bases__", ())):
             yield from _classes_in(base)
         for each in (part, *members):
             for wrapper in ("__func__", "fget", "func"):  # class methods, properties, cached properties
@@ -250,6 +251,10 @@ def _object_page(name: str, value: Any, documented: dict[str, Any]) -> str:
     head = title(name.rpartition(".")[2])
     if inspect.isclass(value):
         options = "   :members:\n   :exclude-members: Result\n   :show-inheritance:\n   :member-order: bysource\n"
+        # A class that is split over modules has the members of its parts, up to the first other base.
+        others = [each for each in value.__mro__[1:] if not each.__module__.startswith(f"{value.__module__}_")]
+        if others[0] not in value.__bases__[:1]:
+            options += f"   :inherited-members: {others[0].__name__}\n"
         return f"{head}\n.. autoclass:: {name}\n{options}"
     if inspect.isroutine(value):
         return f"{head}\n.. autofunction:: {name}\n"

@@ -35,6 +35,7 @@ _MIN_LAST_CACHE = 32 << 20
 # Kinds of runtimes whose compilers map vectors of 16 to the registers of a CPU. Mesa's rusticl calls its CPU device a
 # CPU too, and ends the process in such kernels ("LLVM ERROR: Unsupported vector type with 64 elements!", Mesa 22.3).
 _VECTOR_RUNTIMES = ("pocl", "intel")
+_WITHOUT_VECTORS = ("rusticl",)
 
 
 class Device:
@@ -55,6 +56,8 @@ class Device:
     prefers_vectors : bool
         Whether kernels run their vector variant by default: on the CPU devices of PoCL and Intel's runtime. Other
         runtimes run one work-item per element: some of them abort the process on vectors of 16, or spill them.
+    takes_vectors : bool
+        Whether kernels run their vector variant on request: not on Mesa's rusticl, whose compiler ends the process.
     shares_memory : bool
         Whether host and device read and write the same allocations without map or copy (fine-grained SVM).
     compute_units : int
@@ -81,6 +84,7 @@ class Device:
         self._may_reopen = queue is None
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
         self.prefers_vectors = self.is_cpu and kind in _VECTOR_RUNTIMES
+        self.takes_vectors = kind not in _WITHOUT_VECTORS
         self.compute_units = int(handle.max_compute_units)
         self.has_double = bool(handle.double_fp_config)
         self.max_allocation = int(handle.max_mem_alloc_size)

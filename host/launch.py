@@ -173,4 +173,6 @@ def uses_vectors(variant: Variant, device: Device) -> bool:
     """Decide between the vector variant of a kernel and one work-item per element."""
     if variant not in ("auto", "vector", "work_item"):
         raise ValueError(f"variant must be 'auto', 'vector' or 'work_item', got {variant!r}")
+    if variant == "vector" and not device.takes_vectors:
+        raise ValueError(f"device {device.label} does not run the vector variant of kernels; use variant='auto'")
     return device.prefers_vectors if variant == "auto" else variant == "vector"

@@ -31,6 +31,7 @@ import hypothesis.configuration
 import numpy as np
 import pytest
 
+from driver_faults import mark_faults
 from gpuvision.host import Device, debug
 from gpuvision.host.discovery import INSTALL_HINT
 from processor_time import record_test, table_of_files
@@ -81,6 +82,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if refused:
         config.hook.pytest_deselected(items=list(refused))
         items[:] = [item for item in items if item not in refused]
+    mark_faults(items)
     _set_examples(items, EXAMPLES[tier])
     if tier == "nightly":
         return

@@ -63,11 +63,11 @@ def _values(items: list[pytest.Item]) -> set[tuple[object, ...]]:
 )
 def test_a_device_runs_no_case_that_it_refuses(parameters: dict[str, Any], has_mark: bool, expected: str) -> None:
     for has_double in (False, True):
-        for prefers_vectors in (False, True):
-            device = SimpleNamespace(has_double=has_double, prefers_vectors=prefers_vectors)
+        for takes_vectors in (False, True):
+            device = SimpleNamespace(has_double=has_double, takes_vectors=takes_vectors)
             item: Any = SimpleNamespace(
                 callspec=SimpleNamespace(params={"device": device, **parameters}),
                 get_closest_marker=lambda name: has_mark and name == "double",
             )
-            lacking = {"doubles": not has_double, "vectors": not prefers_vectors}
+            lacking = {"doubles": not has_double, "vectors": not takes_vectors}
             assert bool(is_refused(item)) == lacking.get(expected, False)

@@ -96,7 +96,7 @@ def is_refused(item: pytest.Item) -> bool:
     values = [value for name, value in _parameters_of(item).items() if name != "device"]
     if not device.has_double and (item.get_closest_marker("double") or any(map(_is_double, values))):
         return True
-    return not device.prefers_vectors and any(_variant_of(value) == "vector" for value in values)
+    return not device.takes_vectors and any(_variant_of(value) == "vector" for value in values)
 
 
 def _is_double(value: Any) -> bool:

@@ -259,8 +259,11 @@ static inline edge_residual residual_at(laned_shape of, reals x, reals y, reals 
 #endif
 #define FOR_ALL(from, i) ((reals)((from)[i]))
 
-// Shapes through three edges each (first edges i, i + 1, ...), by Newton's method.
-static inline laned_shape shape_through(private const blob_circuit *circuit, int i, int j, int k, laned_shape shape) {
+// Shapes through three edges each (first edges i, i + 1, ...), by Newton's method. `start` is copied: Mesa 22.3 passes
+// structs by reference, so that a change of a parameter changes the variable of the caller.
+static inline laned_shape shape_through(private const blob_circuit *circuit, int i, int j, int k,
+                                        const laned_shape start) {
+    laned_shape shape = start;
     for (int step = 0; step < START_STEPS; step++) {
         const edge_residual one = RESIDUAL(shape, circuit, READ, i), two = RESIDUAL(shape, circuit, READ, j);
         const edge_residual three = RESIDUAL(shape, circuit, READ, k);

@@ -91,7 +91,11 @@ static inline normal_equations cofactors(normal_equations of) {
 //
 // The heading is scaled to a length, t / lever, with lever = 1 / (root-mean-square distance of the points): the damping
 // then affects all three unknowns equally.
-static inline float3 damped_step(normal_equations of, float damping, float lever) {
+//
+// The damping is added to a copy: Mesa 22.3 passes structs by reference, so that a change of a parameter changes the
+// variable of the caller.
+static inline float3 damped_step(const normal_equations undamped, float damping, float lever) {
+    normal_equations of = undamped;
     const float more = damping * (of.xx + of.yy + of.tt * lever * lever) + 1e-20f;
     of.xx += more;
     of.yy += more;

@@ -58,8 +58,13 @@ kernel void pose_sets(global const PoseRow *restrict rows,
     for (int i = 0; i < padded; i++) {
         global const PoseRow *row = rows + item * count + min(i, count - 1);
         int good = i < count;
-        for (int k = 0; k < (int)(sizeof(PoseRow) / sizeof(INPUT)); k++)
-            good &= !not_finite((real)((global const INPUT *)row)[k]);
+        // By field: Mesa 22.3 drops the index of a pointer to numbers that was cast from a pointer to a struct.
+        good &= !not_finite((real)row->normal_x) & !not_finite((real)row->normal_y) & !not_finite((real)row->x) &
+                !not_finite((real)row->y) & !not_finite((real)row->displacement_x) &
+                !not_finite((real)row->displacement_y) & !not_finite((real)row->sigma);
+#ifdef WITH_ETCH_BIAS
+        good &= !not_finite((real)row->etch_factor);
+#endif
         good &= row->sigma > 0;
         nx[i] = good ? row->normal_x : 0;
         ny[i] = good ? row->normal_y : 0;

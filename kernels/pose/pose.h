@@ -330,7 +330,12 @@ static inline pose_matrix pose_part(private const reals *triangle) {
 
 // Compute the least and the largest eigenvalue of a symmetric matrix by Jacobi rotations (5 sweeps, up to 6 x 6).
 // Returns the rank: the number of eigenvalues above `rank_tolerance` times the largest.
-static inline int eigenvalues(pose_matrix of, real rank_tolerance, private real *least, private real *largest) {
+//
+// The rotations work on a copy: Mesa 22.3 passes structs by reference, so that a change of a parameter changes the
+// variable of the caller.
+static inline int eigenvalues(const pose_matrix symmetric, real rank_tolerance, private real *least,
+                              private real *largest) {
+    pose_matrix of = symmetric;
     for (int sweep = 0; sweep < 5; sweep++)
         for (int p = 0; p < POSE_PARAMETERS - 1; p++)
             for (int q = p + 1; q < POSE_PARAMETERS; q++) {
@@ -364,7 +369,8 @@ static inline int eigenvalues(pose_matrix of, real rank_tolerance, private real 
 //
 // It is the minimum over v of (v^T M v) / (v^T A v), with the information matrices M of the inliers and A of all rows.
 // With the Cholesky factor A = L L^T, this is the least eigenvalue of L^-1 M L^-T. 0 where A is singular.
-static inline real least_inlier_fraction(pose_matrix inlier_matrix, pose_matrix all) {
+static inline real least_inlier_fraction(const pose_matrix of_inliers, const pose_matrix all) {
+    pose_matrix inlier_matrix = of_inliers; // a copy, as in `eigenvalues`
     real factor[POSE_PARAMETERS][POSE_PARAMETERS];
     for (int i = 0; i < POSE_PARAMETERS; i++)
         for (int j = 0; j <= i; j++) {

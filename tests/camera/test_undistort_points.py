@@ -118,6 +118,7 @@ def test_as_the_host_says(device: Device, model: Any, kernel: tuple[Any, ...], r
     assert assert_as_expected(operation, result, points).mean() > 0.9
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("name", ["all", "lens k1 k2"])
 @pytest.mark.parametrize("inverse", [False, True], ids=["undistort", "distort"])
 def test_the_other_two_ways(device: Device, name: str, inverse: bool, rng: np.random.Generator) -> None:
@@ -136,6 +137,7 @@ def test_another_matrix(device: Device, name: str, dtype: Any, inverse: bool, rn
     assert assert_as_expected(operation, operation(points, device=device), points).mean() > 0.9
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_double_arithmetic_on_single_points(device: Device, variant: Any, rng: np.random.Generator) -> None:
     operation = UndistortPoints(model=CAMERAS["all"], precision="double", variant=variant)
@@ -147,6 +149,7 @@ def test_double_arithmetic_on_single_points(device: Device, variant: Any, rng: n
         UndistortPoints(model=CAMERAS["all"], precision="single")(points.astype(float), device=device)
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("name", ["k1", "tangential", pytest.param("tilt", marks=pytest.mark.slow), "all"])
 def test_round_trip_in_double(device: Device, name: str, rng: np.random.Generator) -> None:
     points = image_points(rng)
@@ -216,6 +219,7 @@ def test_at_the_fold(device: Device, coefficients: tuple[float, ...], variant: A
     assert np.all(error <= 8e3 * np.finfo(dtype).eps * magnified)
 
 
+@pytest.mark.double
 def test_lens_at_its_fold(device: Device) -> None:
     lens = Lens(k1=-4e-7, k2=1e-14, centre=(640.0, 512.0))
     radius = lens.fold_radius * np.array([0.0, 0.5, 0.99, 0.9999, 1.0001, 1.5, 3.0])
@@ -230,6 +234,7 @@ def test_lens_at_its_fold(device: Device) -> None:
     np.testing.assert_allclose(back.points[:3], lens.distort(ideal[:3]), rtol=0, atol=1e-9)
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("seed", range(2))
 def test_wild_cameras_agree_with_the_host(device: Device, seed: int) -> None:
     """Random coefficients with arbitrary folds: kernel and host flag the same points and agree on the others."""
@@ -318,6 +323,7 @@ def test_far_points_are_flagged_or_finite(device: Device, model: Any, variant: A
     np.testing.assert_array_equal(np.isnan(result.points).all(axis=1), result.status != 0)
 
 
+@pytest.mark.double
 def test_behind_a_tilted_sensor(device: Device) -> None:
     given_ = camera(tilt=(45.0, 0.0))
     points = np.tile([[642.5, 509.25 + 1650.0 * 0.99], [642.5, 509.25 + 1650.0 * 1.01]], (10, 1))
@@ -381,6 +387,7 @@ def test_plane_polynomial(device: Device, dtype: Any, variant: Any, rng: np.rand
 # ---- errors -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.double
 def test_wrong_inputs(device: Device) -> None:
     operation = UndistortPoints(model=CAMERAS["k1"])
     with pytest.raises(TypeError, match="float32 or float64 points, got int64"):
@@ -405,6 +412,7 @@ def test_wrong_parameters(options: dict[str, Any], error: type[Exception], messa
         UndistortPoints(**options)
 
 
+@pytest.mark.double
 def test_against_a_converged_opencv(device: Device, rng: np.random.Generator) -> None:
     given_ = CAMERAS["all"]
     points = image_points(rng)

@@ -50,6 +50,7 @@ class Machine:
 
     def __init__(self, *, is_cpu: bool = True, has_double: bool = True) -> None:
         self.is_cpu, self.prefers_vectors, self.has_double = is_cpu, is_cpu, has_double
+        self.takes_vectors = True
         self.compute_units, self.cache_bytes = 2, 32 << 20
 
 
@@ -144,6 +145,11 @@ def test_variant_follows_the_device_unless_it_is_named() -> None:
     assert builder((15,)).work(15, each=16, group=64, least=16, grouping="fitted") == WorkSize((15,), (1,), 1)
     one_each = builder((15,), variant="work_item").work(15, each=16, group=64, grouping="per_element")
     assert one_each == group_per_element(15, 64)
+    without = Machine(is_cpu=False)
+    without.takes_vectors = False
+    assert not builder((100,), machine=without).uses_vectors
+    with pytest.raises(ValueError, match="device machine does not run the vector variant of kernels; use"):
+        _ = builder((100,), machine=without, variant="vector").uses_vectors
     with pytest.raises(ValueError, match="variant must be"):
         _ = builder((100,), variant="sideways").uses_vectors
 

@@ -153,5 +153,6 @@ def test_a_vector_variant_that_does_not_compile_is_replaced_by_work_items(
     np.testing.assert_allclose(bound.on_host((frames,)).image, expected(correct, frames), atol=1e-4)
     assert device.prefers_vectors == Device.named(device.label).prefers_vectors
     vectors = example["FlatField"](offset=correct.offset, gain=correct.gain, variant="vector")
-    with pytest.raises(BuildError, match="vectors of 16"):
+    expected_error = (BuildError, "vectors of 16") if device.takes_vectors else (ValueError, "does not run the vector")
+    with pytest.raises(expected_error[0], match=expected_error[1]):
         vectors.bind(device, frames.shape, frames.dtype)

@@ -112,6 +112,7 @@ def test_sizes_and_canaries(device: Device, shape: tuple[int, ...], variant: Any
         assert_close(like, operation, one, two)
 
 
+@pytest.mark.double
 def test_two_readings_agree_within_their_sigmas(device: Device) -> None:
     """Heights 0 and d with sigmas 3 and 4 um: the limit is 15 um; the mean is 9/25 of d."""
     d = np.array([14.9e-6, 15.1e-6], np.float64)
@@ -124,6 +125,7 @@ def test_two_readings_agree_within_their_sigmas(device: Device) -> None:
     np.testing.assert_array_equal(found.status, [0, Status.AMBIGUOUS])
 
 
+@pytest.mark.double
 def test_merged_noise_is_that_of_sigma(device: Device, rng: np.random.Generator) -> None:
     """The scatter of the mean of two maps is the predicted one, and of independent maps 0.3 % disagree."""
     one, two = (rng.uniform(1e-6, 1e-5, 200_000).astype(np.float64) for _ in range(2))
@@ -163,6 +165,7 @@ def height_map(z: np.ndarray, sigma: float | None = None) -> HeightMap:
     return HeightMap(z, np.ones_like(z), status, None if sigma is None else np.full_like(z, sigma))
 
 
+@pytest.mark.double
 def test_maps_over_different_grids(device: Device) -> None:
     """An occlusion of each map is filled by the other; cells outside both have no data."""
     first = Grid(left=0.0, top=0.01, cell_x=1e-3, cell_y=1e-3, columns=6, rows=4)

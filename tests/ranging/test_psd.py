@@ -187,6 +187,7 @@ def test_a_thousandfold_change_of_light_does_not_move_the_position(device):
     assert np.ptp(position) <= 2 * tolerance(np.float32)
 
 
+@pytest.mark.double
 def test_two_lights_meet_at_their_centre_of_gravity(device):
     places, powers = np.array([-1e-3, 2e-3]), np.array([1e-6, 0.5e-6])
     right = (powers * (0.5 + places / LENGTH)).sum()
@@ -209,6 +210,7 @@ def test_quantised_codes_err_within_their_predicted_sigma(device, rng, bits):
     assert np.std(scaled) == pytest.approx(1.0, abs=0.015)
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("model", ["independent", "opposed", "common"])
 @pytest.mark.parametrize("xi", [-0.9, 0.0, 0.5])
 def test_noise_models_predict_what_draws_scatter(device, rng, model, xi):
@@ -368,6 +370,7 @@ def test_a_spot_cut_by_the_end_of_the_strip_is_flagged(device, rng, variant, dty
         np.testing.assert_allclose(error, end * bias, rtol=0, atol=rounding[dtype])
 
 
+@pytest.mark.double
 def test_the_margin_is_a_parameter(device):
     """The limit is inclusive, and does not depend on load resistors; the default is three widths of the spot."""
     inner = 0.8
@@ -405,6 +408,7 @@ def test_ambient_light_pulls_to_the_electrical_centre_and_the_dark_level_undoes_
     assert undone == pytest.approx(0.3 * LENGTH, rel=1e-9)
 
 
+@pytest.mark.double
 def test_load_resistors_shrink_and_the_readout_undoes_it(device):
     shrunk = 0.6 / (1 + 2 * 1e3 / 50e3)
     pair = np.array([[0.5 - shrunk / 2, 0.5 + shrunk / 2]])
@@ -474,6 +478,7 @@ def test_sigma_travels_to_the_sheet(device, rng):
         assert np.isnan([noise[3, 7], systematic[3, 7]]).all()
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("variant", VARIANTS)
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
@@ -586,6 +591,7 @@ def test_a_scale_that_overflows_the_total_is_flagged(device):
     assert (reading.status == Status.SATURATED).all()
 
 
+@pytest.mark.double
 def test_precision_is_never_lowered_in_silence(device):
     with pytest.raises(TypeError, match="single"):
         PsdReadout(strip_length=LENGTH, precision="single")(np.ones((4, 2)), device=device)

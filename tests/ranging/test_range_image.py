@@ -137,6 +137,7 @@ def test_rays_meet_a_bent_sheet(device, rng, dtype, variant, sign):
     close(op(g, h, transport, given, device=device), *expected, tolerance=8 * 0.1 * np.finfo(dtype).eps)
 
 
+@pytest.mark.double
 def test_points_of_a_bent_sheet_and_rays_that_miss_it(device):
     """A point of the surface, seen by the camera, comes back; where the sheet bends away from the ray there is none."""
     bend = BentSheet.from_pose(
@@ -165,6 +166,7 @@ def test_points_of_a_bent_sheet_and_rays_that_miss_it(device):
         np.testing.assert_allclose(made.x[good], (g * (1.0 - share))[good], atol=1e-15)
 
 
+@pytest.mark.double
 def test_bent_sheets_beyond_the_pinhole_and_saddles(device):
     """The light lies between pinhole and sheet, on the intersection that a flat sheet that bends reaches first."""
     geometry = StraightTransport(bend=BentSheet(terms=(40.0, 0.0, 0.0), pinhole=(0.1, 0.0, 0.1)))
@@ -257,6 +259,7 @@ def test_a_rotating_sheet_before_a_calibrated_camera(device, rng, along, dtype, 
     close(made, points, status, 2.0 * depth_tolerance(op, points, facing, dtype))
 
 
+@pytest.mark.double
 def test_a_camera_without_distortion_is_the_pinhole(device, rng):
     pinhole = Camera(matrix=((900.0, 0.0, 511.5), (0.0, 900.0, 380.25), (0.0, 0.0, 1.0)))
     position, angles = rng.uniform(0, 1000, (3, 700)).astype(np.float32), np.array([-0.2, 0.0, 0.2], np.float32)
@@ -396,6 +399,7 @@ def test_bound_and_device_arrays_give_the_same(device, rng):
         np.testing.assert_array_equal(getattr(bound.outputs, name).get(), getattr(truth, name))
 
 
+@pytest.mark.double
 def test_double_is_asked_for_by_precision(device):
     g = np.full((1, 3), 0.1, np.float32)
     op = RangeImage(geometry=StraightTransport(), precision="double")

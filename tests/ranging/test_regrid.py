@@ -57,6 +57,7 @@ def test_groups_of_a_gpu_skip_the_lines_beyond_the_last(device):
     close(OP(*frames, device=gpu), OP(*frames, device=device), 0.0)
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("directions", [("x", "y"), ("-x", "y"), ("x", "-y"), ("-y", "-x"), ("y", "x")])
 def test_the_direction_of_the_scan_does_not_matter(device, directions):
     frames = flat((40, 61))
@@ -71,6 +72,7 @@ def test_the_direction_of_the_scan_does_not_matter(device, directions):
     close(made, truth, 1e-14)
 
 
+@pytest.mark.double
 def test_a_scan_against_its_direction_is_folded_all_over(device):
     x, y, z, intensity, status = flat((40, 61))
     made = dataclasses.replace(OP, along="-x")(x, y, z, intensity, status, device=device)
@@ -78,6 +80,7 @@ def test_a_scan_against_its_direction_is_folded_all_over(device):
     assert np.all(np.isnan(made.z))
 
 
+@pytest.mark.double
 def test_a_gap_stays_a_hole(device):
     frames = flat((40, 61))
     x, y, status = frames[0], frames[1], frames[4]
@@ -94,6 +97,7 @@ def test_a_gap_stays_a_hole(device):
     np.testing.assert_allclose(bridged.z, GRID.x + GRID.y[:, None] / 2, atol=1e-14)
 
 
+@pytest.mark.double
 def test_gaps_and_steps_are_joined_up_to_their_limits(device):
     """Two samples a quarter apart in x and an eighth in height; all numbers are exact."""
     x, y = np.broadcast_to([-0.5, -0.25], (3, 2)).copy(), np.broadcast_to([[-0.25], [0.0], [0.25]], (3, 2)).copy()
@@ -107,6 +111,7 @@ def test_gaps_and_steps_are_joined_up_to_their_limits(device):
         assert not is_joined or made.z[row, between] == 0.0625
 
 
+@pytest.mark.double
 def test_a_step_is_not_joined(device):
     x, y, z, intensity, status = flat((40, 61))
     z = np.where(x > 0.03, 0.3, 0.0)
@@ -118,6 +123,7 @@ def test_a_step_is_not_joined(device):
     assert np.all(np.isfinite(joined.z))
 
 
+@pytest.mark.double
 def test_flags_that_inform_ride_along(device):
     x, y, z, intensity, status = flat((40, 61))
     status[:, 30] = Status.SATURATED
@@ -148,6 +154,7 @@ def test_a_scan_that_turns_back_is_folded_where_it_does(device, dtype):
     assert np.all(kept.z == 0.5)
 
 
+@pytest.mark.double
 def test_of_two_surfaces_the_higher_one_is_kept(device):
     x = np.array([[0.0, 0.5, 1.0, 0.25, 0.75, 1.0]]).repeat(2, 0)
     z = np.array([[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]]).repeat(2, 0)
@@ -161,6 +168,7 @@ def test_of_two_surfaces_the_higher_one_is_kept(device):
     np.testing.assert_array_equal(flags, [0, 0] + [Status.NOT_INVERTIBLE] * 7)
 
 
+@pytest.mark.double
 def test_noise_within_the_tolerance_is_no_fold(device, rng):
     x, y, z, intensity, status = flat((40, 61))
     x = x + rng.uniform(-0.03, 0.03, x.shape)
@@ -170,6 +178,7 @@ def test_noise_within_the_tolerance_is_no_fold(device, rng):
     assert not np.any(made.status & Status.NOT_INVERTIBLE)
 
 
+@pytest.mark.double
 def test_samples_on_one_place_are_folded_there(device):
     x, y, z, intensity, status = flat((40, 61))
     x[:] = np.linspace(-1.0, 1.4, 61)
@@ -178,6 +187,7 @@ def test_samples_on_one_place_are_folded_there(device):
     np.testing.assert_array_equal(np.flatnonzero(made.status[3] == Status.NOT_INVERTIBLE), [8])
 
 
+@pytest.mark.double
 def test_a_fold_is_known_on_the_row_beside_it(device):
     """Cells exactly at a row use its intervals to both neighbours: a fold in either one flags the cell."""
     x, y, z, intensity, status = flat((7, 11))
@@ -294,6 +304,7 @@ def test_a_wrong_regrid_is_refused(change, message):
         dataclasses.replace(OP, **change)
 
 
+@pytest.mark.double
 def test_wrong_input_is_refused(device):
     x, y, z, intensity, status = flat((4, 5))
     with pytest.raises(TypeError, match="float32 or float64 points, got int64"):
@@ -309,6 +320,7 @@ def test_wrong_input_is_refused(device):
         bound(x)
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("along", ["x", "-y"])
 def test_sigma_is_the_effect_of_every_sample(device, rng, along):
     """The oracle perturbs one height after the other: the sum of (weight sigma)^2, by the float64 reference."""

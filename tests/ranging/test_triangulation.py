@@ -127,6 +127,7 @@ def test_device_arrays_and_bound(device: Device, rng: np.random.Generator) -> No
     np.testing.assert_array_equal(bound.outputs.h.get(), result.h.get())
 
 
+@pytest.mark.double
 def test_double_arithmetic_on_single_coordinates(device: Device, rng: np.random.Generator) -> None:
     operation = scanner(precision="double")
     u, v = (rng.uniform(*bounds, 999).astype(np.float32) for bounds in REGION)
@@ -152,6 +153,7 @@ def test_single_precision_stays_near_rounding_far_from_the_origin(device: Device
         np.testing.assert_allclose(value, expected, rtol=0, atol=atol)
 
 
+@pytest.mark.double
 def test_horizon(device: Device) -> None:
     # w = 1 - u / 100 about the middle of the region: the horizon lies at u = 100.
     operation = Triangulation(
@@ -165,6 +167,7 @@ def test_horizon(device: Device) -> None:
     assert np.all(np.isnan(result.g[3:]))
 
 
+@pytest.mark.double
 def test_sign_of_the_homography_does_not_matter(device: Device, rng: np.random.Generator) -> None:
     operation = scanner()
     turned = Triangulation(
@@ -212,6 +215,7 @@ def test_far_coordinates_are_finite_or_flagged(device: Device, lens: Lens | None
         np.testing.assert_array_equal(np.isfinite(result.g) & np.isfinite(result.h), result.status == 0)
 
 
+@pytest.mark.double
 def test_lens_at_its_fold(device: Device) -> None:
     lens = Lens(k1=-4e-6, centre=(640.0, 512.0))
     operation = scanner(lens=lens)
@@ -298,6 +302,7 @@ def test_fused_strips_take_positions_and_sample_numbers(
     np.testing.assert_allclose(sigma.get()[good], expected[good], rtol=64.0 * np.finfo(dtype).eps)
 
 
+@pytest.mark.double
 def test_single_beam(device: Device) -> None:
     operation = Triangulation.from_constants((2.0, 1e-3, 40.0), region=((-3e-3, 3e-3), (0.0, 0.0)))
     u = np.linspace(-3e-3, 3e-3, 11)

@@ -40,6 +40,7 @@ def errors(fits: LineFits, normal: np.ndarray, middle: np.ndarray) -> np.ndarray
     return np.stack([np.arctan(sine / cosine), offset], axis=-1)
 
 
+@pytest.mark.double
 @VARIANTS
 @pytest.mark.parametrize("loss", ["tukey", "huber", "ransac", "least_squares"])
 def test_lies_at_the_minimum_of_its_loss(device: Device, loss: Any, variant: Any, rng: np.random.Generator) -> None:
@@ -54,6 +55,7 @@ def test_lies_at_the_minimum_of_its_loss(device: Device, loss: Any, variant: Any
         assert fits.distance[number] == pytest.approx(found[1], abs=1e-5)
 
 
+@pytest.mark.double
 @VARIANTS
 @pytest.mark.parametrize(
     ("loss", "scale", "bad"),
@@ -77,6 +79,7 @@ def test_covariance_is_what_is_measured(
         assert np.median(fits.scale) == pytest.approx(NOISE, rel=0.2)
 
 
+@pytest.mark.double
 def test_single_follows_double(device: Device, rng: np.random.Generator) -> None:
     _, _, points = scene(rng, 37, 20, 0.3)
     points = points.astype(np.float32)
@@ -89,6 +92,7 @@ def test_single_follows_double(device: Device, rng: np.random.Generator) -> None
     np.testing.assert_allclose(single.covariance, double.covariance, rtol=1e-2, atol=1e-12)
 
 
+@pytest.mark.double
 @VARIANTS
 def test_sigmas_weigh(device: Device, variant: Any, rng: np.random.Generator) -> None:
     _, _, points = scene(rng, 3, 20, size=50.0)
@@ -105,6 +109,7 @@ def test_sigmas_weigh(device: Device, variant: Any, rng: np.random.Generator) ->
     np.testing.assert_array_equal(fits.weights, 1.0)
 
 
+@pytest.mark.double
 @VARIANTS
 def test_what_is_missing(device: Device, variant: Any, rng: np.random.Generator) -> None:
     _, _, points = scene(rng, 6, 20)
@@ -143,12 +148,14 @@ def test_exact_points_upright_and_level(device: Device, variant: Any) -> None:
     np.testing.assert_array_equal(fits.inliers, 8)
 
 
+@pytest.mark.double
 def test_too_few_agree(device: Device, rng: np.random.Generator) -> None:
     points = rng.uniform(0.0, 100.0, (20, 20, 2))
     fits = FitLines(scale=NOISE)(points, device=device)
     assert ((fits.status & Status.AMBIGUOUS) != 0).all()
 
 
+@pytest.mark.double
 @pytest.mark.parametrize(("variant", "lines"), [("vector", 1), ("vector", 17), ("work_item", 3), ("vector", 0)])
 def test_writes_within_its_outputs(device: Device, variant: Any, lines: int, rng: np.random.Generator) -> None:
     _, _, points = scene(rng, lines, 20)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -102,6 +103,7 @@ def test_rulers_that_find_nothing(device: Device, variant: Any, rng: np.random.G
     assert (np.abs(error(result)) < 5.0 * np.sqrt(np.diag(result.covariance))).all()
 
 
+@pytest.mark.double
 @VARIANTS
 def test_as_its_parts(device: Device, variant: Any, rng: np.random.Generator) -> None:
     image, (rulers, lines) = picture(rng), board_rulers()
@@ -122,6 +124,22 @@ def test_as_its_parts(device: Device, variant: Any, rng: np.random.Generator) ->
     assert (np.abs(result.placement - whole.placement) < 0.3 * deviation[:2]).all()
     assert abs(result.pose[2] - whole.pose[2]) < 0.3 * deviation[2]
     np.testing.assert_allclose(np.sqrt(np.diag(result.covariance)), deviation, rtol=0.1)
+
+
+@VARIANTS
+def test_forty_lines_of_one_ruler(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    """More lines than work-items of a group, and lines without an angle of their own."""
+    normal, point, along = artwork()
+    direction = np.stack([normal[:, 1], -normal[:, 0]], axis=-1)
+    at = (point[:, None] + along[..., None] * direction[:, None]).reshape(-1, 2)
+    which = np.linspace(0, LINES * EACH - 1, 40).astype(int)
+    rulers, lines = place_rulers(np.repeat(normal, EACH, axis=0)[which], at[which], np.zeros((40, 1)), MATRIX)
+    fix = replace(operation(variant), lines=40, rulers_per_line=1)
+    result = fix(picture(rng), rulers, lines, device=device)
+    assert result.status == Status.OK
+    np.testing.assert_array_equal(result.edge_status, Status.OK)
+    assert result.rank == 3
+    assert (np.abs(error(result)) < 5.0 * np.sqrt(np.diag(result.covariance))).all()
 
 
 @VARIANTS

@@ -66,6 +66,7 @@ def errors(result: BoardPose, truth: np.ndarray) -> np.ndarray:
     return np.column_stack([result.placement, result.pose[:, 2]]) - placed(truth)
 
 
+@pytest.mark.double
 @VARIANTS
 @pytest.mark.parametrize(
     ("loss", "transform"), [("tukey", "rigid"), ("huber", "similarity"), ("least_squares", "affine")]
@@ -180,6 +181,7 @@ def test_as_many_rows_as_unknowns_have_the_covariance_of_their_sigmas(
     np.testing.assert_allclose(checked.leverage[good], 1.0, atol=1e-6)
 
 
+@pytest.mark.double
 def test_single_follows_double(device: Device, rng: np.random.Generator) -> None:
     _, rows = scene(rng, 20, 32, bad=0.3)
     rows = rows.astype(np.float32)
@@ -191,6 +193,7 @@ def test_single_follows_double(device: Device, rng: np.random.Generator) -> None
     np.testing.assert_allclose(single.covariance[:, 0, 0], double.covariance[:, 0, 0], rtol=0.02)
 
 
+@pytest.mark.double
 @VARIANTS
 def test_points_of_a_board_turned_far(device: Device, variant: Any, rng: np.random.Generator) -> None:
     point = MIDDLE + rng.uniform(-0.01, 0.01, (6, 2))
@@ -206,6 +209,7 @@ def test_points_of_a_board_turned_far(device: Device, variant: Any, rng: np.rand
     np.testing.assert_allclose(result.pose, [0.02, -0.03, -3.0], atol=1e-10)
 
 
+@pytest.mark.double
 @VARIANTS
 def test_covariance_of_points_in_closed_form(device: Device, variant: Any) -> None:
     """Points on a circle about the placement point: x and y have sigma^2/n, theta sigma^2/(n r^2)."""
@@ -247,6 +251,7 @@ def test_refuses_what_the_features_cannot_carry(
     assert np.isfinite(result.pose[5]).all()
 
 
+@pytest.mark.double
 def test_a_start_that_is_no_number(device: Device, rng: np.random.Generator) -> None:
     _, rows = scene(rng, 2, 32)
     initial_pose = np.zeros((2, 3))
@@ -256,6 +261,7 @@ def test_a_start_that_is_no_number(device: Device, rng: np.random.Generator) -> 
     assert np.isnan(result.pose[1]).all()
 
 
+@pytest.mark.double
 def test_missing_rows_are_as_if_they_were_not_there(device: Device, rng: np.random.Generator) -> None:
     _, rows = scene(rng, 2, 40)
     without = SolvePose(loss="least_squares")(np.ascontiguousarray(rows[:, :30]), device=device)
@@ -267,6 +273,7 @@ def test_missing_rows_are_as_if_they_were_not_there(device: Device, rng: np.rand
     assert not result.weights[:, 30:].any()
 
 
+@pytest.mark.double
 def test_fitted_lines_carry_their_angle(device: Device, rng: np.random.Generator) -> None:
     """Poses from fitted lines agree with poses from the edges of the lines."""
     lines, each = 12, 20
@@ -303,6 +310,7 @@ def etched(rng: np.random.Generator, boards: int, count: int, bad: float) -> tup
     return truth, etch, np.concatenate([rows, etch_factor[..., None]], axis=-1)
 
 
+@pytest.mark.double
 @VARIANTS
 def test_an_etching_is_one_more_unknown(device: Device, variant: Any, rng: np.random.Generator) -> None:
     truth, etch, rows = etched(rng, 500, 40, 0.3)
@@ -325,6 +333,7 @@ def test_an_etching_is_one_more_unknown(device: Device, variant: Any, rng: np.ra
     assert np.mean(np.append(wrong, np.ones(np.sum(~seen), bool))) > 0.5
 
 
+@pytest.mark.double
 def test_an_etching_takes_as_much_as_least_squares_say(device: Device, rng: np.random.Generator) -> None:
     _, _, rows = etched(rng, 1, 24, 0.0)
     found = SolvePose(placement=(0.0, 0.0), loss="least_squares", etch_bias_sigma=ETCH)(rows, device=device)
@@ -359,6 +368,7 @@ def test_an_etch_bias_is_at_the_minimum_of_loss_and_prior(
         np.testing.assert_allclose(found.pose[board], expected[:3], atol=1e-8)
 
 
+@pytest.mark.double
 @VARIANTS
 def test_the_condition_is_compared_with_its_limit(device: Device, variant: Any, rng: np.random.Generator) -> None:
     """Edges fix y 50 times worse than x: accepted up to this ratio of standard deviations."""
@@ -373,6 +383,7 @@ def test_the_condition_is_compared_with_its_limit(device: Device, variant: Any, 
         assert np.isnan(found.pose).all() == (status != Status.OK)
 
 
+@pytest.mark.double
 @VARIANTS
 def test_refuses_what_nothing_checks(device: Device, variant: Any, rng: np.random.Generator) -> None:
     """Few edges among many determine x: one edge, two edges of which one is wrong, three edges."""
@@ -395,6 +406,7 @@ def test_refuses_what_nothing_checks(device: Device, variant: Any, rng: np.rando
     assert not lenient.status.any()
 
 
+@pytest.mark.double
 def test_refuses_a_pose_out_of_where_was_looked(device: Device, rng: np.random.Generator) -> None:
     truth, rows = scene(rng, 2, 32)
     moved = np.hypot(*(placed(truth)[:, :2] - PLACE).T)
@@ -406,6 +418,7 @@ def test_refuses_a_pose_out_of_where_was_looked(device: Device, rng: np.random.G
             assert np.isnan(result.pose).all() == (result.status != Status.OK)
 
 
+@pytest.mark.double
 @VARIANTS
 def test_writes_within_its_outputs(device: Device, variant: Any, rng: np.random.Generator) -> None:
     _, rows = scene(rng, 3, 33)

@@ -72,6 +72,7 @@ def expected_reflectance(
     )
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("variant", ["vector", "work_item"])
 def test_images_are_those_of_the_reference(pads: ReflectanceMap, device: Device, variant: Any) -> None:
     """Everything at once: motion, mirrored view, lens, illumination, glare, and all terms of the sensor."""
@@ -140,6 +141,7 @@ def test_without_a_sensor_images_are_reflectances(
     assert np.isfinite(images[2]).all()
 
 
+@pytest.mark.double
 def test_edges_lie_where_the_artwork_and_the_pose_put_them(device: Device) -> None:
     """A half-plane under many poses: the image equals the closed form, and its half level lies on the edge."""
     blur, centre = 0.6, np.array([0.05, 0.05])
@@ -194,6 +196,7 @@ def flat(level: float) -> ReflectanceMap:
     return ReflectanceMap(values=values, origin=(0.0, 0.0), cell=PIXEL / 4, pixel=PIXEL, blur_px=0.5)
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("level", [0.0, 0.01, 0.5])
 def test_noise_has_the_variance_of_the_sensor(device: Device, level: float) -> None:
     op = RenderBoard(board=flat(level), shape=(64, 64), sensor=PLAIN, electrons=4000.0, seed=3)
@@ -210,6 +213,7 @@ def test_noise_has_the_variance_of_the_sensor(device: Device, level: float) -> N
         assert abs(np.mean(a * b)) < 4.5 / 256
 
 
+@pytest.mark.double
 def test_seed_and_number_select_the_noise(pads: ReflectanceMap, device: Device) -> None:
     op = RenderBoard(board=pads, shape=SHAPE, sensor=PLAIN, seed=1)
     pose = motion(1)[None]
@@ -244,6 +248,7 @@ def test_wrong_parameters_are_refused(change: dict[str, Any], error: type[Except
         RenderBoard(**{"board": flat(0.5), "shape": SHAPE, **change})
 
 
+@pytest.mark.double
 def test_wrong_poses_are_refused(device: Device) -> None:
     op = RenderBoard(board=flat(0.5), shape=SHAPE)
     for shape in ((1, 3), (1, 65, 3), (0, 1, 3), (1, 1, 2)):

@@ -49,6 +49,7 @@ def strips(triangles: Any, count: int, each: int) -> Any:
     return np.concatenate([place, np.where(normal[number][..., 2:] < -0.5, -1.0, 1.0) * normal[number]], axis=2)
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("tolerance", [0.0, 1e-6, 1e-5, 1e-4])
 def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
     triangles, segments = boxes(np.random.default_rng(0), 12)
@@ -72,6 +73,7 @@ def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
         np.testing.assert_allclose(ours.irradiance, exact, rtol=2e-5, atol=1e-6 * exact.max())
 
 
+@pytest.mark.double
 def test_pairs_that_are_left_out_are_dark(device: Device) -> None:
     triangles, segments = boxes(np.random.default_rng(0), 3)
     receivers = strips(triangles, 2, 16)
@@ -104,6 +106,7 @@ def groove(strips: int, each: int, segments: int) -> Any:
     return Scene(triangles), rows, receivers, np.stack([power, power * Y], axis=2), reading
 
 
+@pytest.mark.double
 def test_where_clustering_costs_more_all_pairs_are_computed(device: Device) -> None:
     scene, segments, receivers, weights, reading = groove(8, 40, 50)
     exact = OccludedIrradiance(scene=scene, segments=len(segments), precision="single")(
@@ -127,6 +130,7 @@ def test_where_clustering_costs_more_all_pairs_are_computed(device: Device) -> N
     np.testing.assert_allclose(by_cut, exact, rtol=2e-5, atol=1e-6 * exact.max())
 
 
+@pytest.mark.double
 def test_what_faces_each_other_decides_whether_there_is_a_plan(device: Device) -> None:
     scene, segments, receivers, weights, reading = groove(8, 40, 50)
     pairs = receivers[..., 0].size * len(segments)

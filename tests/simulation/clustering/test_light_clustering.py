@@ -84,6 +84,7 @@ def off_by(cut: LightCut, receivers: Any, weights: Any, reading: StripErrorModel
     return SLOPE * np.abs(readings[0] - readings[1])
 
 
+@pytest.mark.double
 @TWO_WAYS
 @given(rng=PLACES, exponent=st.floats(-8.0, -3.0), count=st.integers(1, 40))
 @ON_DEVICES
@@ -143,6 +144,7 @@ def test_a_cluster_keeps_the_power_of_segments_side_by_side() -> None:
     assert tree.power == pytest.approx(0.2)
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_tolerance_zero_leaves_out_nothing_that_shines(device: Device, variant: Any) -> None:
     rng = np.random.default_rng(3)
@@ -183,6 +185,7 @@ def planes(*, wall: bool = False) -> Scene:
     return Scene(np.array(corners))
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_work_falls_as_the_tolerance_rises(device: Device, variant: Any) -> None:
     segments, receivers, weights, reading = valley(64, 8, 64)
@@ -199,6 +202,7 @@ def test_work_falls_as_the_tolerance_rises(device: Device, variant: Any) -> None
     assert not cut.has_pairs
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_far_light_is_one_cluster_for_each_wall(device: Device, variant: Any) -> None:
     """At 50 times its size, light that cannot be left out is replaced by one segment for each wall of the groove."""
@@ -234,6 +238,7 @@ def test_a_strip_that_rises_through_the_plane_of_the_light_is_lit(device: Device
         assert cut.bound_if_omitted[0] >= SLOPE * abs(least[0]) > 0.0
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_a_roof_over_an_end_of_a_cluster_is_seen(device: Device, variant: Any) -> None:
     """The edge of the roof, of either winding and on either side, passes over the lit line off its middle."""
@@ -285,6 +290,7 @@ def test_bounds_hold_far_from_the_origin(device: Device, dtype: Any, with_scene:
     assert np.all(off_by(cut, given.astype(float), weights, reading, segments) <= cut.bound + 1e-13)
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_nothing_hides_in_an_empty_groove(device: Device, variant: Any) -> None:
     """The walls of the groove are within the hulls, but never between a receiver and a lit line."""
@@ -313,6 +319,7 @@ def on_triangles(rng: np.random.Generator, triangles: Any, count: int) -> tuple[
     return np.einsum("nek,nkx->nex", weights, corners), normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
+@pytest.mark.double
 @TWO_WAYS
 @given(rng=PLACES, exponent=st.floats(-7.0, -4.0))
 @ON_DEVICES
@@ -342,6 +349,7 @@ def test_what_is_clear_is_seen(device: Device, variant: Any, rng: Any, exponent:
     assert np.all(SLOPE * np.abs(exact - ours) <= cut.bound + 1e-15)
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_a_wall_in_the_groove_is_seen(device: Device, variant: Any) -> None:
     segments, receivers, weights, reading = valley(32, 4, 32)

@@ -166,6 +166,7 @@ def without_clusters() -> Inputs:
     return Inputs(lit_segments(rng, 8, 0.03), receivers, costs, np.full(2, 0.1), clusters=False)
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_bounds_without_occluders(device: Device, variant: Any) -> None:
     expected = compare(device, variant, without_occluders)
@@ -173,6 +174,7 @@ def test_bounds_without_occluders(device: Device, variant: Any) -> None:
     assert sum(0 < each.tallies[0] < 21 for each in expected) >= 10
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_triangles_that_may_occlude(device: Device, variant: Any) -> None:
     expected = compare(device, variant, with_occluders)

@@ -102,6 +102,7 @@ def test_any_as_every_triangle_says(
     assert sure.mean() > 0.5
 
 
+@pytest.mark.double
 @ON_DEVICES
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 80), size=st.sampled_from([1e-3, 0.1, 2.0]))
 def test_any_soup(device: Device, seed: int, count: int, size: float) -> None:
@@ -278,6 +279,7 @@ def test_ends_do_not_occlude_within_the_clearance(device: Device, variant: Any, 
     assert not AnyHit(scene=both, variant=variant)(touching, device=device).occluded.any()
 
 
+@pytest.mark.double
 def test_far_from_the_origin_in_single(device: Device, rng: np.random.Generator) -> None:
     """The centre of the scene is subtracted in double: details of a micrometre survive at distances of kilometres."""
     corners, away = soup(rng, 200), np.array([5000.0, -3000.0, 1000.0])
@@ -289,6 +291,7 @@ def test_far_from_the_origin_in_single(device: Device, rng: np.random.Generator)
     assert_closest(corners, rays, hits)
 
 
+@pytest.mark.double
 @WAYS
 def test_rays_from_afar(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
     """Rays from a distance of a million scene sizes give the same hits in single precision as rays from nearby."""

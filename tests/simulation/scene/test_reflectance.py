@@ -158,6 +158,7 @@ def test_devices_as_the_host(device: Device, name: str, dtype: Any, variant: Any
     assert np.all(result.value[:100] == 0.0)
 
 
+@pytest.mark.double
 @TWO_WAYS
 @pytest.mark.parametrize("name", MODELS)
 def test_not_finite(device: Device, name: str, variant: Any) -> None:
@@ -168,6 +169,7 @@ def test_not_finite(device: Device, name: str, variant: Any) -> None:
     np.testing.assert_array_equal(np.isnan(result.value), np.isnan(MODELS[name].value(pairs)))
 
 
+@pytest.mark.double
 @TWO_WAYS
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 31, 63, 64, 65, 4097])
 def test_sizes_and_canaries(device: Device, count: int, variant: Any, rng: np.random.Generator) -> None:

@@ -59,6 +59,7 @@ def test_parts_as_the_reference_says(
     assert several > 30
 
 
+@pytest.mark.double
 def test_parts_as_shadow_rays_say(device: Device, rng: np.random.Generator) -> None:
     scene = Scene.of(trimesh.creation.torus(1.0, 0.3, major_sections=40, minor_sections=20))
     fans = some_fans(rng, 200, True)
@@ -147,6 +148,7 @@ def test_more_hidden_intervals_than_there_is_room_for(device: Device, variant: A
             assert np.isnan(result.intervals).all()
 
 
+@pytest.mark.double
 def test_writes_only_its_outputs(device: Device, rng: np.random.Generator) -> None:
     op = VisibleIntervals(scene=Scene(soup(rng, 50)))
     for shape in ((0,), (1,), (3, 7), (65,)):

@@ -50,6 +50,7 @@ def on_wall(b: Any, omega: float) -> np.ndarray:
     return np.column_stack([b * c, 0.0 * b, b * s, *(np.full_like(b, v) for v in (s, 0.0, -c))])
 
 
+@pytest.mark.double
 @WEDGES
 @PRECISIONS
 def test_wedge_by_lines(device: Device, degrees: float, precision: Any) -> None:
@@ -59,6 +60,7 @@ def test_wedge_by_lines(device: Device, degrees: float, precision: Any) -> None:
     np.testing.assert_allclose(light(on_wall(b, omega), device=device).irradiance, exact, rtol=TO[precision])
 
 
+@pytest.mark.double
 @WEDGES
 @PRECISIONS
 def test_wedge_by_patches(device: Device, degrees: float, precision: Any) -> None:
@@ -75,6 +77,7 @@ def test_wedge_by_patches(device: Device, degrees: float, precision: Any) -> Non
     np.testing.assert_allclose(factors, exact, atol=close, rtol=0)
 
 
+@pytest.mark.double
 @WEDGES
 def test_power_on_the_other_wall(device: Device, degrees: float) -> None:
     """M (1 + cos(omega)) / 2 of a line reaches an infinite wall: the form factor from its points to the wall."""
@@ -101,6 +104,7 @@ def gauss_in_log(beta: float, nodes: int) -> tuple[np.ndarray, np.ndarray]:
     return np.exp(t), weights * np.exp(t)
 
 
+@pytest.mark.double
 @PRECISIONS
 @pytest.mark.parametrize(
     ("beta", "known"), [(1, 0.594984), (2, 0.993527), (5, 1.656779), (10, 2.224535), (100, 4.341808)]
@@ -116,6 +120,7 @@ def test_centroid_of_a_window_in_a_corner(device: Device, beta: float, known: fl
     assert moment / power == pytest.approx(known, abs=5.01e-7 if precision == "double" else 5e-6)
 
 
+@pytest.mark.double
 def test_brightest_place_in_a_corner(device: Device) -> None:
     light = LineIrradiance(segments=line((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
     b = math.sqrt(0.5) + np.linspace(-1e-3, 1e-3, 33)
@@ -124,6 +129,7 @@ def test_brightest_place_in_a_corner(device: Device) -> None:
     assert got[16] == pytest.approx(1.0 / (3.0 * math.sqrt(3.0)), rel=1e-12)
 
 
+@pytest.mark.double
 def test_how_the_power_in_a_window_converges(device: Device) -> None:
     """Midpoint errors are 1 / n^2; Gauss-Legendre in ln(b) gains digits with every node."""
     light = LineIrradiance(segments=line((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
@@ -139,6 +145,7 @@ def test_how_the_power_in_a_window_converges(device: Device) -> None:
     assert gauss[-1] < 3e-9
 
 
+@pytest.mark.double
 @PRECISIONS
 def test_perpendicular_rectangle(device: Device, precision: Any) -> None:
     """Rectangle of width a and height b, at distance c from an element at the foot of the corner."""
@@ -155,6 +162,7 @@ def test_perpendicular_rectangle(device: Device, precision: Any) -> None:
             assert got[0, 0] == pytest.approx(0.05573420, abs=5e-9 if precision == "double" else 5e-8)
 
 
+@pytest.mark.double
 def test_squares_that_face_each_other_and_that_meet(device: Device) -> None:
     """Form factors between squares by Gauss-Legendre over one of them; adjacent squares have an edge singularity."""
     square = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, 0.0, 1.0]])
@@ -214,6 +222,7 @@ def extrapolated(values: list[np.ndarray]) -> np.ndarray:
     return (16.0 * once[1] - once[0]) / 15.0
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("albedo", list(PLATES))
 def test_parallel_plates_with_all_bounces(device: Device, albedo: float) -> None:
     """Equal to the table to its last digit; plates 600 gaps wide leave an error of 1e-7 for albedos up to 0.95."""
@@ -224,6 +233,7 @@ def test_parallel_plates_with_all_bounces(device: Device, albedo: float) -> None
         assert solutions[-1][1] == pytest.approx(1.0 / (1.0 - albedo**2), rel=1e-3)
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("albedo", [*CORNER, 1.0])
 def test_corner_with_all_bounces(device: Device, albedo: float) -> None:
     """Equal to the table to its last digit, and to the solved convolution, also for white walls."""
@@ -240,6 +250,7 @@ def sphere(finer: int, height: float = 1.0) -> tuple[Patches, Scene]:
     return Patches(triangles), Scene(triangles)
 
 
+@pytest.mark.double
 def test_any_two_places_in_a_sphere(device: Device) -> None:
     """The form factor is dA / (4 pi R^2) for any two places; flat facets agree to first order, the total exactly."""
     errors = []

@@ -76,6 +76,7 @@ def test_finer_bins_and_samples_add_up(rng: np.random.Generator) -> None:
 # ---- visibility: rays against every triangle -------------------------------------------------------------
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("source", [None, (0.005, 0.3)])
 @pytest.mark.parametrize("lens", [None, Lens(k1=-900.0, centre=(1e-4, -2e-4))])
 def test_as_rays_to_the_lens_say(device: Device, source: Any, lens: Lens | None, rng: np.random.Generator) -> None:

@@ -164,6 +164,7 @@ def test_the_quadrature_is_the_closed_form(rng: np.random.Generator) -> None:
 # ---- closed forms ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.double
 @TWO_WAYS
 @PRECISIONS
 @pytest.mark.parametrize("name", KNOWN)
@@ -176,6 +177,7 @@ def test_known_values(device: Device, name: str, variant: Any, precision: Any) -
     np.testing.assert_allclose(result.irradiance, 4 * list(table.values()), rtol=tolerance)
 
 
+@pytest.mark.double
 @TWO_WAYS
 @PRECISIONS
 def test_any_geometry(device: Device, variant: Any, precision: Any, rng: np.random.Generator) -> None:
@@ -184,6 +186,7 @@ def test_any_geometry(device: Device, variant: Any, precision: Any, rng: np.rand
     assert 0.1 < np.mean(value > 0.0) < 0.6
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_many_pairs_against_the_quadrature(device: Device, variant: Any, rng: np.random.Generator) -> None:
     _, segments = pairs(rng, 37)
@@ -194,6 +197,7 @@ def test_many_pairs_against_the_quadrature(device: Device, variant: Any, rng: np
         assert np.all(np.abs(result.irradiance - value) <= tolerance * most)
 
 
+@pytest.mark.double
 @TWO_WAYS
 @PRECISIONS
 def test_segments_that_lie_alike(device: Device, variant: Any, precision: Any, rng: np.random.Generator) -> None:
@@ -216,6 +220,7 @@ def test_segments_that_lie_alike(device: Device, variant: Any, precision: Any, r
 FLOOR = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 
 
+@pytest.mark.double
 @TWO_WAYS
 @PRECISIONS
 @pytest.mark.parametrize("distance", [1e-1, 1e-3, 1e-6, 1e-9])
@@ -232,6 +237,7 @@ def test_at_a_millionth_of_its_length(
     assert_exact(np.array(receivers, np.float32), lit(FLOOR), device, variant, precision)
 
 
+@pytest.mark.double
 @TWO_WAYS
 @PRECISIONS
 def test_grazing(device: Device, variant: Any, precision: Any, rng: np.random.Generator) -> None:
@@ -243,6 +249,7 @@ def test_grazing(device: Device, variant: Any, precision: Any, rng: np.random.Ge
     assert_exact(*moved_scene(np.array(low + tilted), FLOOR, random_rotation(rng), 0.3), device, variant, precision)
 
 
+@pytest.mark.double
 @TWO_WAYS
 @PRECISIONS
 def test_end_on(device: Device, variant: Any, precision: Any) -> None:
@@ -254,6 +261,7 @@ def test_end_on(device: Device, variant: Any, precision: Any) -> None:
     np.testing.assert_allclose(result.irradiance, value, rtol=2e-6 if precision == "single" else 1e-9)
 
 
+@pytest.mark.double
 @TWO_WAYS
 @PRECISIONS
 def test_lengths_a_million_to_one(device: Device, variant: Any, precision: Any, rng: np.random.Generator) -> None:
@@ -268,6 +276,7 @@ def test_lengths_a_million_to_one(device: Device, variant: Any, precision: Any, 
         assert_exact(receivers, one, device, variant, precision)
 
 
+@pytest.mark.double
 @TWO_WAYS
 @PRECISIONS
 def test_through_the_receivers_plane(device: Device, variant: Any, precision: Any, rng: np.random.Generator) -> None:
@@ -281,6 +290,7 @@ def test_through_the_receivers_plane(device: Device, variant: Any, precision: An
     assert_exact(*moved_scene(upright, FLOOR, random_rotation(rng), 0.7), device, variant, precision)
 
 
+@pytest.mark.double
 @TWO_WAYS
 @PRECISIONS
 def test_in_the_lit_plane_and_behind(device: Device, variant: Any, precision: Any) -> None:
@@ -300,6 +310,7 @@ def test_in_the_lit_plane_and_behind(device: Device, variant: Any, precision: An
     np.testing.assert_array_equal(result.status, 0)
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_no_light(device: Device, variant: Any) -> None:
     receivers = np.tile((0.5, 0.1, 0.1, 0.0, 0.0, -1.0), (20, 1))
@@ -329,6 +340,7 @@ def test_not_finite(device: Device, variant: Any, dtype: Any) -> None:
     np.testing.assert_array_equal(result.irradiance[20:], other.irradiance[20:])
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_neighbours_do_not_count(device: Device, variant: Any, rng: np.random.Generator) -> None:
     """A receiver's result is bit-equal next to far, near and clipped neighbours."""
@@ -354,6 +366,7 @@ def test_sizes_and_canaries(device: Device, count: int, variant: Any, rng: np.ra
     assert np.all(guarded.out.status == 0)
 
 
+@pytest.mark.double
 @ON_DEVICES
 @given(shape=st.lists(st.integers(1, 20), max_size=3), variant=st.sampled_from(VARIANTS), seed=st.integers(0, 9))
 @example(shape=[19, 16, 6], variant="vector", seed=3)  # a receiver 3e-5 of its distance above a segment's surface
@@ -372,6 +385,7 @@ def test_any_shape(device: Device, shape: list[int], variant: Any, seed: int) ->
     assert np.all(np.abs(result.irradiance.ravel() - value.sum(axis=0)) <= bound)
 
 
+@pytest.mark.double
 def test_device_arrays(device: Device, rng: np.random.Generator) -> None:
     receivers, segments = pairs(rng, 33)
     operation = LineIrradiance(segments=segments)
@@ -379,6 +393,7 @@ def test_device_arrays(device: Device, rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(on_device.irradiance.get(), operation(receivers, device=device).irradiance)
 
 
+@pytest.mark.double
 def test_wrong_inputs(device: Device) -> None:
     operation = LineIrradiance(segments=lit(FLOOR))
     with pytest.raises(TypeError, match="float32 or float64 receivers, got int64"):

@@ -84,6 +84,7 @@ def test_rays_reflect_at_the_ends_of_windows_as_they_should(rng: np.random.Gener
     assert cut.sum() > 50
 
 
+@pytest.mark.double
 def test_writes_only_its_outputs(device: Device, rng: np.random.Generator) -> None:
     op = MirrorFacets(corners=mirrors("soup", rng))
     for shape in ((1,), (3, 7), (33,)):

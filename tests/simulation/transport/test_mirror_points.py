@@ -81,6 +81,7 @@ def test_images_converge_to_the_third_order_and_density_to_the_first_or_better(
     assert thin[1] / thin[2] > 2.0
 
 
+@pytest.mark.double
 def test_an_ellipsoid_shows_points_as_rays_that_it_reflects(device: Device, rng: np.random.Generator) -> None:
     """Rays from the lens next to the image, reflected by the true surface, pass the point at the predicted distance."""
     shape = (1.0, 0.8, 1.3)
@@ -92,6 +93,7 @@ def test_an_ellipsoid_shows_points_as_rays_that_it_reflects(device: Device, rng:
         assert abs(density[n] * area_per_angle - 1.0) < 5e-3
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("point_height", [0.012, 0.03, 0.06, 0.2])
 def test_a_hollow_mirror_concentrates_as_its_focal_length_says(device: Device, point_height: float) -> None:
     """On the axis of a sphere of radius R: (d + e - 2 d e / R)^2 square metres per steradian; more beyond the focus."""
@@ -132,6 +134,7 @@ def test_images_move_as_points_do(device: Device, variant: Any, dtype: Any, rng:
     np.testing.assert_allclose(((end - start) / step)[same], move[same], atol=tolerance)
 
 
+@pytest.mark.double
 def test_a_ball_shows_all_that_it_does_not_hide(device: Device, rng: np.random.Generator) -> None:
     """Up to the silhouette, a point has an image on the outside if the ball is not between it and the lens."""
     directions = rng.normal(0.0, 1.0, (3000, 3))
@@ -216,6 +219,7 @@ def test_more_images_than_are_kept_and_numbers_that_are_none(
     assert not no_mirrors(points, LENS.astype(dtype), device=device).image_count.any()
 
 
+@pytest.mark.double
 def test_writes_only_its_outputs(device: Device, rng: np.random.Generator) -> None:
     op = mirrors(1)
     for shape in ((0,), (1,), (3, 7), (33,)):

@@ -84,6 +84,7 @@ def test_a_plane_mirror_shows_a_second_line_at_twice_its_distance(device: Device
     assert np.abs(read - u).min() > 1e-4
 
 
+@pytest.mark.double
 def test_a_mirror_of_micrometres_in_a_scene_of_metres(device: Device) -> None:
     """A mirror of 20 um shows the part of the line given by the path lengths before and after it."""
     sensor, distance, low, high = sensor_view(), 0.004, 3e-3, 3.02e-3
@@ -104,6 +105,7 @@ def test_a_mirror_of_micrometres_in_a_scene_of_metres(device: Device) -> None:
     assert seen.power.sum() == pytest.approx(expected, rel=1e-9 if device.has_double else 0.05)
 
 
+@pytest.mark.double
 def test_a_mirror_seen_at_89_99_degrees(device: Device) -> None:
     """A mirror 30 um below the line; lens and line are nearly in its plane."""
     sensor, height = sensor_view(12, 480), 3e-5
@@ -176,6 +178,7 @@ def mirrored_points(scene: Scene, lit: LitLine, sensor: SensorView, device: Devi
     return total
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_plane_mirrors_show_what_points_by_brute_force_say(device: Device, seed: int) -> None:
     """Facets before a line, boxes in front of the line and of the facets."""
@@ -208,6 +211,7 @@ def ball_scene(fineness: int, radius: float, middle: np.ndarray) -> Scene:
     return Scene(np.concatenate([FLOOR, ball + middle]), np.r_[0, 0, np.ones(len(ball), int)])
 
 
+@pytest.mark.double
 def test_a_ball_shows_a_line_as_alhazen_says(device: Device) -> None:
     radius, middle = 5e-3, np.array([0.0, -0.007, 5.0e-3])
     sensor, light = sensor_view(240, 480), sheet(g_limits=(-0.015, 0.015))
@@ -235,6 +239,7 @@ def test_a_ball_shows_a_line_as_alhazen_says(device: Device) -> None:
         assert abs(v[0] - v[1]) < 2e-6
 
 
+@pytest.mark.double
 def test_a_curved_mirror_in_steps_converges_to_the_second_order(device: Device) -> None:
     scene = ball_scene(3, 5e-3, np.array([0.0, -0.007, 5.0e-3]))
     lit = sheet(g_limits=(-0.015, 0.015)).illuminate(scene, 0.0)

@@ -122,6 +122,7 @@ def test_light_on_a_board_as_rays_say(device: Device, variant: Any, dtype: Any) 
     assert 0.2 < np.mean(value > 0.0) < 0.9
 
 
+@pytest.mark.double
 @ON_DEVICES
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 30), size=st.sampled_from([0.1, 0.3, 3.0]))
 def test_light_in_any_soup(device: Device, seed: int, count: int, size: float) -> None:
@@ -187,6 +188,7 @@ def test_a_wall_between_is_dark(device: Device, variant: Any, dtype: Any, rng: n
     np.testing.assert_array_equal(result.status, 0)
 
 
+@pytest.mark.double
 @WAYS
 def test_light_through_a_comb(device: Device, variant: Any, dtype: Any) -> None:
     """More shadows than the kernel can store: the segment is processed in parts."""
@@ -204,6 +206,7 @@ def test_light_through_a_comb(device: Device, variant: Any, dtype: Any) -> None:
     np.testing.assert_allclose(result.irradiance, expected.irradiance, rtol=1e-4 if dtype == np.float32 else 2e-6)
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("variant", ["vector", "work_item"])
 def test_rays_come_to_the_same_in_first_order(device: Device, variant: Any, rng: np.random.Generator) -> None:
     corners, segments, receivers = soup(rng, 60, 0.3), segments_of(rng, 5), receivers_of(rng, 4, 64)
@@ -217,6 +220,7 @@ def test_rays_come_to_the_same_in_first_order(device: Device, variant: Any, rng:
     assert errors[2] < 0.15 * errors[1]
 
 
+@pytest.mark.double
 @WAYS
 def test_without_visibility_as_line_irradiance(
     device: Device, variant: Any, dtype: Any, rng: np.random.Generator
@@ -254,6 +258,7 @@ def test_metres_and_micrometres(device: Device, variant: Any, dtype: Any, rng: n
     assert np.count_nonzero(result.irradiance) > 10
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("variant", ["vector", "work_item"])
 def test_a_part_of_micrometres_in_a_room_of_metres(device: Device, variant: Any) -> None:
     """A box of 20 um on the floor has the same shadow as in a scene of its size (double; single cannot resolve it)."""
@@ -280,6 +285,7 @@ def test_faces_that_coincide(device: Device, variant: Any, dtype: Any, rng: np.r
     np.testing.assert_allclose(twice.irradiance, once.irradiance, rtol=64 * float(np.finfo(dtype).eps), atol=1e-7)
 
 
+@pytest.mark.double
 @WAYS
 @pytest.mark.parametrize("angle", [1e-2, 1.7e-4, 1e-6])
 def test_grazing(device: Device, variant: Any, dtype: Any, angle: float) -> None:
@@ -428,6 +434,7 @@ def test_sizes_and_canaries(device: Device, variant: Any, strips: int, each: int
     np.testing.assert_allclose(guarded.out.left, guarded.out.irradiance.sum(axis=1), rtol=1e-6)
 
 
+@pytest.mark.double
 def test_no_light_and_no_triangles(device: Device, rng: np.random.Generator) -> None:
     receivers, dark = receivers_of(rng, 1, 20), segments_of(rng, 4)
     dark[0, 9], dark[1, 9], dark[2, 3:6], dark[3] = 0.0, -1.0, dark[2, :3], 0.0
@@ -452,6 +459,7 @@ def test_one_bound_instance_for_all_profiles(device: Device, rng: np.random.Gene
     np.testing.assert_array_equal(operation(*given).left.get(), expected.left)
 
 
+@pytest.mark.double
 def test_wrong_parameters(device: Device) -> None:
     scene = Scene(NO_TRIANGLES)
     with pytest.raises(TypeError, match=r"OccludedIrradiance\.scene is None, expected a Scene"):

@@ -77,6 +77,7 @@ def test_factors_are_exact_at_any_distance(device: Device, variant: Any, precisi
     np.testing.assert_array_equal(result.factors[bounds == 0.0], 0.0)
 
 
+@pytest.mark.double
 def test_micrometres_stand_in_metres(device: Device) -> None:
     """A corner of ten micrometres far from the centre of a scene of metres has the same light as at the origin."""
     corner = 1e-5 * np.array([[[0, 0, 0], [0, 1, 0], [0, 1, 1]], [[0, 0, 0], [0, 1, 1], [0, 0, 1]]])
@@ -90,6 +91,7 @@ def test_micrometres_stand_in_metres(device: Device) -> None:
     np.testing.assert_allclose(away[:, :2], at_home, atol=1e-8)
 
 
+@pytest.mark.double
 def test_pieces_add_up_to_the_whole(device: Device) -> None:
     rng = np.random.default_rng(3)
     triangle = rng.normal(size=(1, 3, 3))
@@ -103,6 +105,7 @@ def test_pieces_add_up_to_the_whole(device: Device) -> None:
     np.testing.assert_allclose(FormFactors(patches=together)(receivers, device=device).factors, complete, atol=1e-14)
 
 
+@pytest.mark.double
 @given(st.integers(0, 2**32 - 1))
 @ON_DEVICES
 def test_a_closed_room_fills_the_view(device: Device, seed: int) -> None:
@@ -115,6 +118,7 @@ def test_a_closed_room_fills_the_view(device: Device, seed: int) -> None:
     np.testing.assert_allclose(factors.sum(axis=1), 1.0, rtol=1e-12)
 
 
+@pytest.mark.double
 def test_a_surface_gets_nothing_from_its_own_plane(device: Device) -> None:
     """A surface gets no light from its own plane, even if rounding of large coordinates lifts a receiver above it."""
     rng = np.random.default_rng(5)
@@ -130,6 +134,7 @@ def test_a_surface_gets_nothing_from_its_own_plane(device: Device) -> None:
                 assert np.all(diagonal < 1e-10)
 
 
+@pytest.mark.double
 def test_at_an_edge_the_factor_is_that_of_the_angle(device: Device) -> None:
     """A wall that begins at distance 0 has the form factor (1 + cos(angle)) / 2; on the edge at most that."""
     long = 1e6
@@ -146,6 +151,7 @@ def test_at_an_edge_the_factor_is_that_of_the_angle(device: Device) -> None:
         assert np.all((result.factors[9:] >= 0.0) & (result.factors[9:] <= 1.0))
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_light_is_the_sum_of_factors(device: Device, variant: Any) -> None:
     rng = np.random.default_rng(11)
@@ -159,6 +165,7 @@ def test_light_is_the_sum_of_factors(device: Device, variant: Any) -> None:
     np.testing.assert_allclose(result.irradiance, factors @ exitance, rtol=1e-13)
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_what_stands_between_hides(device: Device, variant: Any) -> None:
     """A half plane hides half of a small square patch, by rays to subdivisions of it."""
@@ -185,6 +192,7 @@ def test_what_stands_between_hides(device: Device, variant: Any) -> None:
     assert errors[2] < 0.02
 
 
+@pytest.mark.double
 def test_one_ray_agrees_with_any_hit(device: Device, rng: np.random.Generator) -> None:
     plate = trimesh.creation.box((0.1, 0.1, 0.002))
     parts = [
@@ -310,6 +318,7 @@ def test_backs_of_open_surfaces() -> None:
     np.testing.assert_allclose((both.normals * both._areas[:, None]).sum(axis=0), 0.0, atol=1e-3)
 
 
+@pytest.mark.double
 def test_a_fine_mesh_shines_as_a_coarse_one(device: Device) -> None:
     """A finely meshed plate and ball: outlines against the original triangles, beside them and in their shadows."""
     plate = trimesh.creation.box((1.0, 1.0, 0.1))

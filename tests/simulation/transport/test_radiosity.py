@@ -35,6 +35,7 @@ def solved(size: float, albedo: Any, device: Device, *, lid: bool = False) -> Ra
     return Radiosity(patches=solution.patches, albedo=solution.albedo, device=device)
 
 
+@pytest.mark.double
 def test_no_light_is_lost_in_a_closed_box(device: Device) -> None:
     """The first arriving power equals the emitted power to rounding; the absorbed power equals it to second order."""
     albedo, errors = 0.9, []
@@ -88,6 +89,7 @@ def test_both_ways_of_solving_agree(device: Device) -> None:
     np.testing.assert_allclose(iterated.solve(arrival), box.solve(arrival), rtol=3e-5)
 
 
+@pytest.mark.double
 def test_arrival_is_the_mean_over_patches(device: Device) -> None:
     """Against receivers all over each patch with the closed form of the lines; also near the ends of the line."""
     box, lit = solved(0.5, [0.5], device), stripe()
@@ -105,6 +107,7 @@ def test_arrival_is_the_mean_over_patches(device: Device) -> None:
     np.testing.assert_allclose(arrival[near_line], mean[near_line], rtol=0.05, atol=1e-4)
 
 
+@pytest.mark.double
 def test_many_short_segments_are_as_one(device: Device) -> None:
     """A line in 2000 pieces, as by a fine mesh, sends the same power to every patch."""
     box = solved(0.3, [0.5], device)
@@ -183,6 +186,7 @@ def test_patches_in_corners_are_graded(device: Device) -> None:
     assert from_edge[small].mean() < 0.6 * from_edge[~small].mean()
 
 
+@pytest.mark.double
 def test_graded_patches_in_a_groove(device: Device) -> None:
     """Line across a groove of 90 degrees: the light of all further bounces, integrated along the groove.
 
@@ -222,6 +226,7 @@ def test_graded_patches_in_a_groove(device: Device) -> None:
     assert worst[True] < 0.03
 
 
+@pytest.mark.double
 def test_materials_and_receivers(device: Device) -> None:
     scene = room(1.0, 0.8, 0.6, lid=True)
     box = Radiosity.from_scene(scene, [0.7, 0.2], size=0.5, refinements=1, both_sides=True, device=device)
@@ -263,6 +268,7 @@ def test_what_is_refused() -> None:
         Radiosity.from_scene(room(1.0, 1.0, 1.0, lid=True), [0.5], size=1.0)
 
 
+@pytest.mark.double
 def test_convergence_of_light_in_a_room(device: Device) -> None:
     """At points of a room with grey walls, errors halve at least when the patch size is halved."""
     receivers = np.array([[0.2, 0.1, 0.0, 0.3, 0.2, 0.9], [-0.1, -0.2, 0.1, 1.0, 0.0, 0.0], [0, 0.3, -0.1, 0, -1, 1]])

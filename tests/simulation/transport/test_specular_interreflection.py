@@ -59,6 +59,7 @@ def test_a_mirror_at_45_degrees_throws_the_sheet_onto_a_wall(
     assert covered == pytest.approx(expected[1] - expected[0], rel=1e-9)
 
 
+@pytest.mark.double
 @SOURCES
 def test_plane_mirrors_throw_where_rays_say(
     device: Device, source: tuple[float, float] | None, rng: np.random.Generator

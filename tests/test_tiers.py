@@ -57,6 +57,8 @@ def _values(items: list[pytest.Item]) -> set[tuple[object, ...]]:
         ({"operation": SimpleNamespace(precision="double", variant="auto")}, False, "doubles"),
         ({"rows": 3}, True, "doubles"),
         ({"variant": "vector"}, False, "vectors"),
+        ({"kernel": ("vector", np.float32)}, False, "vectors"),
+        ({"kernel": (3, np.float64)}, False, "doubles"),
         ({"operation": SimpleNamespace(variant="vector")}, False, "vectors"),
     ],
     ids=repr,

@@ -93,7 +93,8 @@ def is_refused(item: pytest.Item) -> bool:
     device = device_of(item)
     if device is None:
         return False
-    values = [value for name, value in _parameters_of(item).items() if name != "device"]
+    given = [value for name, value in _parameters_of(item).items() if name != "device"]
+    values = [value for each in given for value in (each if isinstance(each, tuple) else (each,))]
     if not device.has_double and (item.get_closest_marker("double") or any(map(_is_double, values))):
         return True
     return not device.takes_vectors and any(_variant_of(value) == "vector" for value in values)

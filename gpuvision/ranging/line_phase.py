@@ -129,7 +129,8 @@ def phase_error(
     known = levels[np.isfinite(levels)]
     if not known.size:
         return None
-    table = np.unique(np.linspace(*np.quantile(known, [_TAIL, 1.0 - _TAIL]), _PEAKS))
+    low, high = np.quantile(known, [_TAIL, 1.0 - _TAIL])
+    table = np.unique(np.linspace(low, high, _PEAKS))
     reach = readout.window + readout.fir_length + math.ceil(6.0 * shape.sigma)
     true = reach + (np.arange(_PHASES) + 0.5) / _PHASES
     distance = np.arange(2 * reach + 2)[:, None] - true

@@ -187,8 +187,8 @@ def _phase(sensor: Sensor, fields: Mapping[str, Array], readout: PointSigma, dev
     if not isinstance(sensor.readout, LineReadout) or "width" not in fields:
         return None
     good = fields["status"] == Status.OK
-    outputs = (fields[name][good] for name in ("peak", "width", "total"))
-    shape = estimate_line_shape(*outputs, sensor.readout.threshold)
+    peak, width, total = (fields[name][good] for name in ("peak", "width", "total"))
+    shape = estimate_line_shape(peak, width, total, sensor.readout.threshold)
     error = None if shape is None else phase_error(sensor.readout, shape, fields["peak"], device)
     if error is None:
         return None

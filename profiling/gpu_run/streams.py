@@ -18,6 +18,7 @@ from gpuvision.ranging.line import LineReadout
 _SHAPE = (512, 1024)
 _MEGABYTES = (4, 16, 64)
 _ENDLESS = 1 << 40  # frames
+_LEAST_US = 0.1  # shortest credible stage [us]
 _STAGES = ("upload", "compute", "download")
 _READOUT = LineReadout(method="centroid", threshold=20)
 
@@ -73,7 +74,7 @@ def overlap(events: Iterable[dict[str, Any]]) -> dict[str, float]:
     Returns
     -------
     dict
-        Empty where the runtime gives no device times (all events of rusticl have the same times).
+        Empty where the runtime gives no device times (events of rusticl on llvmpipe last 1 ns).
         ``upload_share``, ``compute_share``, ``download_share``: time of the stage over the time from the first start to
         the last end. ``busy_share``: share of the time in which at least one stage runs. ``overlap``: 1 - busy time /
         sum of the stages' times: 0 where no two stages run at the same time, 2/3 where all three always do.
@@ -83,7 +84,7 @@ def overlap(events: Iterable[dict[str, Any]]) -> dict[str, float]:
         for stage in _STAGES
     }
     everything = sorted(span for each in spans.values() for span in each)
-    if not any(end > start for start, end in everything):
+    if not any(end - start > _LEAST_US for start, end in everything):
         return {}
     whole = max(max(end for _, end in everything) - everything[0][0], 1e-9)
     sums = {stage: sum(end - start for start, end in each) for stage, each in spans.items()}

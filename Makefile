@@ -8,7 +8,7 @@ CACHES := XDG_CACHE_HOME="$(CURDIR)/build/cache" MPLCONFIGDIR="$(CURDIR)/build/c
 # otherwise.
 PYTEST = PYTHONDONTWRITEBYTECODE= .venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
 
-.PHONY: demo test test-full nightly fuzz mutants offline lint docs clean
+.PHONY: demo test test-full nightly fuzz mutants offline sanitize lint docs clean
 
 demo: .venv/ready
 	.venv/bin/gpuvision demo
@@ -25,6 +25,7 @@ nightly: .venv/ready-tests
 	$(MAKE) fuzz FUZZ_ARGS="--engine atheris --runs 20000 --seconds 60"
 	$(MAKE) mutants
 	$(MAKE) offline
+	$(MAKE) sanitize
 
 # Fuzz the readers of files: see tests/fuzz/run.py. FUZZ_ARGS: its options, and readers such as sensor.toml.
 FUZZ_ARGS ?= --runs 100000
@@ -44,6 +45,11 @@ OFFLINE_ARGS ?= --offline sm_70 --offline sm_90 --offline gfx90a --offline gfx11
 offline: .venv/ready
 	.venv/bin/python -m pip --quiet --disable-pip-version-check install --editable ".[offline]"
 	$(CACHES) .venv/bin/gpuvision profile $(OFFLINE_ARGS)
+
+# Run all kernels in the simulator oclgrind (Debian package oclgrind): accesses beyond an array, data races. See
+# tests/sanitize.py. KERNELS: some kernel files, such as KERNELS="psd line".
+sanitize: .venv/ready-tests
+	.venv/bin/python tests/sanitize.py $(KERNELS)
 
 # Type checkers do not understand setuptools' package-dir or its import hook for editable installs. Symbolic links in
 # build/lint give the package the layout of an installed wheel, so that messages name the real files.

@@ -356,7 +356,7 @@ def _height_map(
     heights, grid = resample_heights(sensor, points, intensity, device, max_cells=max_cells, sigma=sigma)
     if errors is not None:
         # Linear interpolation of systematic errors, as of the intensity: the errors of neighbours are the same.
-        maps = {
+        maps: dict[str, Any] = {
             f"map_{name}": to_numpy(resample_heights(sensor, points, each.z, device, max_cells=max_cells)[0].intensity)
             for name, each in (("systematic", errors.systematic), ("phase", errors.phase))
             if each is not None

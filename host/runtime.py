@@ -40,7 +40,7 @@ def pin_workers() -> None:
     ``POCL_AFFINITY``. Must run before the first platform query.
     """
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
-    if usable == os.cpu_count() and not any(os.environ.get(name) for name in _WORKER_COUNTS):
+    if usable == os.cpu_count() and set(_WORKER_COUNTS).isdisjoint(os.environ):
         os.environ.setdefault("POCL_AFFINITY", "1")
 
 

@@ -165,7 +165,6 @@ kernel void board_pose(global const CODE *restrict image, global const BoardRule
     local int flags;
     const int item = get_local_id(0), items = RULER_GROUP;
     for (int i = 0; i < lines * each; i++) {
-        // By field: Mesa 22.3 drops the index of a pointer to numbers that was cast from a pointer to a struct.
         const real4 ruler = {rulers[i].x_px, rulers[i].y_px, rulers[i].cosine, rulers[i].sine};
         ruler_measure(image, rows, columns, ruler, table, model, profile, slopes, &flags, edge);
         if (item == 0) {

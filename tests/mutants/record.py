@@ -56,13 +56,15 @@ def tests_of(fault: Fault, budget: float) -> list[str]:
     Python files have tests that read the source, too. They take a few seconds and come before the test files.
     The recorded tests run the lines of the fault and take up to `budget` seconds together. Lines that run only at
     import have no recorded tests; for them, take all tests that run any line of the file. For a kernel, take the test
-    file of its name and the tests of the operations that launch it; for a header of many kernels, at most `_MAX_FILES`
-    files, the first file of each operation before the second ones.
+    file of its name, the files that include it, and the tests of the operations that launch it; for a header of many
+    kernels, at most `_MAX_FILES` files, the first file of each operation before the second ones.
     """
     path = ROOT / fault.file
     is_code = path.suffix == ".py"
     places = [(path, fault.lines(path.read_text()))] if is_code else list(_launches(fault.file))
     own = [] if is_code else [str(file.relative_to(ROOT)) for file in _tests() if file.name == f"test_{path.stem}.py"]
+    # Tests that compile a program of their own with the kernel file.
+    own += [str(file.relative_to(ROOT)) for file, text in _tests().items() if f'"{_in_folder(fault.file)}"' in text]
     by_operation = itertools.zip_longest(*dict.fromkeys(_test_files(file) for file, _ in places))
     others = [file for files in by_operation for file in files if file is not None]
     files = list(dict.fromkeys([*own, *others]))[:_MAX_FILES]
@@ -95,6 +97,11 @@ def _test_files(path: Path, *, direct: bool = True) -> tuple[str, ...]:
             if f".{path.stem} import" in user.read_text():
                 files += _test_files(user, direct=False)
     return tuple(files)
+
+
+def _in_folder(kernel: str) -> str:
+    """Return the path of a kernel file as other kernels include it."""
+    return kernel.removeprefix("kernels/")
 
 
 def _public_names(text: str) -> list[str]:
@@ -146,7 +153,7 @@ def _sources(kernel: str) -> set[str]:
         if path.suffix in (".cl", ".h"):
             for name in re.findall(r'#include "([^"]+)"', path.read_text()):
                 users[name].add(str(path.relative_to(folder)))
-    found, new = set(), {kernel.removeprefix("kernels/")}
+    found, new = set(), {_in_folder(kernel)}
     while new:
         found |= new
         new = {user for name in new for user in users[name]} - found

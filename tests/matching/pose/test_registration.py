@@ -460,3 +460,9 @@ def test_what_leaves_the_picture_does_not_count(data: Path, name: str, device: D
     miss, turn = agreement(data / "pcb" / "deeppcb" / name, (640, 640), 2, device)
     assert miss <= 0.05
     assert turn <= 0.01
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_an_image_without_edges_has_none(device: Device, dtype: Any) -> None:
+    edges = find_template_edges(np.full((60, 80), 100, dtype), RulerEdges(threshold=20.0), device=device)
+    assert [each.shape for each in edges] == [(0, 2), (0, 2)]

@@ -107,6 +107,18 @@ def test_a_square_before_a_line(device: Device, variant: Any, dtype: Any) -> Non
 
 
 @WAYS
+@pytest.mark.parametrize("corner", [0, 1, 2])
+def test_a_corner_that_touches_the_plane_from_above_hides_nothing(
+    device: Device, variant: Any, dtype: Any, corner: int
+) -> None:
+    """The corner lies in the fan, before the segment; the rest of the triangle lies on the side of the normal."""
+    triangle = np.roll([[0.0, 1.0, 0.0], [-0.25, 1.0, -0.5], [0.25, 1.0, -0.5]], corner, axis=0)
+    fan = np.array([[0.0, 0.0, 0.0, -1.0, 2.0, 0.0, 1.0, 2.0, 0.0, *NO_MIRROR]], dtype)
+    result = VisibleIntervals(scene=Scene(triangle[None]), variant=variant)(fan, device=device)
+    np.testing.assert_array_equal(parts(result, 0), [[0.0, 1.0]])
+
+
+@WAYS
 def test_surfaces_that_the_ends_lie_on_do_not_hide(device: Device, variant: Any, dtype: Any) -> None:
     corners = np.array([[[-1.0, -1, 0], [2, -1, 0], [-1, 2, 0]], [[-1.0, 0.5, 0], [2, 0.5, 0], [0, 0.5, 2]]])
     fans = np.array([[0.1, -1.0, 2.0, 0.0, -0.5, 0.0, 0.3, 0.5, 0.0, 0, 0]], dtype)

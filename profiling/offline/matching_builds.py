@@ -152,5 +152,5 @@ def _edge_search() -> Iterator[Example]:
         yield Example(f"means {np.dtype(dtype)}", CellMeans(), _IMAGE, dtype)
     yield Example("levels", EdgeCostMap(threshold=10.0, border=8), _IMAGE)
     for scores in (False, True):
-        search = EdgeSearch(rows=64, columns=128, headings=9, points=512, with_scores=scores)
+        search = EdgeSearch(rows=16, columns=24, headings=3, points=512, with_scores=scores)
         yield Example(f"search{', scores' if scores else ''}", search, (8, 480, 640), np.uint16)

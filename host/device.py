@@ -139,7 +139,7 @@ class Device:
         NoDeviceError
             There is no healthy device; the message names packages to install.
         """
-        requested = os.environ.get(VARIABLE)
+        requested = requested_device()
         if requested:
             return Device.named(requested)
         healthy = Device.all()
@@ -359,6 +359,11 @@ class Device:
                 "gpuvision.clear_cache()"
             ) from error
         return cl.array.Array(queue, shape, dtype, data=memory)
+
+
+def requested_device() -> str | None:
+    """Return the device that the environment variable ``GPUVISION_DEVICE`` names; ``None`` without the variable."""
+    return os.environ.get(VARIABLE)
 
 
 def _check_order(queue: Any) -> None:

@@ -6,14 +6,13 @@ this time.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from gpuvision.host.arrays import HostArray
-from gpuvision.host.device import VARIABLE, Device
+from gpuvision.host.device import Device, requested_device
 from gpuvision.host.operation import Operation
 
 # Calls that bind the operation and fill the caches, and timed calls, of which the median counts. Chosen: pauses of a
@@ -58,7 +57,7 @@ def placement_devices() -> tuple[Device, ...]:
         There is no healthy device.
     """
     first = Device.best()
-    if os.environ.get(VARIABLE):
+    if requested_device():
         return (first,)
     other = next((each for each in Device.all() if each.is_cpu is not first.is_cpu), None)
     return (first,) if other is None else (first, other)

@@ -39,7 +39,7 @@ def gpu(device: Device, monkeypatch: pytest.MonkeyPatch) -> Device:
     """List a GPU before the CPU device."""
     gpu = copy.copy(device)
     gpu.label, gpu.is_cpu = "gpu", False
-    monkeypatch.delenv(placement.VARIABLE, raising=False)
+    monkeypatch.delenv("GPUVISION_DEVICE", raising=False)
     monkeypatch.setattr(Device, "all", staticmethod(lambda: (gpu, gpu, device, device)))
     monkeypatch.setattr(Device, "best", staticmethod(lambda: gpu))
     return gpu
@@ -56,13 +56,13 @@ def test_small_work_runs_on_the_cpu_beside_a_gpu(gpu: Device, device: Device) ->
 
 def test_named_device_is_the_only_one(gpu: Device, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     assert placement.placement_devices() == (gpu, device)
-    monkeypatch.setenv(placement.VARIABLE, "gpu")
+    monkeypatch.setenv("GPUVISION_DEVICE", "gpu")
     assert placement.placement_devices() == (gpu,)
     assert fastest_device(READOUT, currents_of(3), devices=[device]).device is device
 
 
 def test_without_a_gpu_one_device_is_measured(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(placement.VARIABLE, raising=False)
+    monkeypatch.delenv("GPUVISION_DEVICE", raising=False)
     monkeypatch.setattr(Device, "all", staticmethod(lambda: (device, copy.copy(device))))
     monkeypatch.setattr(Device, "best", staticmethod(lambda: device))
     assert placement.placement_devices() == (device,)

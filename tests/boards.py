@@ -32,3 +32,14 @@ def board_folder(folder: Path) -> Path:
     for name, text in zip(LAYERS, (copper, mask, outline), strict=True):
         (folder / name).write_text(_HEAD + text + "M02*\n")
     return folder
+
+
+def narrow_pads(folder: Path, *, rows: int = 2, pitch: float = 1.0) -> Path:
+    """Write a board with rows of six pads of 0.34 mm."""
+    pads = [(8.6 + 0.5 * column, 7.5 + pitch * row) for column in range(6) for row in range(rows)]
+    head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
+    flashes = "".join(f"X{round(1e6 * x)}Y{round(1e6 * y)}D03*\n" for x, y in pads)
+    (folder / "copper.gbr").write_text(f"{head}%ADD10R,0.34X0.34*%\nD10*\n{flashes}M02*\n")
+    border = "X0Y0D02*\nX20000000Y0D01*\nX20000000Y16000000D01*\nX0Y16000000D01*\nX0Y0D01*\n"
+    (folder / "outline.gbr").write_text(f"{head}%ADD10C,0.1*%\nD10*\n{border}M02*\n")
+    return folder

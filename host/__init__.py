@@ -7,6 +7,7 @@ from gpuvision.host.arrays import Array, DeviceArray, FloatArray, HostArray, Int
 from gpuvision.host.batch import Batch
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
+from gpuvision.host.device_choice import DeviceChoice, fastest_device
 from gpuvision.host.errors import (
     BuildError,
     DeviceLostError,
@@ -23,7 +24,6 @@ from gpuvision.host.launch import Launch, Precision, Spec, Specs, Variant, real_
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, table_offsets, type_defines
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Pipeline, PipelineLimits
-from gpuvision.host.placement import Placement, fastest_device
 from gpuvision.host.planning import Plan, PlanLimits, plan_stream
 from gpuvision.host.program import Define
 from gpuvision.host.reading import FileLimit
@@ -56,6 +56,7 @@ __all__ = [
     "Define",
     "Device",
     "DeviceArray",
+    "DeviceChoice",
     "DeviceLostError",
     "DeviceMemoryError",
     "DeviceUnusableError",
@@ -73,7 +74,6 @@ __all__ = [
     "PacedSource",
     "Pipeline",
     "PipelineLimits",
-    "Placement",
     "Plan",
     "PlanLimits",
     "Precision",

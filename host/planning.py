@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpuvision.host.device import Device
+from gpuvision.host.device_choice import candidate_devices
 from gpuvision.host.errors import StreamError
 from gpuvision.host.memory import free_bytes
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Pipeline
-from gpuvision.host.placement import placement_devices
 from gpuvision.host.ring import Step, slot_bytes, steps_of, takes_single_frames
 from gpuvision.host.sources import ArraySource, Source
 from gpuvision.host.text import size_in_words
@@ -278,7 +278,7 @@ def plan_stream(
     )
     if device is not None or measure is not None:
         return plan(Device.best() if device is None else device)
-    devices = placement_devices()
+    devices = candidate_devices()
     return plan(devices[0]) if len(devices) == 1 else _fastest(plan, devices)
 
 

@@ -15,8 +15,8 @@ from gpuvision.host import (
     Device,
     PlanLimits,
     StreamError,
+    device_choice,
     fastest_device,
-    placement,
     plan_stream,
     planning,
 )
@@ -55,9 +55,9 @@ def test_small_work_runs_on_the_cpu_beside_a_gpu(gpu: Device, device: Device) ->
 
 
 def test_named_device_is_the_only_one(gpu: Device, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert placement.placement_devices() == (gpu, device)
+    assert device_choice.candidate_devices() == (gpu, device)
     monkeypatch.setenv("GPUVISION_DEVICE", "gpu")
-    assert placement.placement_devices() == (gpu,)
+    assert device_choice.candidate_devices() == (gpu,)
     assert fastest_device(READOUT, currents_of(3), devices=[device]).device is device
 
 
@@ -65,7 +65,7 @@ def test_without_a_gpu_one_device_is_measured(device: Device, monkeypatch: pytes
     monkeypatch.delenv("GPUVISION_DEVICE", raising=False)
     monkeypatch.setattr(Device, "all", staticmethod(lambda: (device, copy.copy(device))))
     monkeypatch.setattr(Device, "best", staticmethod(lambda: device))
-    assert placement.placement_devices() == (device,)
+    assert device_choice.candidate_devices() == (device,)
 
 
 @pytest.fixture

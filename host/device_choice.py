@@ -21,8 +21,8 @@ _WARM_UP, _CALLS = 3, 15
 
 
 @dataclass(frozen=True, kw_only=True)
-class Placement:
-    """Device on which an operation is fastest; ``str(placement)`` states it in one line.
+class DeviceChoice:
+    """Device on which an operation is fastest; ``str(choice)`` states it in one line.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Placement:
         return f"{self.operation} on {self.device.label}, {1e6 * self.seconds[self.device.label]:.3g} us{against}"
 
 
-def placement_devices() -> tuple[Device, ...]:
+def candidate_devices() -> tuple[Device, ...]:
     """Return the devices to choose from: the best GPU and the best CPU device, best first.
 
     Only the default device where the variable ``GPUVISION_DEVICE`` names it.
@@ -63,7 +63,7 @@ def placement_devices() -> tuple[Device, ...]:
     return (first,) if other is None else (first, other)
 
 
-def fastest_device(operation: Operation[Any], *inputs: HostArray, devices: Sequence[Device] = ()) -> Placement:
+def fastest_device(operation: Operation[Any], *inputs: HostArray, devices: Sequence[Device] = ()) -> DeviceChoice:
     """Measure an operation on each device and return the fastest one.
 
     Parameters
@@ -76,7 +76,7 @@ def fastest_device(operation: Operation[Any], *inputs: HostArray, devices: Seque
 
     Returns
     -------
-    Placement
+    DeviceChoice
 
     Raises
     ------
@@ -93,13 +93,13 @@ def fastest_device(operation: Operation[Any], *inputs: HostArray, devices: Seque
     --------
     >>> import numpy as np
     >>> import gpuvision as gv
-    >>> placement = gv.fastest_device(gv.PsdReadout(strip_length=6e-3), np.ones((1000, 2), np.float32))
-    >>> reading = gv.PsdReadout(strip_length=6e-3)(np.ones((1000, 2), np.float32), device=placement.device)
+    >>> choice = gv.fastest_device(gv.PsdReadout(strip_length=6e-3), np.ones((1000, 2), np.float32))
+    >>> reading = gv.PsdReadout(strip_length=6e-3)(np.ones((1000, 2), np.float32), device=choice.device)
     """
-    measured = {each: _seconds(operation, inputs, each) for each in devices or placement_devices()}
+    measured = {each: _seconds(operation, inputs, each) for each in devices or candidate_devices()}
     fastest = min(measured, key=measured.__getitem__)
     seconds = {each.label: s for each, s in measured.items()}
-    return Placement(operation=type(operation).__name__, device=fastest, seconds=seconds)
+    return DeviceChoice(operation=type(operation).__name__, device=fastest, seconds=seconds)
 
 
 def _seconds(operation: Operation[Any], inputs: Sequence[HostArray], device: Device) -> float:

@@ -75,9 +75,13 @@ def files_of(source: str) -> frozenset[str]:
     return frozenset({source, *re.findall(r'^#line 1 "([^"]+)"', text, re.MULTILINE)})
 
 
+def _kernel_files() -> list[Path]:
+    return [path for suffix in ("cl", "h") for path in KERNEL_FOLDER.glob(f"*/*.{suffix}")]
+
+
 def test_builds_switch_every_macro_on_and_off() -> None:
     defined: set[str] = set()
-    texts = {path: path.read_text() for path in KERNEL_FOLDER.glob("*/*.[ch]*")}
+    texts = {path: path.read_text() for path in _kernel_files()}
     for text in texts.values():
         defined |= set(re.findall(r"#[ \t]*define[ \t]+(\w+)", text))
     assert files_of("line/line.cl") >= {"line/line.cl", "line/line_ml.h", "common/camera.h"}
@@ -98,7 +102,7 @@ def test_helper_functions_have_a_body_in_every_file() -> None:
     """C99: a function that is only ``inline`` has no body outside of the calls that the compiler inlines."""
     plain = [
         f"{path.parent.name}/{path.name}: {line}"
-        for path in KERNEL_FOLDER.glob("*/*.[ch]*")
+        for path in _kernel_files()
         for line in path.read_text().splitlines()
         if re.match(r"\s*(?!static\b|//)(?:\w+\s+)*inline\b", line)
     ]

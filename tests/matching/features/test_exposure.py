@@ -71,7 +71,7 @@ def test_wrong_parameters_are_refused() -> None:
     with pytest.raises(ValueError, match="no contrast"):
         sensor_imaging(SENSOR, pixel=PIXEL, white_electrons=1e3, reflectance=replace(BOARD, copper=0.3))
     direct = replace(SENSOR, pixel="direct_read", response_time=1e-5)
-    with pytest.raises(ValueError, match="no exposure; their noise"):
+    with pytest.raises(ValueError, match="no exposure; the response time determines their noise"):
         smallest_exposure(direct, 0.1, irradiance=1.0, pixel=PIXEL)
 
 

@@ -4,8 +4,11 @@ The option ``--tier`` selects the tests. ``fast`` runs all tests without the mar
 smoke set on every other device: one test for each kernel. Of kernel tests with several parameters it runs a covering
 design, of both variants of a kernel a few tests for each file, and of hypothesis tests fewer examples, see `tiers`.
 ``full`` runs all tests on the best device; on every other device it runs no slow tests, and a covering design of
-products of three or more parameters. ``nightly`` runs all tests on every device, with more hypothesis examples. No tier
-runs the cases that a device refuses: double precision without doubles, vectors on a runtime without them.
+products of three or more parameters. ``nightly`` runs all tests on every device, with more hypothesis examples.
+``GPUVISION_DEVICE`` selects the best device, see `Device.best`.
+
+No tier runs the cases that a device refuses: double precision without doubles, vectors on a runtime without them. The
+last lines of a run state their number. A case that PoCL or Intel's CPU runtime refuses is an error.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ from driver_faults import mark_faults
 from gpuvision.host import Device, debug
 from gpuvision.host.discovery import INSTALL_HINT
 from processor_time import record_test, table_of_files
-from tiers import LEFT, device_of, is_refused, select_fast, select_full
+from tiers import LEFT, best_devices, device_of, select_fast, select_full, split_refused
 
 ROOT = Path(__file__).resolve().parents[1]
 # Compiled kernels of all runtimes, verdicts of devices, fonts of matplotlib: kept in the clone, so that a second run is
@@ -45,6 +48,7 @@ os.environ |= {"XDG_CACHE_HOME": str(CACHE), "MPLCONFIGDIR": str(CACHE / "matplo
 hypothesis.configuration.set_hypothesis_home_dir(CACHE / "hypothesis")
 
 LEFT_COUNTS = pytest.StashKey[dict[str, int]]()
+REFUSED_COUNTS = pytest.StashKey[dict[str, int]]()
 WITHOUT_INLINE = pytest.StashKey[bool]()
 TIERS = ("fast", "full", "nightly")
 Draws = Callable[..., int]
@@ -78,15 +82,22 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect the tests that the tier omits; draw the tier's number of hypothesis examples."""
     tier = config.getoption("tier")
-    refused = {item for item in items if is_refused(item)}
+    try:
+        items[:], refused = split_refused(items)
+        best = best_devices()
+    except pytest.UsageError as error:
+        if hasattr(config, "workerinput"):  # pytest-xdist prints other errors of a worker, not this one
+            raise RuntimeError(str(error)) from error
+        raise
     if refused:
-        config.hook.pytest_deselected(items=list(refused))
-        items[:] = [item for item in items if item not in refused]
+        config.hook.pytest_deselected(items=refused)
+        devices = [device for device in map(device_of, refused) if device is not None]
+        config.stash[REFUSED_COUNTS] = dict(Counter(device.label for device in devices))
     mark_faults(items)
     _set_examples(items, EXAMPLES[tier])
     if tier == "nightly":
         return
-    chosen, left, without_inline = (select_fast if tier == "fast" else select_full)(items, Device.all()[:1])
+    chosen, left, without_inline = (select_fast if tier == "fast" else select_full)(items, best)
     for item in without_inline:
         item.stash[WITHOUT_INLINE] = True
     if left:
@@ -121,6 +132,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     config = session.config
     if hasattr(config, "workeroutput"):
         config.workeroutput["left"] = config.stash.get(LEFT_COUNTS, {})
+        config.workeroutput["refused"] = config.stash.get(REFUSED_COUNTS, {})
     elif config.getoption("strict_skips") and _unexpected_skips(config) and session.exitstatus == pytest.ExitCode.OK:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
@@ -128,7 +140,9 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: Any) -> None:
     """Take the counts of a worker; every worker collects the same tests."""
-    node.config.stash[LEFT_COUNTS] = getattr(node, "workeroutput", {}).get("left", {})
+    counts = getattr(node, "workeroutput", {})
+    node.config.stash[LEFT_COUNTS] = counts.get("left", {})
+    node.config.stash[REFUSED_COUNTS] = counts.get("refused", {})
 
 
 def _unexpected_skips(config: pytest.Config) -> list[str]:
@@ -177,7 +191,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print the number of passed tests for every device, which CI reads, and of the tests that the tier leaves out."""
+    """Print the number of passed tests for every device, which CI reads, and of the tests that do not run."""
     config = terminalreporter.config
     passed = terminalreporter.getreports("passed")
     labels = Counter(label for each in passed for name, label in each.user_properties if name == "device")
@@ -186,6 +200,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     if left:
         more = "full tier (make test-full)" if config.getoption("tier") == "fast" else "nightly tier (make nightly)"
         terminalreporter.write_line(f"left to the {more}: {_counts(left)}")
+    refused = config.stash.get(REFUSED_COUNTS, {})
+    if refused:
+        terminalreporter.write_line(f"left to no tier, because the device refuses them: {_counts(refused)}")
     for line in table_of_files(each for each in terminalreporter.getreports("") if each.when == "teardown"):
         terminalreporter.write_line(line)
     if config.getoption("strict_skips"):

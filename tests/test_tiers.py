@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +14,16 @@ import numpy as np
 import pytest
 
 from gpuvision.host import Device
-from tiers import collected_items, device_of, function_of, is_refused, select_fast, without_other_variants
+from tiers import (
+    best_devices,
+    collected_items,
+    device_of,
+    function_of,
+    is_refused,
+    select_fast,
+    split_refused,
+    without_other_variants,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 PLANTED = tomllib.loads((ROOT / "tests" / "mutants" / "planted.toml").read_text())["fault"]
@@ -24,14 +36,14 @@ def test_the_fast_tier_has_each_killing_test(request: pytest.FixtureRequest, nam
     function = function.partition("[")[0]
     of_file = [item for item in collected_items(request.session) if item.path == ROOT / path]
     named = {item for item in of_file if function_of(item) == function or not function}
-    best = Device.all()[:1]
+    best = best_devices()
     chosen = named.intersection(select_fast(of_file, best).chosen)
     # A run of other files collects none of them.
     assert not named or any(device_of(item) in (None, *best) for item in chosen)
 
 
 def test_the_fast_tier_holds_each_value_of_each_parameter(request: pytest.FixtureRequest) -> None:
-    best = Device.all()[:1]
+    best = best_devices()
     items = [item for item in collected_items(request.session) if device_of(item) in best]
     fast = [item for item in items if item.get_closest_marker("slow") is None]
     expected = _values(list(without_other_variants(fast)))
@@ -73,3 +85,101 @@ def test_a_device_runs_no_case_that_it_refuses(parameters: dict[str, Any], has_m
             )
             lacking = {"doubles": not has_double, "vectors": not takes_vectors}
             assert bool(is_refused(item)) == lacking.get(expected, False)
+
+
+@pytest.mark.parametrize("kind", ["pocl", "intel", "rusticl"])
+def test_no_test_vanishes_on_a_cpu_runtime_with_doubles(kind: str) -> None:
+    """A fault of ``Device.has_double`` or ``Device.takes_vectors`` must not deselect all tests of a kernel."""
+    for has_double, takes_vectors in ((True, True), (False, True), (True, False)):
+        device = SimpleNamespace(kind=kind, label=f"{kind}:1", has_double=has_double, takes_vectors=takes_vectors)
+        items: list[Any] = [
+            SimpleNamespace(
+                nodeid=f"test_a.py::test_b[{variant}]",
+                callspec=SimpleNamespace(params={"device": device, "dtype": dtype, "variant": variant}),
+                get_closest_marker=lambda name: None,
+            )
+            for dtype, variant in ((np.float32, "work_item"), (np.float64, "work_item"), (np.float32, "vector"))
+        ]
+        refused = [each for each, has in zip(items[1:], (has_double, takes_vectors), strict=True) if not has]
+        if refused and kind != "rusticl":
+            with pytest.raises(
+                pytest.UsageError, match=rf"device {kind}:1 refuses test_a\.py::test_b\[\w+\] \(has_double"
+            ):
+                split_refused(items)
+        else:
+            assert split_refused(items) == ([each for each in items if each not in refused], refused)
+
+
+def test_the_requested_device_runs_the_whole_tier(monkeypatch: pytest.MonkeyPatch) -> None:
+    for device in Device.all():
+        monkeypatch.setenv("GPUVISION_DEVICE", device.label)
+        assert best_devices() == (device,)
+    monkeypatch.setenv("GPUVISION_DEVICE", "no such device")
+    with pytest.raises(pytest.UsageError, match="no such device"):
+        best_devices()
+    monkeypatch.delenv("GPUVISION_DEVICE")
+    assert best_devices() == Device.all()[:1]
+    monkeypatch.setattr(Device, "all", staticmethod(lambda: ()))
+    assert best_devices() == ()
+
+
+CASES = """
+import numpy as np
+import pytest
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_case(device, dtype):
+    pass
+"""
+WITHOUT_DOUBLES = """
+from gpuvision.host import Device
+
+for device in Device.all():
+    device.has_double = False
+    device.kind = {kind}
+"""
+
+
+def run_cases(folder: Path, device: Device, kind: str = "", *, workers: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run two cases for each device in the fast tier, with a device as the best one; a kind has no doubles."""
+    (folder / "conftest.py").write_text((ROOT / "tests" / "conftest.py").read_text())
+    (folder / "test_cases.py").write_text(CASES)
+    (folder / "without_doubles.py").write_text(WITHOUT_DOUBLES.format(kind=kind) if kind else "")
+    options = [
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "without_doubles",
+        "-o",
+        f"pythonpath={ROOT / 'tests'}",
+        "-n",
+        str(workers),
+    ]
+    command = [sys.executable, "-m", "pytest", "-q", "--tier", "fast", *options, str(folder)]
+    environment = os.environ | {"GPUVISION_DEVICE": device.label, "PYTHONPATH": f"{ROOT}:{folder}"}
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder, env=environment)
+
+
+def test_the_fast_tier_runs_whole_on_the_requested_device(tmp_path: Path) -> None:
+    *others, last = Device.all()
+    run = run_cases(tmp_path, last)
+    assert f"kernel tests passed: {last.label} 2\n" in run.stdout, run.stdout
+    left = ", ".join(f"{each} 2" for each in sorted(each.label for each in others))
+    assert f"left to the full tier (make test-full): {left}\n" in run.stdout or not left
+    assert "left to no tier" not in run.stdout
+
+
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_the_summary_counts_refused_tests(tmp_path: Path, workers: int) -> None:
+    device = Device.best()
+    run = run_cases(tmp_path, device, "'other'", workers=workers)
+    assert f"kernel tests passed: {device.label} 1\n" in run.stdout, run.stdout
+    refused = ", ".join(f"{each} 1" for each in sorted(each.label for each in Device.all()))
+    assert f"left to no tier, because the device refuses them: {refused}\n" in run.stdout
+
+
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_run_in_which_pocl_refuses_doubles_fails(tmp_path: Path, workers: int) -> None:
+    run = run_cases(tmp_path, Device.best(), "'pocl'", workers=workers)
+    assert run.returncode not in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
+    assert "refuses test_cases.py::test_case[" in run.stdout + run.stderr, run.stdout

@@ -12,6 +12,7 @@ import pytest
 
 from designs import covering
 from gpuvision.host import Device
+from gpuvision.host.errors import GpuVisionError
 
 _ROOT = Path(__file__).resolve().parents[1]
 # Names of the test files that are about one kernel; other files run whole tasks with kernels of these files.
@@ -21,6 +22,8 @@ _COMPOSED = frozenset({"cli", "formats", "profiling", "workflows"})
 # Test functions of a file that the fast tier runs in both kernel variants: the variants differ in few functions of a
 # kernel, and each variant takes another compilation.
 _IN_BOTH_VARIANTS = 2
+# Kinds of runtimes whose devices have doubles and vectors of 16: a refused case is a fault of `gpuvision.host`.
+_REFUSING_NOTHING = ("pocl", "intel")
 # Tests of this run that the tier leaves out, for `pytest.Session`.
 LEFT = pytest.StashKey[list[pytest.Item]]()
 
@@ -42,6 +45,22 @@ class Selection(NamedTuple):
     chosen: list[pytest.Item]
     left: list[pytest.Item]
     without_inline: set[pytest.Item]
+
+
+def best_devices() -> tuple[Device, ...]:
+    """Return the device that runs the whole tier: the default device; none without a healthy device.
+
+    Raises
+    ------
+    pytest.UsageError
+        ``GPUVISION_DEVICE`` names no healthy device.
+    """
+    if not Device.all():
+        return ()
+    try:
+        return (Device.best(),)
+    except GpuVisionError as error:
+        raise pytest.UsageError(str(error)) from error
 
 
 def select_full(items: Sequence[pytest.Item], best: Collection[Device]) -> Selection:
@@ -98,6 +117,28 @@ def is_refused(item: pytest.Item) -> bool:
     if not device.has_double and (item.get_closest_marker("double") or any(map(_is_double, values))):
         return True
     return not device.takes_vectors and any(_variant_of(value) == "vector" for value in values)
+
+
+def split_refused(items: Sequence[pytest.Item]) -> tuple[list[pytest.Item], list[pytest.Item]]:
+    """Return the tests that devices run, and the tests that they refuse.
+
+    Raises
+    ------
+    pytest.UsageError
+        PoCL or Intel's CPU runtime refuses a test. These have doubles and vectors: all such tests would vanish.
+    """
+    run: list[pytest.Item] = []
+    refused: list[pytest.Item] = []
+    for item in items:
+        (refused if is_refused(item) else run).append(item)
+    for item in refused:
+        device = device_of(item)
+        if device is not None and device.kind in _REFUSING_NOTHING:
+            raise pytest.UsageError(
+                f"device {device.label} refuses {item.nodeid} (has_double {device.has_double}, "
+                f"takes_vectors {device.takes_vectors}); every {device.kind} device runs such tests"
+            )
+    return run, refused
 
 
 def _is_double(value: Any) -> bool:

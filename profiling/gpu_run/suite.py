@@ -18,8 +18,8 @@ _OUTCOME = re.compile(r"(\d+) (passed|failed|errors?|skipped|xfailed|deselected)
 def run(device: Device, seconds: float, *selection: str) -> dict[str, Any]:
     """Run the tests of the checkout that run kernels on the device, in at most `seconds`.
 
-    The process has ``GPUVISION_DEVICE`` set to the device, so that it is the best device: it runs the whole fast tier.
-    Vector variants run only where the device takes them.
+    The process has ``GPUVISION_DEVICE`` set to the device: the best device of the tiers, which runs the whole fast
+    tier. Vector variants run only where the device takes them.
     """
     if not (_ROOT / "tests" / "conftest.py").exists():
         return {"failure": f"{_ROOT} has no tests: run from a checkout"}

@@ -95,7 +95,7 @@ class Usage:
 
 
 class CompilerError(GpuVisionError):
-    """A kernel does not compile for a target, or calls a function that has no body."""
+    """A kernel does not compile for a target within the time limit, or calls a function that has no body."""
 
 
 def check_compilers(targets: Sequence[Target]) -> None:
@@ -150,7 +150,7 @@ def compile_text(text: str, options: Sequence[str], target: Target) -> list[Usag
     Raises
     ------
     CompilerError
-        The file does not compile, or calls a function without a body.
+        The file does not compile, calls a function without a body, or keeps a compiler busy beyond the time limit.
     """
     with tempfile.TemporaryDirectory(prefix="gpuvision-offline-") as folder:
         source, assembly = Path(folder, "kernel.cl"), Path(folder, "kernel.s")
@@ -173,7 +173,10 @@ def compile_text(text: str, options: Sequence[str], target: Target) -> list[Usag
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, capture_output=True, text=True, timeout=_SECONDS, check=False)
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=_SECONDS, check=False)
+    except subprocess.TimeoutExpired as expired:
+        raise CompilerError(f"{Path(command[0]).name} did not finish within {_SECONDS} s") from expired
 
 
 def _first_errors(log: str) -> str:

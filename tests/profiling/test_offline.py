@@ -204,6 +204,23 @@ def test_builds_are_compiled_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     assert set(report["compilers"]) == {"sm_90"}
 
 
+def test_compiler_that_does_not_finish_is_a_fault_of_its_build(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    slow = tmp_path / "slow-clang"
+    slow.write_text("#!/bin/sh\nexec sleep 20\n")
+    slow.chmod(0o700)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(check, "check_compilers", list)
+    monkeypatch.setattr(check, "versions", lambda target: ("compiler 1",))
+    monkeypatch.setattr(targets, "CLANG", str(slow))
+    monkeypatch.setattr(targets, "_SECONDS", 0.2)
+    builds = [KernelBuild(name, "psd/psd.cl", {}) for name in ("first", "second")]
+    report = check_builds(builds, [TARGETS["gfx90a"]])
+    assert [(row.case, row.fault) for row in report.faults] == [
+        ("first", "slow-clang did not finish within 0.2 s"),
+        ("second", "slow-clang did not finish within 0.2 s"),
+    ]
+
+
 @pytest.fixture
 def few_builds(monkeypatch: pytest.MonkeyPatch) -> list[Usage]:
     """Replace builds and compilers; the command sees one kernel with this usage."""

@@ -399,6 +399,7 @@ def test_the_margin_is_a_parameter(device):
         PsdReadout(strip_length=1.0, noise=PsdNoise(spot=0.2))
 
 
+@pytest.mark.double
 def test_ambient_light_pulls_to_the_electrical_centre_and_the_dark_level_undoes_it(device):
     ambient = 100e-6
     pair = np.array([[0.2e-6 + ambient, 0.8e-6 + ambient]])

@@ -276,6 +276,7 @@ def test_a_camera_without_distortion_is_the_pinhole(device, rng):
     assert status.tolist() == [0, 0, 128, 128, 8, 8]
 
 
+@pytest.mark.double
 def test_a_point_of_the_scene_comes_back_from_where_the_camera_sees_it(device, rng):
     points = rng.uniform((-0.4, -0.3, 0.8), (0.4, 0.3, 2.0), (4, 50, 3))
     geometry = dataclasses.replace(

@@ -103,6 +103,7 @@ def carried(rows: np.ndarray, bad: int, transform: str) -> tuple[float, float]:
     return share, np.einsum("ij,ji->i", good, np.linalg.pinv(good)).max()
 
 
+@pytest.mark.double
 @VARIANTS
 @pytest.mark.parametrize(
     ("transform", "scale", "count", "bad", "turn"),
@@ -160,6 +161,7 @@ def test_exact_rows_are_not_refused(device: Device, variant: Any, dtype: Any, rn
     np.testing.assert_allclose(result.leverage, [carried(each, 0, "rigid")[1] for each in rows], rtol=1e-3)
 
 
+@pytest.mark.double
 @VARIANTS
 @pytest.mark.parametrize("is_exact", [False, True])
 def test_as_many_rows_as_unknowns_have_the_covariance_of_their_sigmas(
@@ -345,6 +347,7 @@ def test_an_etching_takes_as_much_as_least_squares_say(device: Device, rng: np.r
     np.testing.assert_allclose(found.covariance[0], np.linalg.inv(matrix)[:3, :3], rtol=0.1)
 
 
+@pytest.mark.double
 @VARIANTS
 @pytest.mark.parametrize("sigma", [3e-7, 20e-6])
 def test_an_etch_bias_is_at_the_minimum_of_loss_and_prior(

@@ -219,6 +219,7 @@ def test_far_light_is_one_cluster_for_each_wall(device: Device, variant: Any) ->
     assert cut.counts["work"] == 2 * receivers.shape[1]
 
 
+@pytest.mark.double
 @TWO_WAYS
 def test_a_strip_that_rises_through_the_plane_of_the_light_is_lit(device: Device, variant: Any) -> None:
     """Its middle lies behind the plane of the lit segment, its normal is perpendicular to that of the segment."""

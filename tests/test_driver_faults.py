@@ -1,0 +1,66 @@
+"""Faults of drivers mark the affected tests of that driver, and no others."""
+
+from __future__ import annotations
+
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from driver_faults import FAULTS, DriverFault, mark_faults
+from tiers import collected_items
+
+AFFECTED = {
+    "blob kernel": ("tests/matching/features/test_blob.py::test_any[rusticl-uint8]", False),
+    "accuracy of blobs": ("tests/matching/features/test_blob_accuracy.py::test_any[rusticl]", False),
+    "vectors": ("tests/ranging/test_line.py::test_tall_frames[rusticl-float32]", True),
+    "infinite samples": ("tests/ranging/test_line.py::test_not_finite[rusticl-centroid]", True),
+    "random variant": ("tests/camera/test_undistort_points.py::test_any_shape[rusticl]", True),
+    "faintest light": ("tests/ranging/test_line.py::test_faintest_light[rusticl-centroid-columns]", True),
+    "large array": ("tests/a/test_line_irradiance.py::test_sizes_and_canaries[rusticl-work_item-20011]", True),
+    "mirror": ("tests/a/test_mirrors.py::test_an_image_on_an_edge_counts_once[rusticl]", True),
+    "pose of features": ("tests/a/test_feature_pose.py::test_one_kind_of_features_is_enough[rusticl-rulers]", True),
+    "affine pose": ("tests/a/test_registration_pairs.py::test_copper_of_another_width_does_not_move[rusticl-2]", True),
+    "board in an image": ("tests/a/test_registration.py::test_real_boards_are_found[rusticl-upverter]", True),
+}
+UNAFFECTED = (
+    "tests/matching/features/test_ruler.py::test_any[rusticl]",
+    "tests/ranging/test_line.py::test_not_finite[rusticl-peak]",
+    "tests/a/test_feature_pose.py::test_wrong_frames_and_options_are_refused[rusticl]",
+    "tests/a/test_registration_pairs.py::test_an_unknown_etch_bias_is_in_the_covariance",
+    "tests/a/test_registration.py::test_an_image_of_nothing_is_refused[rusticl]",
+)
+
+
+def marks_of(name: str, kind: str | None = "rusticl", driver: str = "22.3.6") -> list[pytest.Mark]:
+    """Return the marks of a test of a device."""
+    marks: list[Any] = []
+    device = None if kind is None else SimpleNamespace(kind=kind, driver=driver)
+    item: Any = SimpleNamespace(
+        nodeid=name, add_marker=marks.append, callspec=SimpleNamespace(params={"device": device} if device else {})
+    )
+    mark_faults([item])
+    return [each.mark for each in marks]
+
+
+@pytest.mark.parametrize(("name", "runs"), AFFECTED.values(), ids=AFFECTED)
+def test_affected_test_is_an_expected_failure(name: str, runs: bool) -> None:
+    (mark,) = marks_of(name)
+    assert mark.name == "xfail"
+    assert mark.kwargs["reason"].startswith("Mesa 22.3 ")
+    assert (mark.kwargs["run"], mark.kwargs["strict"]) == (runs, False)
+    for kind, driver in (("pocl", "22.3.6"), ("rusticl", "25.0.1"), (None, "")):
+        assert marks_of(name, kind, driver) == []
+
+
+@pytest.mark.parametrize("name", UNAFFECTED)
+def test_other_tests_of_the_driver_are_not_marked(name: str) -> None:
+    assert marks_of(name) == []
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.reason[:40])
+def test_names_of_a_fault_are_names_of_tests(request: pytest.FixtureRequest, fault: DriverFault) -> None:
+    """A renamed test would not be expected to fail; a run of other files collects none of them."""
+    found = [item for item in collected_items(request.session) if f"{item.path.stem}\\.py" in fault.tests]
+    assert not found or any(re.search(fault.tests, item.nodeid) for item in found)

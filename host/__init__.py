@@ -10,6 +10,7 @@ from gpuvision.host.device import Device
 from gpuvision.host.device_choice import DeviceChoice, fastest_device
 from gpuvision.host.errors import (
     BuildError,
+    DeviceLimitError,
     DeviceLostError,
     DeviceMemoryError,
     DeviceUnusableError,
@@ -57,6 +58,7 @@ __all__ = [
     "Device",
     "DeviceArray",
     "DeviceChoice",
+    "DeviceLimitError",
     "DeviceLostError",
     "DeviceMemoryError",
     "DeviceUnusableError",

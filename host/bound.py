@@ -15,7 +15,7 @@ import pyopencl.array
 from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
 from gpuvision.host.device import Device
 from gpuvision.host.failure import launch_failure
-from gpuvision.host.launch import Launchable, Spec, check_counts
+from gpuvision.host.launch import Launch, Launchable, Spec, describe_launch
 from gpuvision.host.limits import fit_group
 from gpuvision.host.process import after_fork, check_process
 from gpuvision.host.program import build
@@ -62,8 +62,7 @@ class Bound(Generic[R]):
         queue: Any,
         inputs: Sequence[DeviceArray] = (),
     ) -> None:
-        launch = operation.launch(device, shape, dtype)
-        check_counts(type(operation).__name__, launch)
+        launch = describe_launch(operation, device, shape, dtype)
         self.operation, self.device = operation, device
         self.queue = device.queue if queue is None else queue
         self._launch = launch
@@ -76,22 +75,30 @@ class Bound(Generic[R]):
         self._empty = not all(launch.global_size)
         self.inputs = tuple(inputs) or self._new_inputs(launch.inputs)
         self.outputs = self.allocate()
-        self._tables = [self._upload(each) for each in launch.arguments if isinstance(each, np.ndarray)]
         self._in_flight: collections.deque[tuple[Any, Any]] = collections.deque()
         after_inputs = enumerate(launch.outputs.values(), len(launch.inputs))
         # Indices of the input and output arrays among the kernel's arguments.
         self._places = [*range(len(launch.inputs)), *(place for place, spec in after_inputs if spec is not None)]
         self._own = (*self.inputs, *self._computed(self.outputs))
+        self._inline_site: _Site | None = None
+        try:
+            self._connect(launch)
+            self._enqueue(self._own).wait()
+        except cl.Error as error:
+            self._raise(error)
+
+    def _connect(self, launch: Launch) -> None:
+        """Upload the tables, and build the kernel for calls that run inline."""
+        device = self.device
+        self._tables = [self._upload(each) for each in launch.arguments if isinstance(each, np.ndarray)]
         # Intel's runtime searches for the allocation of an SVM pointer at every launch, but not for the allocation of a
         # buffer.
         known = self._own if device.kind == "intel" and device.shares_memory else ()
         self._known = {id(each): _buffer_over(device.context, each) for each in known}
         self._queue_is_inline = device.is_inline(self.queue)
-        self._inline_site: _Site | None = None
         if not self._queue_is_inline and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
             inline_queue = device.inline_queue(self.queue, groups=launch.groups)
             self._inline_site = None if inline_queue is None else self._site_on(inline_queue)
-        self().wait()
 
     @functools.cached_property
     def _queue_site(self) -> _Site:
@@ -101,14 +108,20 @@ class Bound(Generic[R]):
     def prepare_queue(self) -> None:
         """Build the kernel for the queue and launch it once, so that no later call compiles."""
         if self._inline_site is not None and not self._empty:
-            self._set_arrays(self._queue_site, self._own)
-            cl.enqueue_nd_range_kernel(self.queue, self._queue_site.kernel, self._global, self._local).wait()
+            try:
+                self._set_arrays(self._queue_site, self._own)
+                cl.enqueue_nd_range_kernel(self.queue, self._queue_site.kernel, self._global, self._local).wait()
+            except cl.Error as error:
+                self._raise(error)
 
     def _new_inputs(self, specs: Sequence[Spec]) -> tuple[DeviceArray, ...]:
         """Return new input arrays, filled with zeros."""
         arrays = tuple(self.device.empty(shape, dtype, self.queue) for shape, dtype in specs)
-        for array in arrays:
-            self._clear(array)
+        try:
+            for array in arrays:
+                self._clear(array)
+        except cl.Error as error:
+            self._raise(error)
         return arrays
 
     @property
@@ -345,10 +358,7 @@ class Bound(Generic[R]):
 
     def _upload(self, table: HostArray) -> Any:
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
-        try:
-            return cl.Buffer(self.device.context, flags, hostbuf=np.ascontiguousarray(table))
-        except cl.Error as error:
-            self._raise(error)
+        return cl.Buffer(self.device.context, flags, hostbuf=np.ascontiguousarray(table))
 
     def _hold(self, event: Any, given: tuple[Any, ...]) -> None:
         """Keep references to arrays of the caller until the kernel has run."""

@@ -17,7 +17,8 @@ from numpy.typing import DTypeLike
 
 from gpuvision.host import discovery
 from gpuvision.host.arrays import SHARED_FLAGS, DeviceArray
-from gpuvision.host.errors import DeviceMemoryError, DeviceUnusableError, NoDeviceError
+from gpuvision.host.errors import DeviceLimitError, DeviceMemoryError, DeviceUnusableError, NoDeviceError
+from gpuvision.host.failure import launch_failure
 from gpuvision.host.kept import clear_with
 from gpuvision.host.process import check_process
 from gpuvision.host.text import printable, size_in_words
@@ -36,6 +37,14 @@ _MIN_LAST_CACHE = 32 << 20
 # CPU too, and ends the process in such kernels ("LLVM ERROR: Unsupported vector type with 64 elements!", Mesa 22.3).
 _VECTOR_RUNTIMES = ("pocl", "intel")
 _WITHOUT_VECTORS = ("rusticl",)
+
+
+class _Connection:
+    """Context and default queue of a device, shared by its copies (`Device.without_vectors`)."""
+
+    def __init__(self, context: Any, queue: Any, *, may_reopen: bool) -> None:
+        self.context, self.queue = context, queue
+        self.may_reopen = may_reopen
 
 
 class Device:
@@ -79,9 +88,9 @@ class Device:
         self.name, self.driver = printable(handle.name).strip(), printable(handle.driver_version)
         # The context is kept for the queue, too: Intel's runtime frees a context while a queue of it exists.
         self.inline_device = inline_device
-        self.context = queue.context if queue is not None else self._new_context()
-        self.queue = queue if queue is not None else cl.CommandQueue(self.context, handle)
-        self._may_reopen = queue is None
+        context = queue.context if queue is not None else self._new_context()
+        own_queue = queue if queue is not None else cl.CommandQueue(context, handle)
+        self._connection = _Connection(context, own_queue, may_reopen=queue is None)
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
         self.prefers_vectors = self.is_cpu and kind in _VECTOR_RUNTIMES
         self.takes_vectors = kind not in _WITHOUT_VECTORS
@@ -94,22 +103,41 @@ class Device:
     def _new_context(self) -> Any:
         return cl.Context([self.handle] if self.inline_device is None else [self.handle, self.inline_device])
 
-    def reopen(self) -> bool:
-        """Replace a lost context and its queue by new ones, once in the life of the object.
+    @property
+    def context(self) -> Any:
+        """Context of the device; `reopen` replaces it."""
+        return self._connection.context
+
+    @property
+    def queue(self) -> Any:
+        """Default queue of the device; `reopen` replaces it."""
+        return self._connection.queue
+
+    def reopen(self, lost_context: Any) -> bool:
+        """Replace a lost context and its queue by new ones, once in the life of the object and its copies.
+
+        Parameters
+        ----------
+        lost_context : pyopencl.Context
+            Context that does not work any more.
 
         Returns
         -------
         bool
-            Whether the device has a new context. False where the caller owns the queue (`of`), where the device was
-            opened again before, and where the driver gives no new context.
+            Whether the device has another context than the lost one, from this call or from another thread. False
+            where the caller owns the queue (`of`), where the device was opened again before, and where the driver
+            gives no new context.
         """
+        connection = self._connection
         with _opening:
-            if not self._may_reopen:
+            if connection.context != lost_context:
+                return True
+            if not connection.may_reopen:
                 return False
-            self._may_reopen = False
+            connection.may_reopen = False
             try:
                 context = self._new_context()
-                self.queue, self.context = cl.CommandQueue(context, self.handle), context
+                connection.queue, connection.context = cl.CommandQueue(context, self.handle), context
             except cl.Error:
                 return False
             return True
@@ -334,15 +362,19 @@ class Device:
 
         Raises
         ------
+        DeviceLimitError
+            The array is larger than the device allocates at once.
         DeviceMemoryError
-            The array is larger than the device allocates at once, or its memory is full.
+            The memory of the device is full.
+        DeviceLostError
+            The context is lost.
         """
         queue = self.queue if queue is None else queue
         dtype = np.dtype(dtype)
         # OpenCL refuses allocations of zero bytes; an empty batch needs one byte.
         size = max(math.prod(shape) * dtype.itemsize, 1)
         if size > self.max_allocation:
-            raise DeviceMemoryError(
+            raise DeviceLimitError(
                 f"an array of shape {tuple(shape)} and dtype {dtype} takes {size_in_words(size)}, device {self.label} "
                 f"allocates at most {size_in_words(self.max_allocation)} at once; split the input"
             )
@@ -353,6 +385,11 @@ class Device:
             else:
                 memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size)
         except cl.Error as error:
+            failure = launch_failure(error, self, queue, f"array of shape {tuple(shape)}")
+            if failure is error:
+                raise
+            if not isinstance(failure, DeviceMemoryError):
+                raise failure from error
             raise DeviceMemoryError(
                 f"device {self.label} cannot allocate {size_in_words(size)} for an array of shape {tuple(shape)} "
                 f"({str(error).splitlines()[0]}); split the input, or free the arrays of earlier shapes with "

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from gpuvision.host.arrays import HostArray
 from gpuvision.host.device import Device, requested_device
+from gpuvision.host.errors import GpuVisionError
 from gpuvision.host.operation import Operation
 
 # Calls that bind the operation and fill the caches, and timed calls, of which the median counts. Chosen: pauses of a
@@ -32,17 +33,19 @@ class DeviceChoice:
         Fastest device.
     seconds : mapping of str to float
         Median time of a call on NumPy arrays [s], by the label of each measured device.
+    unusable : mapping of str to str
+        First line of the error of each device that cannot run the operation, by its label.
     """
 
     operation: str
     device: Device
     seconds: Mapping[str, float]
+    unusable: Mapping[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        others = ", ".join(
-            f"{label} {1e6 * s:.3g} us" for label, s in self.seconds.items() if label != self.device.label
-        )
-        against = f" ({others})" if others else ""
+        others = [f"{label} {1e6 * s:.3g} us" for label, s in self.seconds.items() if label != self.device.label]
+        others += [f"{label} is not usable: {reason}" for label, reason in self.unusable.items()]
+        against = f" ({', '.join(others)})" if others else ""
         return f"{self.operation} on {self.device.label}, {1e6 * self.seconds[self.device.label]:.3g} us{against}"
 
 
@@ -82,8 +85,10 @@ def fastest_device(operation: Operation[Any], *inputs: HostArray, devices: Seque
     ------
     NoDeviceError
         There is no healthy device.
-    TypeError, ValueError
+    TypeError
         The operation does not take such input.
+    GpuVisionError, ValueError
+        No device runs the operation on such input; the error is the first device's.
 
     Notes
     -----
@@ -96,10 +101,21 @@ def fastest_device(operation: Operation[Any], *inputs: HostArray, devices: Seque
     >>> choice = gv.fastest_device(gv.PsdReadout(strip_length=6e-3), np.ones((1000, 2), np.float32))
     >>> reading = gv.PsdReadout(strip_length=6e-3)(np.ones((1000, 2), np.float32), device=choice.device)
     """
-    measured = {each: _seconds(operation, inputs, each) for each in devices or candidate_devices()}
-    fastest = min(measured, key=measured.__getitem__)
-    seconds = {each.label: s for each, s in measured.items()}
-    return DeviceChoice(operation=type(operation).__name__, device=fastest, seconds=seconds)
+    measured: dict[Device, float] = {}
+    failures: dict[str, Exception] = {}
+    for each in devices or candidate_devices():
+        try:
+            measured[each] = _seconds(operation, inputs, each)
+        except (GpuVisionError, ValueError) as error:
+            failures[each.label] = error
+    if not measured:
+        raise next(iter(failures.values()))
+    return DeviceChoice(
+        operation=type(operation).__name__,
+        device=min(measured, key=measured.__getitem__),
+        seconds={each.label: s for each, s in measured.items()},
+        unusable={label: str(error).partition("\n")[0] for label, error in failures.items()},
+    )
 
 
 def _seconds(operation: Operation[Any], inputs: Sequence[HostArray], device: Device) -> float:

@@ -9,11 +9,12 @@ import json
 import re
 import subprocess
 import sys
+import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyopencl as cl
 
@@ -43,10 +44,12 @@ _PREFERRED = ("pocl", "intel")
 # Drivers that run on GPUs of several makers: the maker's driver comes first.
 _GENERIC_GPU_DRIVERS = ("pocl-gpu", "rusticl")
 _SIMULATORS = ("oclgrind",)
+# Time for which the verdict of a driver that does not answer is kept [s] (chosen): each process would wait for it.
+_HANG_KEPT_SECONDS = 3600
+_HANG = "did not finish within"
 # Reasons of a device or machine that is busy: the next process probes again. 137: the system stopped the process.
 _BUSY = re.compile(
-    "did not finish within|exit (-9|137):|"
-    "OUT_OF_RESOURCES|OUT_OF_HOST_MEMORY|MEM_OBJECT_ALLOCATION_FAILURE|DEVICE_NOT_AVAILABLE"
+    "exit (-9|137):|OUT_OF_RESOURCES|OUT_OF_HOST_MEMORY|MEM_OBJECT_ALLOCATION_FAILURE|DEVICE_NOT_AVAILABLE"
 )
 
 
@@ -119,6 +122,11 @@ class ProbedDevice(ListedDevice):
         """Advice to the user about an unhealthy device."""
         if self.healthy:
             return ""
+        if _HANG in self.reason:
+            return (
+                "the driver hangs, or the machine is busy; the verdict is kept for an hour: "
+                "`gpuvision devices --probe` asks again"
+            )
         if _BUSY.search(self.reason):
             return "the device or the machine is busy; start again when it is idle: the verdict is not kept"
         if self.kind == "pocl" and "debian" not in self.driver:
@@ -149,6 +157,21 @@ class ProbedDevice(ListedDevice):
         )
 
 
+class _Verdict(NamedTuple):
+    """Verdict of the cache file.
+
+    Attributes
+    ----------
+    reason : str
+        Reason why the device is not healthy; empty for a healthy device.
+    until : int or None
+        Time at which the verdict expires [s since 1970]; ``None``: with the driver's version.
+    """
+
+    reason: str
+    until: int | None = None
+
+
 def kind_of(handle: Any) -> str:
     """Return the kind of a device: ``pocl``, ``pocl-gpu``, ``intel``, ``intel-gpu``, ``nvidia``, ..."""
     words = f"{handle.platform.name} {handle.platform.vendor} {handle.vendor}".lower()
@@ -169,19 +192,37 @@ def _verdicts_file() -> Path:
     return cache_folder() / "devices.json"
 
 
-def _read_verdicts() -> dict[str, str]:
+def _read_verdicts() -> dict[str, _Verdict]:
+    """Return the verdicts of the cache file by key, without expired ones."""
     try:
         read = json.loads(read_private(_verdicts_file()) or "{}")
     except (ValueError, RecursionError):
         return {}
     kept = read.items() if isinstance(read, dict) else ()
-    return {key: reason for key, reason in kept if _KEY.fullmatch(key) and isinstance(reason, str)}
+    verdicts = {key: _parsed(entry) for key, entry in kept if _KEY.fullmatch(key)}
+    return {key: verdict for key, verdict in verdicts.items() if verdict is not None}
 
 
-def _keep_verdicts(fresh: dict[str, str]) -> None:
+def _parsed(entry: Any) -> _Verdict | None:
+    """Return the verdict of an entry of the cache file; None where it is damaged or has expired."""
+    match entry:
+        case str():
+            return _Verdict(entry)
+        # A later end than a new verdict gets comes from a clock that was set back.
+        case [str() as reason, int() as until] if time.time() < until <= time.time() + _HANG_KEPT_SECONDS + 1:
+            return _Verdict(reason, until)
+    return None
+
+
+def _keep_verdicts(fresh: Mapping[str, str]) -> None:
+    until = int(time.time()) + _HANG_KEPT_SECONDS
+    verdicts = _read_verdicts() | {
+        key: _Verdict(reason, until if _HANG in reason else None) for key, reason in fresh.items()
+    }
+    entries = {key: reason if until is None else [reason, until] for key, (reason, until) in verdicts.items()}
     # Without a writable cache the next start probes again, which takes about a second per device.
     with contextlib.suppress(OSError):
-        write_private(_verdicts_file(), json.dumps(_read_verdicts() | fresh, indent=1))
+        write_private(_verdicts_file(), json.dumps(entries, indent=1))
 
 
 def _ask_probe(platform_index: int, device_index: int) -> str:
@@ -198,7 +239,7 @@ def _ask_probe(platform_index: int, device_index: int) -> str:
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return f"the probe kernel did not finish within {_PROBE_SECONDS} s"
+        return f"the probe kernel {_HANG} {_PROBE_SECONDS} s"
     try:
         return str(json.loads(ran.stdout.splitlines()[-1])["reason"])
     except (IndexError, KeyError, TypeError, ValueError):
@@ -268,7 +309,8 @@ def probed_devices(*, probe_again: bool = False) -> tuple[ProbedDevice, ...]:
     Notes
     -----
     Verdicts are cached in the user's cache folder for each driver version. The first call on a machine takes about a
-    second per device. The verdict of a busy device (no memory, no end within the time limit) is not cached.
+    second per device. The verdict of a busy device (no memory) is not cached, the verdict of a device that does
+    not answer within the time limit for an hour.
     """
     check_process()
     if probe_again:
@@ -279,7 +321,7 @@ def probed_devices(*, probe_again: bool = False) -> tuple[ProbedDevice, ...]:
 @functools.cache
 def _probed_devices(*, trust_bad: bool) -> tuple[ProbedDevice, ...]:
     listed = listed_devices()  # first: it makes the cache folder private
-    known = {key: reason for key, reason in _read_verdicts().items() if trust_bad or not reason}
+    known = {key: reason for key, (reason, _) in _read_verdicts().items() if trust_bad or not reason}
     fresh: dict[str, str] = {}
     for each in listed:
         if each.key not in known:

@@ -23,6 +23,10 @@ class DeviceMemoryError(GpuVisionError, MemoryError):
     """A device cannot allocate an array, or has no memory or registers for a launch."""
 
 
+class DeviceLimitError(DeviceMemoryError):
+    """An array or a kernel needs more than the device ever has; freeing memory does not help."""
+
+
 class BuildError(GpuVisionError):
     """A kernel does not compile; the message contains the compiler's log."""
 

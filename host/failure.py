@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pyopencl as cl
 
-from gpuvision.host.device import Device
 from gpuvision.host.errors import DeviceLostError, DeviceMemoryError
 from gpuvision.host.kept import drop_bound
 
@@ -15,8 +14,21 @@ _NO_MEMORY = ("MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY")
 _NO_RESOURCES = "OUT_OF_RESOURCES"
 
 
-def launch_failure(error: cl.Error, device: Device, queue: Any, name: str) -> Exception:
-    """Return the exception to raise for an error of the runtime at a launch or at the wait for it.
+class Reopenable(Protocol):
+    """Part of a `Device` that a lost context concerns."""
+
+    label: str
+
+    @property
+    def context(self) -> Any:
+        """Context of the device."""
+
+    def reopen(self, lost_context: Any) -> bool:
+        """Replace a lost context; return whether the device has another one."""
+
+
+def launch_failure(error: cl.Error, device: Reopenable, queue: Any, name: str) -> Exception:
+    """Return the exception to raise for an error of the runtime at an allocation, a launch, or the wait for it.
 
     Where the context of the queue does not work any more, the kept bound instances are dropped, and the device is
     opened again, at the first loss only.
@@ -49,7 +61,7 @@ def launch_failure(error: cl.Error, device: Device, queue: Any, name: str) -> Ex
         return _lost(name, device, reason, reopened=True)
     if not responds(queue):
         drop_bound()
-        return _lost(name, device, reason, reopened=device.reopen())
+        return _lost(name, device, reason, reopened=device.reopen(queue.context))
     if _NO_RESOURCES in reason:
         return DeviceMemoryError(
             f"{name}: device {device.label} has no resources for the launch ({reason}): registers, local memory or "
@@ -70,7 +82,7 @@ def responds(queue: Any) -> bool:
     return True
 
 
-def _lost(name: str, device: Device, reason: str, *, reopened: bool) -> DeviceLostError:
+def _lost(name: str, device: Reopenable, reason: str, *, reopened: bool) -> DeviceLostError:
     remedy = (
         "the device was opened again: repeat the call with new arrays, and bind operations again"
         if reopened

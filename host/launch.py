@@ -69,6 +69,41 @@ class Launch:
         return nbytes_of((*self.inputs, *self.outputs.values()))
 
 
+def describe_launch(operation: Launchable, device: Device, shape: Shape, dtype: np.dtype[Any]) -> Launch:
+    """Return the launch of an operation; check that its kernel can count in 32-bit integers.
+
+    Raises
+    ------
+    TypeError, ValueError
+        The operation does not take such input, or a count is beyond `MAX_COUNT`.
+    """
+    name = type(operation).__name__
+    check_shape(name, shape)
+    try:
+        launch = operation.launch(device, shape, dtype)
+    except OverflowError as error:  # of a NumPy integer among the arguments
+        raise ValueError(
+            f"{name}: input of shape {shape} takes counts beyond the 32 bits of a kernel argument; split the input"
+        ) from error
+    check_counts(name, launch)
+    return launch
+
+
+def check_shape(name: str, shape: Shape) -> None:
+    """Check that a kernel can count the elements of an array, and each of its axes, in 32-bit integers.
+
+    Raises
+    ------
+    ValueError
+        The array has more than `MAX_COUNT` elements, or an axis is longer.
+    """
+    if max(math.prod(shape), *shape, 0) > MAX_COUNT:
+        raise ValueError(
+            f"{name}: an array of shape {tuple(shape)} has more than {MAX_COUNT} elements, which kernels count in 32 "
+            "bits; split the input"
+        )
+
+
 def check_counts(name: str, launch: Launch) -> None:
     """Check that a kernel can count the elements of its arrays and its work-items in 32-bit integers.
 
@@ -78,11 +113,8 @@ def check_counts(name: str, launch: Launch) -> None:
         An array has more than `MAX_COUNT` elements, or the launch more work-items.
     """
     for spec in (*launch.inputs, *launch.outputs.values()):
-        if spec is not None and math.prod(spec[0]) > MAX_COUNT:
-            raise ValueError(
-                f"{name}: an array of shape {tuple(spec[0])} has more than {MAX_COUNT} elements, which kernels "
-                "count in 32 bits; split the input"
-            )
+        if spec is not None:
+            check_shape(name, spec[0])
     items = math.prod(launch.global_size)
     if items > MAX_COUNT:
         raise ValueError(

@@ -7,7 +7,7 @@ from typing import Any
 
 import pyopencl as cl
 
-from gpuvision.host.errors import DeviceMemoryError
+from gpuvision.host.errors import DeviceLimitError
 from gpuvision.host.work_size import Shape
 
 
@@ -15,7 +15,8 @@ def fit_group(kernel: Any, handle: Any, local_size: Shape | None, *, name: str, 
     """Return the work-group size with which a kernel runs on a device.
 
     The work-items of a kernel without local memory do not depend on each other: its groups are halved until the device
-    has registers for them. A kernel with local memory is compiled for its group size.
+    has registers for them. Such a kernel takes its group size from ``get_local_size``, not from an argument. A kernel
+    with local memory is compiled for its group size.
 
     Parameters
     ----------
@@ -28,20 +29,20 @@ def fit_group(kernel: Any, handle: Any, local_size: Shape | None, *, name: str, 
 
     Raises
     ------
-    DeviceMemoryError
+    DeviceLimitError
         The kernel needs more local memory or a larger group than the device has.
     """
     needed, largest = _needs_of(kernel, handle)
     available = int(handle.local_mem_size)
     if needed > available:
-        raise DeviceMemoryError(
+        raise DeviceLimitError(
             f"{name}: kernel {kernel.function_name} takes {needed} bytes of local memory, device {label} has "
             f"{available}; give fewer elements (rulers, lines, points), or choose another device"
         )
     if local_size is None or math.prod(local_size) <= largest:
         return local_size
     if needed:
-        raise DeviceMemoryError(
+        raise DeviceLimitError(
             f"{name}: kernel {kernel.function_name} takes groups of {math.prod(local_size)}, device {label} runs "
             f"groups of up to {largest}; choose another device"
         )

@@ -21,7 +21,7 @@ from numpy.typing import DTypeLike
 from gpuvision.host.arrays import DeviceArray, HostArray
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
-from gpuvision.host.errors import BuildError, DeviceMemoryError
+from gpuvision.host.errors import BuildError, DeviceLimitError, DeviceMemoryError
 from gpuvision.host.kept import clear_cache, kept_bound
 from gpuvision.host.launch import Launch, Specs
 from gpuvision.host.process import check_process
@@ -225,18 +225,26 @@ class Operation(Generic[R]):
         kept: collections.OrderedDict[Any, Bound[R]] = kept_bound()
         key = (self, device, queue, first.shape, first.dtype)
         if key not in kept:
-            try:
-                kept[key] = self._bind(device, first.shape, first.dtype, queue)
-            except DeviceMemoryError:
-                if not kept:
-                    raise
-                clear_cache()
-                kept = kept_bound()
-                kept[key] = self._bind(device, first.shape, first.dtype, queue)
+            bound = self._bind_freeing(device, queue, first)
+            kept = kept_bound()  # a new mapping where `_bind_freeing` has cleared the old one
+            kept[key] = bound
             if len(kept) > _KEPT_BOUND:
                 kept.popitem(last=False)
         kept.move_to_end(key)
         return kept[key]
+
+    def _bind_freeing(self, device: Device, queue: Any, first: HostArray | DeviceArray) -> Bound[R]:
+        """Return a new bound instance; where the memory is full, free the kept arrays and try once more."""
+        try:
+            return self._bind(device, first.shape, first.dtype, queue)
+        except DeviceLimitError:
+            raise
+        except DeviceMemoryError:
+            if not kept_bound():
+                raise
+        # After the `except` block: its exception refers to the frames of the failed attempt, and so to the arrays.
+        clear_cache()
+        return self._bind(device, first.shape, first.dtype, queue)
 
 
 def _device(device: Device | None) -> Device:

@@ -19,7 +19,7 @@ import numpy as np
 
 from gpuvision.host.device import Device
 from gpuvision.host.device_choice import candidate_devices
-from gpuvision.host.errors import StreamError
+from gpuvision.host.errors import GpuVisionError, StreamError
 from gpuvision.host.memory import free_bytes
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Pipeline
@@ -147,6 +147,8 @@ class Plan:
         Measurements on the device; the last ones measured the chosen batch.
     other_devices : mapping of str to float or None
         Latency of the plan for each other measured device by its label [s]; ``None`` where it does not keep up.
+    unusable : mapping of str to str
+        First line of the error of each device that cannot run the operation, by its label.
     """
 
     device: Device
@@ -158,6 +160,7 @@ class Plan:
     ring_bytes: int
     trials: tuple[Trial, ...]
     other_devices: Mapping[str, float | None] = field(default_factory=dict)
+    unusable: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -178,7 +181,7 @@ class Plan:
         others = [
             f"{label} {'does not keep up' if seconds is None else f'{1e3 * seconds:.3g} ms'}"
             for label, seconds in self.other_devices.items()
-        ]
+        ] + [f"{label} is not usable: {reason}" for label, reason in self.unusable.items()]
         latency = f" with a latency of {1e3 * self.latency:.3g} ms ({', '.join(others)})" if others else ""
         return (
             f"on {self.device.label}{latency}: batches of {self.batch}, a ring of {self.ring} slots "
@@ -189,7 +192,8 @@ class Plan:
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as dictionaries, lists and numbers for JSON."""
         trials = [asdict(each) for each in self.trials]
-        return {**vars(self), "device": self.device.label, "trials": trials, "other_devices": dict(self.other_devices)}
+        others = {"other_devices": dict(self.other_devices), "unusable": dict(self.unusable)}
+        return {**vars(self), "device": self.device.label, "trials": trials, **others}
 
 
 def plan_stream(
@@ -287,22 +291,26 @@ def _fastest(plan: Callable[[Device], Plan], devices: Sequence[Device]) -> Plan:
 
     Raises
     ------
-    StreamError
-        No device keeps up; the error is the first device's.
+    GpuVisionError, ValueError
+        No device runs the operation and keeps up; the error is the first device's.
     """
     plans: dict[str, Plan | None] = {}
-    failures: list[StreamError] = []
+    unusable: dict[str, str] = {}
+    failures: list[Exception] = []
     for device in devices:
         try:
             plans[device.label] = plan(device)
         except StreamError as error:
             plans[device.label] = None
             failures.append(error)
+        except (GpuVisionError, ValueError) as error:
+            unusable[device.label] = str(error).partition("\n")[0]
+            failures.append(error)
     best = min((each for each in plans.values() if each is not None), key=lambda each: each.latency, default=None)
     if best is None:
         raise failures[0]
     others = {label: None if each is None else each.latency for label, each in plans.items() if each is not best}
-    return replace(best, other_devices=others)
+    return replace(best, other_devices=others, unusable=unusable)
 
 
 def _plan_on(

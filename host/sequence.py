@@ -16,7 +16,7 @@ import pyopencl as cl
 from gpuvision.host.arrays import DeviceArray, HostArray, host_view
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
-from gpuvision.host.launch import Spec, Specs, nbytes_of
+from gpuvision.host.launch import Spec, Specs, check_shape, nbytes_of
 from gpuvision.host.operation import Operation
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -123,6 +123,7 @@ class BoundSequence(Bound[R]):
         queue: Any,
         inputs: Sequence[DeviceArray] = (),
     ) -> None:
+        check_shape(type(operation).__name__, shape)
         layout = operation.layout(device, shape, dtype)
         specs = operation.specs(device, shape, dtype)
         self.operation, self.device = operation, device

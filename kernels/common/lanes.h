@@ -210,7 +210,8 @@ static inline sample_range samples_of_item(ulong each, ulong count) {
     range.begin = get_global_id(0) * each;
     range.end = min(range.begin + each, count);
 #else
-    range.begin = min(get_group_id(0) * each, count - each) + get_local_id(0);
+    const ulong group = get_local_size(0); // the host halves the groups where a device lacks registers
+    range.begin = min(get_group_id(0) * group, count - group) + get_local_id(0);
     range.end = range.begin + 1;
 #endif
     return range;

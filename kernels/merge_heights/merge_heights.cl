@@ -16,7 +16,7 @@
 //          constants below; 0: no height. require_both: whether a height that one map alone has is dropped, 0 or 1.
 // Build options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, WITH_SIGMA, VECTOR_VARIANT, PAST_CACHES.
 // Work:    vector variant: a work-item processes `each` consecutive cells in vectors of 16. Otherwise: one work-item per
-//          cell, in work-groups of `each` cells.
+//          cell, in work-groups of at most `cells` work-items.
 #include "common/load.h"
 #include "common/status.h"
 
@@ -130,7 +130,7 @@ kernel void merge_heights(global const INPUT *restrict z1, global const INPUT *r
                  max_sigmas, tolerance, disagreement, require_both, z, intensity, status, sigma, source);
     }
 #else
-    const ulong i = min(get_group_id(0) * each, cells - each) + get_local_id(0);
+    const ulong group = get_local_size(0), i = min(get_group_id(0) * group, cells - group) + get_local_id(0);
     merge_at(i, load_heights(i, z1, intensity1, status1, sigma1), load_heights(i, z2, intensity2, status2, sigma2),
              max_sigmas, tolerance, disagreement, require_both, z, intensity, status, sigma, source);
 #endif

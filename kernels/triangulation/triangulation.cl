@@ -10,8 +10,7 @@
 // Build options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, LENS, LENS_K2, LENS_K3, LENS_K4,
 //          SHEET_SIGMAS, SHEET_COVARIANCE, PAST_CACHES, VECTOR_VARIANT.
 // Work:    vector variant: a work-item processes `each` consecutive points in vectors of 16. Otherwise: one work-item
-// per
-//          point, in work-groups of `each` points.
+//          per point, in work-groups of at most `points` work-items.
 #include "common/load.h"
 #include "common/sheet.h"
 
@@ -45,7 +44,7 @@ kernel void triangulate(global const INPUT *restrict u, global const INPUT *rest
         triangulate_at(min(next, points - LANES), u, v, g, h, status, sigma_g, sigma_h, sheet, sigma_u, sigma_v);
     }
 #else
-    const ulong i = min(get_group_id(0) * each, points - each) + get_local_id(0);
+    const ulong group = get_local_size(0), i = min(get_group_id(0) * group, points - group) + get_local_id(0);
     triangulate_at(i, u, v, g, h, status, sigma_g, sigma_h, sheet, sigma_u, sigma_v);
 #endif
 }

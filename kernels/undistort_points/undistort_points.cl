@@ -6,8 +6,8 @@
 // Tables:  model: parameters of the model.
 // Options: INPUT, REAL_IS_DOUBLE, INVERSE; the model: CAMERA (common/camera.h), LENS (common/lens.h) or PLANE
 //          (plane.h).
-// Variants: vector: a work-item processes `each` points, 16 in a vector; work-item: one point per item, `each` per
-//          work-group.
+// Variants: vector: a work-item processes `each` points, 16 in a vector; work-item: one point per item, in
+//          work-groups of at most `count` work-items.
 #include "common/camera.h"
 #include "common/lens.h"
 #include "common/plane.h"
@@ -74,7 +74,7 @@ kernel void undistort_points(global const INPUT *restrict points, global real *r
         const ulong i = min(next, count - LANES);
 #else
     {
-        const ulong i = min(get_group_id(0) * each, count - each) + get_local_id(0);
+        const ulong group = get_local_size(0), i = min(get_group_id(0) * group, count - group) + get_local_id(0);
 #endif
         reals x, y;
         load_points(points, i, &x, &y);

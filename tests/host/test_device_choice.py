@@ -5,14 +5,17 @@ from __future__ import annotations
 import copy
 import json
 import time
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from gpuvision.host import (
     ArraySource,
+    BuildError,
     Device,
+    DeviceLostError,
+    DeviceMemoryError,
     PlanLimits,
     StreamError,
     device_choice,
@@ -68,6 +71,34 @@ def test_without_a_gpu_one_device_is_measured(device: Device, monkeypatch: pytes
     assert device_choice.candidate_devices() == (device,)
 
 
+class Refused(PsdReadout):
+    """Operation that fails on the devices of these labels."""
+
+    failures: ClassVar[dict[str, Exception]] = {}
+
+    def __call__(self, *inputs: Any, device: Any = None, out: Any = None) -> Any:
+        if device.label in self.failures:
+            raise self.failures[device.label]
+        return super().__call__(*inputs, device=device, out=out)
+
+
+ERRORS = [BuildError("no\nlog"), DeviceMemoryError("no\nlog"), DeviceLostError("no\nlog"), ValueError("no\nlog")]
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda each: type(each).__name__)
+def test_a_device_that_cannot_run_the_operation_is_not_chosen(
+    gpu: Device, device: Device, error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Refused, "failures", {"gpu": error})
+    found = fastest_device(Refused(strip_length=6e-3), currents_of(3))
+    assert (found.device, set(found.seconds)) == (device, {device.label})
+    assert found.unusable == {"gpu": "no"}
+    assert str(found).endswith(" us (gpu is not usable: no)")
+    monkeypatch.setattr(Refused, "failures", {"gpu": error, device.label: StreamError("second")})
+    with pytest.raises(type(error), match="no"):
+        fastest_device(Refused(strip_length=6e-3), currents_of(3))
+
+
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, Cost]:
     """Costs of a batch by the label of the device, instead of measurements."""
@@ -78,6 +109,27 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, Cost]:
 
     monkeypatch.setattr(planning, "_Measurement", measurement)
     return costs
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda each: type(each).__name__)
+def test_plan_leaves_out_a_device_that_cannot_run_the_operation(
+    gpu: Device, device: Device, error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failing = {"gpu"}
+
+    def measurement(source: Any, steps: Any, device: Device, zero_copy: bool, limits: PlanLimits) -> Any:
+        if device.label in failing:
+            raise error
+        return lambda batch, inline: Cost(1e4, 1e-4, 1e-5)
+
+    monkeypatch.setattr(planning, "_Measurement", measurement)
+    chosen = plan()
+    assert (chosen.device, chosen.other_devices, chosen.unusable) == (device, {}, {"gpu": "no"})
+    assert "(gpu is not usable: no)" in str(chosen)
+    assert json.loads(json.dumps(chosen.to_dict()))["unusable"] == {"gpu": "no"}
+    failing.add(device.label)
+    with pytest.raises(type(error), match="no"):
+        plan()
 
 
 def plan() -> Any:

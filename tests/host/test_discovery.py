@@ -146,7 +146,6 @@ def test_driver_of_the_maker_precedes_pocl_on_a_gpu(see: Any) -> None:
         "clEnqueueNDRangeKernel failed: MEM_OBJECT_ALLOCATION_FAILURE",
         "clBuildProgram failed: OUT_OF_HOST_MEMORY",
         "clCreateContext failed: DEVICE_NOT_AVAILABLE",
-        "the probe kernel did not finish within 120 s",
         "the runtime ended the probe's process (exit -9: no message)",
     ],
 )
@@ -155,6 +154,47 @@ def test_verdict_of_a_busy_device_is_not_kept(see: Any, reason: str) -> None:
     (busy,) = discovery.probed_devices()
     assert (busy.healthy, busy.reason) == (False, reason)
     assert "start again when it is idle" in busy.advice
+    probed = see(FakePlatform())
+    assert discovery.probed_devices()[0].healthy
+    assert probed == [(0, 0)]
+
+
+def test_verdict_of_a_driver_without_answer_is_kept_for_an_hour(see: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 1_000_000.0
+    monkeypatch.setattr(discovery.time, "time", lambda: now)
+    reason = "the probe kernel did not finish within 120 s"
+    see(FakePlatform(), probe=lambda p, d: reason)
+    assert discovery.probed_devices()[0].reason == reason
+    now += 3500
+    probed = see(FakePlatform())
+    (hanging,) = discovery.probed_devices()
+    assert (hanging.reason, probed) == (reason, []), "no process waits for it again"
+    assert "kept for an hour: `gpuvision devices --probe` asks again" in hanging.advice
+    now += 200
+    probed = see(FakePlatform())
+    assert discovery.probed_devices()[0].healthy
+    assert probed == [(0, 0)]
+
+
+def test_verdict_of_a_driver_without_answer_ends_with_a_new_probe(see: Any) -> None:
+    two = FakePlatform(devices=[FakeDevice("good"), FakeDevice("hanging")])
+    see(two, probe=lambda p, d: "the probe kernel did not finish within 120 s" if d else "")
+    discovery.probed_devices()
+    probed = see(two)
+    assert all(each.healthy for each in discovery.probed_devices(probe_again=True))
+    assert probed == [(0, 1)]
+    probed = see(two)
+    assert all(each.healthy for each in discovery.probed_devices())
+    assert probed == []
+
+
+@pytest.mark.parametrize("until", [0, 1 << 60, "soon", None, [1]])
+def test_damaged_end_of_a_verdict_is_asked_anew(see: Any, cache: Path, until: Any) -> None:
+    see(FakePlatform())
+    discovery.probed_devices()
+    file = cache / "devices.json"
+    file.write_text(json.dumps({key: ["broken", until] for key in json.loads(file.read_text())}))
+    file.chmod(0o600)
     probed = see(FakePlatform())
     assert discovery.probed_devices()[0].healthy
     assert probed == [(0, 0)]

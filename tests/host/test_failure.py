@@ -6,7 +6,9 @@ import copy
 import gc
 import subprocess
 import sys
+import threading
 import weakref
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ import pyopencl as cl
 import pytest
 
 import gpuvision as gv
-from gpuvision.host import Device, DeviceLostError, DeviceMemoryError, StreamError, failure
+from gpuvision.host import Device, DeviceLimitError, DeviceLostError, DeviceMemoryError, StreamError, failure
 from gpuvision.host.kept import kept_bound
 from gpuvision.host.pipeline import Pipeline
 from gpuvision.ranging.psd import PsdReadout
@@ -78,6 +80,122 @@ def test_a_call_without_memory_frees_the_kept_arrays_and_tries_again(own: Device
     reading = READOUT(currents_of(4), device=own)
     assert reading.position.shape == (4, 5)
     assert [key[3] for key in kept_bound()] == [(4, 5, 2)]
+
+
+def test_the_second_attempt_starts_without_the_arrays_of_the_first(own: Device, monkeypatch: Any) -> None:
+    READOUT(currents_of(3), device=own)
+    real, made, alive = own.empty, [], []
+
+    def empty(shape: Any, dtype: Any, queue: Any = None) -> Any:
+        if len(made) == 1:
+            made.append(None)
+            raise DeviceMemoryError("full")
+        alive.extend(each() is not None for each in made[:1])
+        array = real(shape, dtype, queue)
+        made.append(weakref.ref(array))
+        return array
+
+    monkeypatch.setattr(own, "empty", empty)
+    assert READOUT(currents_of(4), device=own).position.shape == (4, 5)
+    assert alive
+    assert not any(alive)
+
+
+def test_an_array_beyond_the_limit_keeps_the_others(own: Device) -> None:
+    """Freed memory would not help: the kept instances stay."""
+    READOUT(currents_of(3), device=own)
+    kept = [*kept_bound()]
+    own.max_allocation = 100
+    with pytest.raises(DeviceLimitError, match="allocates at most 100 bytes at once"):
+        READOUT(currents_of(4), device=own)
+    assert [*kept_bound()] == kept
+
+
+def test_a_context_lost_at_an_allocation_is_opened_again(own: Device, monkeypatch: Any) -> None:
+    own.shares_memory = False
+    READOUT(currents_of(3), device=own)
+    dead, buffer, responds = own.context, cl.Buffer, failure.responds
+
+    def allocate(context: Any, *args: Any, **kwargs: Any) -> Any:
+        if context == dead:
+            raise error_of("INVALID_CONTEXT", "create_buffer")
+        return buffer(context, *args, **kwargs)
+
+    monkeypatch.setattr(cl, "Buffer", allocate)
+    monkeypatch.setattr(failure, "responds", lambda queue: queue.context != dead and responds(queue))
+    with pytest.raises(DeviceLostError, match=r"create_buffer failed: INVALID_CONTEXT.*was opened again"):
+        READOUT(currents_of(6), device=own)
+    assert own.context != dead
+    assert READOUT(currents_of(6), device=own).position.shape == (6, 5)
+
+
+def test_another_error_of_an_allocation_comes_through(own: Device, monkeypatch: Any) -> None:
+    def allocate(*args: Any, **kwargs: Any) -> Any:
+        raise error_of("INVALID_VALUE", "create_buffer")
+
+    own.shares_memory = False
+    monkeypatch.setattr(failure, "responds", lambda queue: True)
+    monkeypatch.setattr(cl, "Buffer", allocate)
+    with pytest.raises(cl.Error, match="INVALID_VALUE"):
+        own.empty((3,), np.float32)
+
+
+def test_errors_of_the_runtime_in_bind(own: Device, lose: Any, monkeypatch: Any) -> None:
+    """First use of new memory, first launch, and launch for the queue beside the inline one."""
+    message = "^PsdReadout: device .* has no memory for the launch"
+    own.shares_memory = False
+
+    def refuse(*args: Any, **kwargs: Any) -> Any:
+        raise error_of("MEM_OBJECT_ALLOCATION_FAILURE")
+
+    faults = {
+        "enqueue_fill_buffer": refuse,
+        "enqueue_nd_range_kernel": lambda *args, **kwargs: SimpleNamespace(wait=refuse),
+    }
+    for name, fault in faults.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(cl, name, fault)
+            with pytest.raises(DeviceMemoryError, match=message):
+                READOUT.bind(own, (3, 5, 2), np.float32)
+    bound = READOUT._bind(own, (3, 5, 2), np.float32, None)
+    if bound._inline_site is not None:
+        lose(own, "MEM_OBJECT_ALLOCATION_FAILURE")
+        with pytest.raises(DeviceMemoryError, match=message):
+            bound.prepare_queue()
+
+
+def test_two_threads_meet_one_loss(own: Device, monkeypatch: Any) -> None:
+    """Both find the context dead before one of them opens the device again."""
+    both = threading.Barrier(2, timeout=10)
+
+    def responds(queue: Any) -> bool:
+        both.wait()
+        return False
+
+    monkeypatch.setattr(failure, "responds", responds)
+    lost, queue, failures = own.context, own.queue, []
+
+    def meet() -> None:
+        failures.append(str(failure.launch_failure(error_of("OUT_OF_RESOURCES"), own, queue, "Psd")))
+
+    threads = [threading.Thread(target=meet) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(failures) == 2
+    assert all("was opened again" in each for each in failures)
+    assert own.context != lost
+
+
+def test_a_device_without_vectors_is_opened_again_with_its_original(own: Device) -> None:
+    scalar, lost = own.without_vectors(), own.context
+    assert scalar.reopen(lost)
+    assert scalar.context is own.context
+    assert own.context != lost
+    assert own.queue.context == own.context
+    assert own.reopen(lost), "opened already"
+    assert not own.reopen(own.context), "once only"
 
 
 def test_a_launch_without_memory(own: Device, lose: Any) -> None:

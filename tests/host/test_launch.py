@@ -32,7 +32,7 @@ from gpuvision.host import (
     type_defines,
     vector_work,
 )
-from gpuvision.host.launch import check_counts
+from gpuvision.host.launch import check_counts, describe_launch
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
 
@@ -287,6 +287,22 @@ def test_a_batch_of_too_many_samples_is_refused_before_its_memory_is_taken(devic
     camera = Camera(matrix=((9.0, 0.0, 4.0), (0.0, 9.0, 4.0), (0.0, 0.0, 1.0)))
     with pytest.raises(ValueError, match=r"UndistortPoints: an array of shape \(1073741824, 2\).*; split the input"):
         UndistortPoints(model=camera).bind(device, (1 << 30, 2), np.float32)
+
+
+@pytest.mark.parametrize("shape", [(1 << 33, 2), (3, 1 << 33), (0, 1 << 33), (7, 3)])
+def test_counts_are_checked_before_the_launch_is_described(shape: tuple[int, ...]) -> None:
+    """An operation converts counts to 32 bits, which may overflow in its description."""
+
+    class Counting(PsdReadout):
+        def launch(self, device: Any, shape: Any, dtype: Any) -> Any:
+            assert max(shape) < 1 << 31, "refused before"
+            return np.int32(shape[0] << 30)
+
+    message = (
+        "more than 2147483647 elements" if max(shape) > 7 else r"input of shape \(7, 3\) takes counts beyond the 32"
+    )
+    with pytest.raises(ValueError, match=rf"^Counting: .*{message}.*; split the input"):
+        describe_launch(Counting(strip_length=6e-3), Machine(is_cpu=False), shape, SINGLE)
 
 
 ODD = 1_000_003  # a prime: without padding, no group of more than one work-item divides it

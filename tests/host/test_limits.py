@@ -10,8 +10,10 @@ import pyopencl as cl
 import pytest
 
 import gpuvision as gv
-from gpuvision.host import Device, DeviceMemoryError
+from gpuvision.host import Device, DeviceLimitError, DeviceMemoryError, launch_builder
 from gpuvision.host.limits import fit_group
+from gpuvision.profiling.offline import ranging_builds, simulation_builds
+from gpuvision.profiling.offline.builds import Example, GpuModel
 
 
 def kernel(local_bytes: int = 0, largest: int = 256) -> Any:
@@ -67,17 +69,76 @@ def test_wrong_numbers_of_mesa_are_corrected() -> None:
         fit_group(kernel(65536), newer, (64,), name="Sum", label="rusticl")
 
 
-def test_bound_operations_ask_the_kernel(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A kernel with registers for groups of 8 runs in groups of 8, with the same results."""
-    readout = gv.PsdReadout(strip_length=2.0, variant="work_item")
-    pairs = np.linspace(0.1, 1.0, 2000, dtype=np.float32).reshape(1000, 2)
-    expected = readout(pairs, device=device)
+def test_limits_of_a_device_are_not_a_full_memory() -> None:
+    for of in (kernel(32772), kernel(256, largest=32)):
+        with pytest.raises(DeviceLimitError):
+            fit_group(of, handle(), (64,), name="Sum", label="gpu")
+
+
+@pytest.fixture
+def small_groups(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Let each kernel have registers for groups of 8 work-items, within the context."""
     real = cl.Kernel.get_work_group_info
 
     def limited(self: Any, key: Any, of: Any) -> Any:
         return 8 if key == cl.kernel_work_group_info.WORK_GROUP_SIZE else real(self, key, of)
 
-    monkeypatch.setattr(cl.Kernel, "get_work_group_info", limited)
+    def limit() -> None:
+        monkeypatch.setattr(cl.Kernel, "get_work_group_info", limited)
+
+    return limit
+
+
+def fitted_examples(monkeypatch: pytest.MonkeyPatch) -> dict[str, Example]:
+    """Return an example of each operation whose last work-group moves back to end with the last element."""
+    real, fitted = launch_builder._GROUPINGS["fitted"], []
+    monkeypatch.setitem(launch_builder._GROUPINGS, "fitted", lambda *size: fitted.append(size) or real(*size))
+    found: dict[str, Example] = {}
+    seen = set()
+    for example in (*ranging_builds.examples(), *simulation_builds.examples()):
+        kind = type(example.operation).__name__
+        if kind not in seen:
+            seen.add(kind)
+            fitted.clear()
+            example.operation.launch(GpuModel(), example.shape, np.dtype(example.dtype))
+            if fitted:
+                found[kind] = example
+    return found
+
+
+def test_fitted_kernels_follow_smaller_groups(
+    device: Device, rng: np.random.Generator, small_groups: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kernels compute all elements in halved groups: their index follows the size with which the kernel runs."""
+    examples = fitted_examples(monkeypatch)
+    assert {"UndistortPoints", "Triangulation", "MergeHeights", "Reflectance", "LineIrradiance"} <= set(examples)
+    scalar = device.without_vectors()
+    expected = {}
+    for name, (_, operation, shape, dtype, _) in examples.items():
+        bound = operation.bind(scalar, (301, *shape[1:]), dtype)
+        inputs = [
+            rng.integers(0, 2, each.shape, np.uint8) if each.dtype == np.uint8 else rng.uniform(0.1, 1.0, each.shape)
+            for each in bound.inputs
+        ]
+        given = [values.astype(each.dtype) for values, each in zip(inputs, bound.inputs, strict=True)]
+        expected[name] = (given, bound.on_host(given))
+    small_groups()
+    for name, (given, result) in expected.items():
+        _, operation, shape, dtype, _ = examples[name]
+        bound = operation.bind(scalar, (301, *shape[1:]), dtype)
+        if device.kind != "rusticl":
+            assert bound.enqueue_arguments[3] == (8,), name
+        for field, values in zip(result._fields, result, strict=True):
+            found = getattr(bound.on_host(given), field)
+            np.testing.assert_array_equal(found, values, err_msg=f"{name}.{field}")
+
+
+def test_bound_operations_ask_the_kernel(device: Device, small_groups: Any) -> None:
+    """A kernel with registers for groups of 8 runs in groups of 8, with the same results."""
+    readout = gv.PsdReadout(strip_length=2.0, variant="work_item")
+    pairs = np.linspace(0.1, 1.0, 2000, dtype=np.float32).reshape(1000, 2)
+    expected = readout(pairs, device=device)
+    small_groups()
     bound = readout.bind(device, pairs.shape, pairs.dtype)
     found = bound.on_host((pairs,))
     if device.kind != "rusticl":

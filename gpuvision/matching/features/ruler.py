@@ -40,7 +40,7 @@ EDGE_SELECTIONS = ("strongest", "first", "last", "all")
 RULER_COLUMNS = ("x_px", "y_px", "cosine", "sine", "polarity", "least_spacing_px", "greatest_spacing_px")
 """Columns of the rulers with ``RulerEdges.per_ruler``; without it the first four."""
 MAX_LENGTH = 512
-"""Largest number of samples: the kernel has one bit of 32 for each 16 gradients."""
+"""Largest number of samples: the larger capacity of the kernel's arrays of samples."""
 SAMPLING_SIGMA_PX = 0.02
 """Standard deviation of the error that bilinear sampling adds to an edge [px]; neighbours share a part (measured)."""
 MAX_WIDTH = 255

@@ -41,7 +41,7 @@ def draw_placements(
     motion : sequence of numpy.ndarray
         Distance from the target in each frame, (frames, 3) for each placement [m], [m], [rad].
     response : numpy.ndarray
-        (frames,): error in each frame by theory, as a fraction of the start error; drawn for the first placement.
+        (frames, 3): errors in each frame by theory, as fractions of the start errors; drawn for the first placement.
     error : numpy.ndarray
         (n, 3): error at the release; NaN where the part was not released.
     sigmas : numpy.ndarray
@@ -125,8 +125,8 @@ def _draw_motion(
         axes.semilogy(
             1e3 * period * np.arange(len(each)), quantity.factor * distance, color="C0", alpha=0.5, linewidth=0.8
         )
-    first = quantity.factor * float(np.linalg.norm(motion[0][0, quantity.columns]))
-    theory = first * np.abs(response[: len(motion[0])])
+    first = motion[0][0, quantity.columns]
+    theory = quantity.factor * np.linalg.norm(first * response[: len(motion[0]), quantity.columns], axis=1)
     axes.semilogy(1e3 * period * np.arange(len(theory)), theory, color="C1", linestyle=":", label="theory, placement 1")
     axes.axhline(quantity.factor * tolerance, color="0.4", linestyle="--", linewidth=0.8, label="tolerance")
     axes.legend(fontsize=8)

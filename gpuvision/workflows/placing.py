@@ -89,9 +89,11 @@ class PlacementResult(NamedTuple):
     def settled(self) -> list[int | None]:
         """Frame from which on the true error, less calibration and drift, stays within `settling_band`.
 
-        Measured apart from the release rule; None for an error that is larger at the end.
+        Measured apart from the release rule; None for an error that is larger at the end, and for a part that was not
+        released.
         """
-        return [settled_frames(each, self.settling_band) for each in self._servo_motion]
+        pairs = zip(self.placements, self._servo_motion, strict=True)
+        return [settled_frames(motion, self.settling_band, released=each.released) for each, motion in pairs]
 
     @property
     def _landing_frames(self) -> int:
@@ -100,10 +102,10 @@ class PlacementResult(NamedTuple):
 
     @property
     def response(self) -> Float64:
-        """Error (frames,) in each frame of the longest run by theory, as a fraction of the start error."""
+        """Errors (frames, 3) in each frame of the longest run by theory, as fractions of the start errors."""
         landing = self._landing_frames
         frames = max(len(each) for each in self.motion) - landing
-        return np.concatenate([np.ones(landing), self.machine.error_after(max(frames, 1))])
+        return np.concatenate([np.ones((landing, 3)), self.machine.error_after(max(frames, 1))])
 
     @property
     def predicted_settling(self) -> list[int]:

@@ -262,7 +262,7 @@ def test_delay_and_errors_of_placements(drawn: list[Figure], tmp_path: Path) -> 
         tmp_path / "placements.png",
         period=2e-3,
         motion=[np.full((3, 3), 1e-5)],
-        response=np.array([1.0, 0.2, 0.04]),
+        response=np.outer([1.0, 0.2, 0.04], np.ones(3)),
         error=error,
         sigmas=np.array([1e-6, 2e-6, 1e-4]),
         delay={"exposure": 1e-3, "pose": 3e-3},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -33,7 +34,7 @@ def test_errors_of_position_and_angle_are_drawn_as_outlines(drawn: list[Figure],
         tmp_path / "placements.png",
         period=1e-3,
         motion=motion,
-        response=np.array([1.0, 0.2, 0.04]),
+        response=np.array([[1.0] * 3, [0.2, 0.1, 0.4], [0.04] * 3]),
         error=error,
         sigmas=np.array([1e-6, 1e-6, 1e-4]),
         delay={"exposure": 1e-3},
@@ -41,9 +42,10 @@ def test_errors_of_position_and_angle_are_drawn_as_outlines(drawn: list[Figure],
     )
     panels: dict[str, Any] = {each.get_xlabel() + each.get_ylabel(): each for each in drawn[0].axes}
     (distance, theory, position_limit) = panels["time [ms]distance from the target [µm]"].lines
-    (angle, _, angle_limit) = panels["time [ms]angle from the target [mrad]"].lines
+    (angle, angle_theory, angle_limit) = panels["time [ms]angle from the target [mrad]"].lines
     np.testing.assert_allclose(distance.get_ydata(), [50.0, 5.0])
-    np.testing.assert_allclose(theory.get_ydata(), [50.0, 10.0])
+    np.testing.assert_allclose(theory.get_ydata(), [50.0, math.hypot(0.2 * 30.0, 0.1 * 40.0)])
+    np.testing.assert_allclose(angle_theory.get_ydata(), [5.0, 2.0])
     np.testing.assert_allclose(angle.get_ydata(), [5.0, 1.0])
     assert (position_limit.get_ydata()[0], angle_limit.get_ydata()[0]) == pytest.approx((5.0, 2.0))
     for unit, coordinates in (("µm", 2), ("mrad", 1)):

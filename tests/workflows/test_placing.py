@@ -109,6 +109,13 @@ def test_parts_land_where_and_when_the_prediction_says(artwork: Artwork, machine
     assert list(report["measured_rms"]["total"].values()) == pytest.approx(np.sqrt(np.mean(result.error**2, axis=0)))
     assert len(report["placements"]) == 6
     assert "6 of 6 parts placed" in result.summary()
+    # An aborted run is not settled, even if its last errors are small.
+    first = result.placements[0]._replace(released=False, reason="stalled")
+    error = np.vstack([np.full(3, np.nan), result.error[1:]])
+    aborted = result._replace(placements=(first, *result.placements[1:]), error=error)
+    assert aborted.settled == [None, *counted[1:]]
+    assert [each["settled_frames"] for each in aborted.report()["placements"]] == [None, *counted[1:]]
+    assert "not settled before the release: 1" in aborted.summary()
 
 
 def test_the_simulated_machine_keeps_all_commands_of_a_placement(

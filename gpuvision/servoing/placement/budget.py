@@ -75,15 +75,40 @@ def noise_gain(
     ValueError
         The loop is not stable, or the gain is 0.
     """
-    zeros, poles = closed_loop(delay, gain, integral=integral, derivative=derivative, lag=lag)
+    loop = closed_loop(delay, gain, integral=integral, derivative=derivative, lag=lag)
+    return _variance(loop.numerator, loop.denominator, f"the loop with delay {delay:g} frames and gain {gain:g}")
+
+
+def _variance(zeros: Float64, poles: Float64, name: str) -> float:
+    """Return the variance behind a transfer function of white noise with the variance 1."""
     total = 0.0
     while len(poles) > 1:
         if abs(poles[-1]) >= poles[0]:
-            raise ValueError(f"the loop with delay {delay:g} frames and gain {gain:g} is not stable: no variance")
+            raise ValueError(f"{name} is not stable: no variance")
         total += zeros[-1] ** 2 / poles[0]
         mirrored = poles[::-1] / poles[0]
         poles, zeros = (poles - poles[-1] * mirrored)[:-1], (zeros - zeros[-1] * mirrored)[:-1]
     return float(total + zeros[0] ** 2 / poles[0])
+
+
+def _noise_gains(machine: Machine) -> Float64:
+    """Return the covariances (3, 3) of the positions of the axes over the covariances of a measured pose.
+
+    With the transfer functions H and G of two axes, the covariance is a quarter of the difference of the variances of
+    ``H + G`` and ``H - G``.
+    """
+    lags, gain, delay = machine.control_lags, machine.loop_gain, machine.control_delay
+    name = f"the loop with gain {gain:g}"
+    gains = np.zeros((3, 3))
+    for row, column in np.ndindex(3, 3):
+        if lags[row] == lags[column]:
+            gains[row, column] = noise_gain(delay, gain, **machine.time_constants(lags[row]))
+            continue
+        one, other = (closed_loop(delay, gain, **machine.time_constants(lags[each])) for each in (row, column))
+        first, second = np.convolve(one.numerator, other.denominator), np.convolve(other.numerator, one.denominator)
+        poles = np.convolve(one.denominator, other.denominator)
+        gains[row, column] = (_variance(first + second, poles, name) - _variance(first - second, poles, name)) / 4.0
+    return gains
 
 
 def noise_covariance(machine: Machine, reported: Float64, noise: Float64, frames: int) -> Float64:
@@ -108,16 +133,16 @@ def noise_covariance(machine: Machine, reported: Float64, noise: Float64, frames
     Notes
     -----
     The latest pose and the Smith predictor pass the error of a pose on to the controller: `noise_gain` times the noise,
-    the limit for many frames. The Kalman filter has the correction K_j in frame j: 1 in the first frame, then smaller
-    from frame to frame, by the recursion of the covariance. The error of its estimate,
-    ``e_k = (1 - K_k) e_(k-1) + K_k noise_k``, drives a loop without delay that has the impulse response h. The error at
-    the release in frame n is the sum of ``A_j K_j noise_j`` with ``A_j = h_(n-j) + A_(j+1) (1 - K_(j+1))``.
+    the limit for many frames. With the Smith predictor each axis has its lag, and two axes with different lags have the
+    sum of the products of their impulse responses. The Kalman filter has the correction K_j in frame j: 1 in the first
+    frame, then smaller from frame to frame, by the recursion of the covariance. The error of its estimate, ``e_k = (1 -
+    K_k) e_(k-1) + K_k noise_k``, drives a loop without delay that has the impulse response h. The error at the release
+    in frame n is the sum of ``A_j K_j noise_j`` with ``A_j = h_(n-j) + A_(j+1) (1 - K_(j+1))``.
     """
-    delay, constants = machine.control_delay, machine.time_constants
     if machine.control.motion_sigma is None:
-        return noise_gain(delay, machine.loop_gain, **constants) * noise
+        return _noise_gains(machine) * noise
     corrections = _corrections(reported, np.diag(machine.control.motion_sigma) ** 2, frames)
-    response = -np.diff(machine.error_after(frames + 1))  # h_1 ... h_n
+    response = -np.diff(machine.error_after(frames + 1)[:, 0])  # h_1 ... h_n, the same for all axes
     covariance, later, unit = np.zeros((3, 3)), np.zeros((3, 3)), np.eye(3)
     for frame in range(frames - 1, -1, -1):
         later = later + response[frames - 1 - frame] * unit
@@ -152,7 +177,10 @@ class ModelTolerance(NamedTuple):
 
 
 def model_tolerance(machine: Machine, plan: PlacementPlan) -> ModelTolerance | None:
-    """Return the errors of the model at which the loop becomes unstable; None for a predictor with PI or PID."""
+    """Return the errors of the model at which the loop becomes unstable; None for a predictor with PI or PID.
+
+    With a predictor, each axis counts with its lag, and the least errors of the axes are returned.
+    """
     gain, delay, period = machine.loop_gain, machine.delay.frames, machine.period
     observer = machine.control.observer
     if observer == "latest":
@@ -161,11 +189,17 @@ def model_tolerance(machine: Machine, plan: PlacementPlan) -> ModelTolerance | N
     if machine.control.controller != "p":
         return None
     if machine.control.motion_sigma is None:
-        predictor = predictor_tolerance(gain, delay, lag=machine.control_lag)
-        return ModelTolerance(predictor.plant_gain, predictor.longer * period)
-    ratio = np.array(machine.control.motion_sigma) / np.sqrt(np.diag(plan.reported))
-    each = [observer_tolerance(gain, delay, lag=machine.lag / period, noise_ratio=float(one)) for one in ratio]
-    return ModelTolerance(min(one.plant_gain for one in each), min(one.longer for one in each) * period)
+        lags = dict.fromkeys(machine.control_lags)
+        predictors = [predictor_tolerance(gain, delay, lag=lag) for lag in lags]
+        return ModelTolerance(
+            min(each.plant_gain for each in predictors), min(each.longer for each in predictors) * period
+        )
+    ratios = np.array(machine.control.motion_sigma) / np.sqrt(np.diag(plan.reported))
+    observers = [
+        observer_tolerance(gain, delay, lag=axis.lag / period, noise_ratio=float(ratio))
+        for axis, ratio in zip(machine.axes, ratios, strict=True)
+    ]
+    return ModelTolerance(min(each.plant_gain for each in observers), min(each.longer for each in observers) * period)
 
 
 def predict_budget(machine: Machine, plan: PlacementPlan, frames: npt.ArrayLike | None = None) -> ErrorBudget:

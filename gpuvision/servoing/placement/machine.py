@@ -198,8 +198,9 @@ class Machine:
     tolerance : Tolerance
         Limits of a placement.
     axes : tuple of Axis
-        Axes x, y and theta of the head. Gain and predicted frames count the longest lag as a delay; the rest is for the
-        simulated machine. Default: axes that follow at once.
+        Axes x, y and theta of the head. With the observers "latest" and "kalman", gain and predicted frames count the
+        longest lag as a delay of all axes; with "smith" the theory of each axis has its lag, and the least limit of the
+        gain counts. The rest is for the simulated machine. Default: axes that follow at once.
     rate : float
         Frames per second, above 0; default 1000.
     transfer : float
@@ -263,8 +264,10 @@ class Machine:
     def _check_stability(self) -> None:
         """Raise a `ValueError` for a gain that is unstable or too small."""
         gain, delay = self.control.gain, self.control_delay
-        if self.control_lag:
-            most, cause = lag_gains(self.control_lag).limit, f"a lag of {self.control_lag:.2f} frames"
+        if any(self.control_lags):
+            # The limit is not monotonic in the lag: 2 without a lag, 3.8 at 0.3 frames, 2.39 at 1 frame.
+            most, lag = min((lag_gains(each).limit, each) for each in self.control_lags)
+            cause = f"a lag of {lag:.2f} frames"
         else:
             # Below half a frame a delay raises the limit, a lag does not.
             most, cause = gain_limit(max(delay, 0.5) if self.lag else delay), f"a delay of {delay:.2f} frames"
@@ -276,12 +279,15 @@ class Machine:
             raise ValueError(f"gain is {gain}, expected {_MIN_GAIN} or more: the loop would hardly move")
         if self.control.controller == "p":
             return
-        gains, loop = self.gains, closed_loop(delay, self.loop_gain, **self.time_constants)
-        if not np.all(np.abs(np.roots(loop.denominator)) < 1.0):
-            raise ValueError(
-                f"the controller {self.control.controller} with gain {self.loop_gain:.4g}, integral "
-                f"{gains.integral:.4g} s and derivative {gains.derivative:.4g} s is not stable with {cause}"
-            )
+        gains = self.gains
+        for lag in dict.fromkeys(self.control_lags):
+            loop = closed_loop(delay, self.loop_gain, **self.time_constants(lag))
+            if not np.all(np.abs(np.roots(loop.denominator)) < 1.0):
+                raise ValueError(
+                    f"the controller {self.control.controller} with gain {self.loop_gain:.4g}, integral "
+                    f"{gains.integral:.4g} s and derivative {gains.derivative:.4g} s is not stable with "
+                    + (f"a lag of {lag:.2f} frames" if any(self.control_lags) else cause)
+                )
 
     @property
     def period(self) -> float:
@@ -320,22 +326,26 @@ class Machine:
     def control_delay(self) -> float:
         """Delay in frames that the controller sees: the part of `response_frames` that the observer does not predict.
 
-        The Smith predictor predicts the delay, and `control_lag` remains. The Kalman filter predicts the delay by the
-        time stamps, and the lag remains as a delay.
+        The Smith predictor predicts the delay, and `control_lags` remain. The Kalman filter predicts the delay by the
+        time stamps, and the longest lag remains as a delay.
         """
         if self.control.observer == "latest":
             return self.response_frames
         return self.lag / self.period if self.control.observer == "kalman" else 0.0
 
     @property
-    def control_lag(self) -> float:
-        """Longest lag of an axis in frames, where the theory of the loop has it as a lag: with the Smith predictor."""
-        return self.lag / self.period if self.control.observer == "smith" else 0.0
+    def control_lags(self) -> tuple[float, float, float]:
+        """Lags of x, y and theta in frames, where the theory has them as lags: with the Smith predictor; else 0."""
+        if self.control.observer != "smith":
+            return (0.0, 0.0, 0.0)
+        x, y, theta = (axis.lag / self.period for axis in self.axes)
+        return (x, y, theta)
 
     @property
-    def _smooth_gain(self) -> float:
-        """Largest proportional gain without oscillation."""
-        return lag_gains(self.control_lag).critical if self.control_lag else non_oscillating_gain(self.control_delay)
+    def _smooth_gains(self) -> tuple[float, ...]:
+        """Largest proportional gain without oscillation of each axis."""
+        free = non_oscillating_gain(self.control_delay)
+        return tuple(lag_gains(each).critical if each else free for each in self.control_lags)
 
     @property
     def loop_gain(self) -> float:
@@ -343,7 +353,7 @@ class Machine:
         if self.control.gain is not None:
             return self.control.gain
         if self.control.controller == "p":
-            return self._smooth_gain
+            return min(self._smooth_gains)
         return self._rule.proportional * self.period
 
     @property
@@ -363,30 +373,46 @@ class Machine:
     def _rule(self) -> PidGains:
         """Gains by the rule of Skogestad for the delay that the controller sees, with half a frame for the hold.
 
-        A lag counts as a delay.
+        The longest lag counts as a delay.
         """
-        return simc_gains((self.control_delay + self.control_lag + 0.5) * self.period)
+        return simc_gains((self.control_delay + max(self.control_lags) + 0.5) * self.period)
 
     def error_after(self, frames: int) -> Float64:
-        """Return the error (frames,) in each frame after a start error of 1, by theory."""
-        return step_response(self.control_delay, self.loop_gain, frames, **self.time_constants)
+        """Return the errors (frames, 3) of x, y and theta in each frame after start errors of 1, by theory."""
+        error = {
+            lag: step_response(self.control_delay, self.loop_gain, frames, **self.time_constants(lag))
+            for lag in dict.fromkeys(self.control_lags)
+        }
+        return np.stack([error[lag] for lag in self.control_lags], axis=1)
 
-    def frames_to(self, fraction: float) -> int:
-        """Return the number of frames after which a start error of 1 stays within a fraction, by theory."""
-        return settling_frames(self.control_delay, self.loop_gain, fraction, **self.time_constants)
+    def frames_to(self, fraction: npt.ArrayLike) -> int:
+        """Return the number of frames after which start errors of 1 of all axes stay within a fraction, by theory.
+
+        The fraction is a number above 0, or three for x, y and theta. A fraction of 1 or more takes no frame.
+        """
+        least: dict[float, float] = {}
+        for lag, each in zip(self.control_lags, np.broadcast_to(fraction, 3).tolist(), strict=True):
+            least[lag] = min(each, least.get(lag, 1.0))
+        counts = (
+            settling_frames(self.control_delay, self.loop_gain, each, **self.time_constants(lag))
+            for lag, each in least.items()
+            if each < 1.0
+        )
+        return max(counts, default=0)
 
     @property
-    def overshoot(self) -> float:
-        """Overshoot of the step response as a fraction of the start error, by theory; 0 without oscillation."""
-        if self.control.controller == "p" and self.loop_gain <= self._smooth_gain:
-            return 0.0
-        return max(-float(self.error_after(self.frames_to(_SETTLED) + 1).min()), 0.0)
+    def overshoot(self) -> Float64:
+        """Overshoot (3,) of the step response as a fraction of the start error, by theory; 0 without oscillation."""
+        is_smooth = np.array(self._smooth_gains) >= self.loop_gain
+        if self.control.controller == "p" and np.all(is_smooth):
+            return np.zeros(3)
+        found = np.maximum(-self.error_after(self.frames_to(_SETTLED) + 1).min(axis=0), 0.0)
+        return np.where(is_smooth & (self.control.controller == "p"), 0.0, found)
 
-    @property
-    def time_constants(self) -> dict[str, float]:
-        """Time constants ``integral``, ``derivative`` and ``lag`` [frames]: arguments of `closed_loop`."""
+    def time_constants(self, lag: float) -> dict[str, float]:
+        """Return the arguments ``integral``, ``derivative`` and ``lag`` [frames] of `closed_loop` for a lag."""
         integral, derivative = self.gains.integral / self.period, self.gains.derivative / self.period
-        return {"integral": integral, "derivative": derivative, "lag": self.control_lag}
+        return {"integral": integral, "derivative": derivative, "lag": lag}
 
     def for_side(self, side: Side) -> Machine:
         """Return the machine over a side of the board.

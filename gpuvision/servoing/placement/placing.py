@@ -154,18 +154,27 @@ def _frames_of_rule(machine: Machine, error: Float64) -> int:
 
 
 def predicted_frames(machine: Machine, error: npt.ArrayLike, fraction: float = REMAINDER) -> int:
-    """Return the number of frames in which the loop reduces an error (3,) to a fraction of the tolerance, by theory."""
-    share = error_share(machine, error) / fraction
-    return machine.frames_to(1.0 / share) if share > 1.0 else 0
+    """Return the number of frames in which the loop reduces an error (3,) to a fraction of the tolerance, by theory.
+
+    Both x and y take the frames of the distance: an upper bound if their axes have different lags.
+    """
+    distance, angle = _shares(machine, error)
+    shares = np.array([distance, distance, angle]) / fraction
+    return machine.frames_to(1.0 / np.maximum(shares, 1.0))
+
+
+def _shares(machine: Machine, error: npt.ArrayLike) -> tuple[float, float]:
+    """Return distance and angle of an error (3,) as fractions of their tolerances."""
+    x, y, theta = (float(each) for each in np.asarray(error))
+    return math.hypot(x, y) / machine.tolerance.position, abs(theta) / machine.tolerance.angle
 
 
 def error_share(machine: Machine, error: npt.ArrayLike) -> float:
     """Return an error (3,) as a fraction of the tolerance: the larger one of distance and angle."""
-    x, y, theta = (float(each) for each in np.asarray(error))
-    return max(math.hypot(x, y) / machine.tolerance.position, abs(theta) / machine.tolerance.angle)
+    return max(_shares(machine, error))
 
 
-def settled_frames(motion: Float64, band: Float64) -> int | None:
+def settled_frames(motion: Float64, band: Float64, *, released: bool) -> int | None:
     """Return the frame from which on an error stays within a band.
 
     Parameters
@@ -174,12 +183,16 @@ def settled_frames(motion: Float64, band: Float64) -> int | None:
         (frames, 3): error in each frame [m], [m], [rad], such as the true error of a simulation.
     band : numpy.ndarray
         (3,): largest errors [m], [m], [rad].
+    released : bool
+        Whether the part was released: an aborted run is not settled, even if its errors are small.
 
     Returns
     -------
     int or None
-        Number of the frame from 0; None if the last error is larger.
+        Number of the frame from 0; None if the last error is larger, or if the part was not released.
     """
+    if not released:
+        return None
     outside = np.flatnonzero(np.any(np.abs(motion) > band, axis=1))
     first = int(outside[-1]) + 1 if outside.size else 0
     return first if first < len(motion) else None
@@ -187,8 +200,7 @@ def settled_frames(motion: Float64, band: Float64) -> int | None:
 
 def predicted_settling(machine: Machine, start: Float64, band: Float64) -> int:
     """Return the number of frames after which a start error (3,) stays within a band (3,), by theory."""
-    share = float(np.max(np.abs(start) / band))
-    return machine.frames_to(1.0 / share) if share > 1.0 else 0
+    return machine.frames_to(1.0 / np.maximum(np.abs(start) / band, 1.0))
 
 
 def count_commands(machine: Machine) -> int:
@@ -279,8 +291,8 @@ def place_part(
     times the landing zone at most, by commands that answered trusted poses.
     """
     x, y, theta = (axis.lag for axis in machine.axes)
-    side = machine.overshoot * machine.tolerance.landing_zone
-    overshoot = (side, side, machine.overshoot * machine.tolerance.landing_angle)
+    zone = machine.tolerance
+    away = machine.overshoot * np.array([zone.landing_zone, zone.landing_zone, zone.landing_angle])
     goal = np.asarray(target, np.float64)
     observer = make_observer(machine, goal, clock.now())
     blind = landing + machine.delay.latency + machine.tolerance.max_refused * machine.period
@@ -294,7 +306,7 @@ def place_part(
         limits=LoopLimits(
             hold_after=blind,
             abort_after=blind,
-            overshoot=overshoot,
+            overshoot=(float(away[0]), float(away[1]), float(away[2])),
             lag=(x, y, theta),
             watchdog=machine.control.watchdog * machine.period,
         ),

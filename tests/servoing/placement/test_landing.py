@@ -27,6 +27,7 @@ def test_flags_of_the_refused_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     calibrated, pose = np.array([3e-3, -2e-3, 0.2]), np.array([0.1, 0.2, 0.5])
     rendered: list[np.ndarray] = []
     regions: list[Any] = []
+    changed: list[tuple[Any, dict[str, Any]]] = []
 
     def render(poses: np.ndarray, seeds: np.ndarray, device: Any) -> Any:
         rendered.append(poses)
@@ -35,7 +36,12 @@ def test_flags_of_the_refused_starts(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(landing.ReflectanceMap, "of", lambda artwork, **how: regions.append(how))
     monkeypatch.setattr(landing, "board_renderer", lambda board, camera, noise: render)
-    monkeypatch.setattr(landing, "replace", lambda camera, **changes: camera)
+
+    def recorded(camera: Any, **changes: Any) -> Any:
+        changed.append((camera, changes))
+        return camera
+
+    monkeypatch.setattr(landing, "replace", recorded)
     machine: Any = SimpleNamespace(
         camera=SimpleNamespace(window=(300, 400), pixel=1e-5, blur_px=0.7),
         tolerance=SimpleNamespace(landing_zone=1e-3, landing_angle=0.1),
@@ -44,6 +50,8 @@ def test_flags_of_the_refused_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     search: Any = Search()
     artwork: Any = None
     assert landing.refused_starts(artwork, pose, machine, search) == [Status.AMBIGUOUS, Status.LOW_SIGNAL]
+    # The ideal images have no distortion.
+    assert changed == [(machine.camera, {"lens": None})]
     (poses,) = rendered
     nozzle = compose_poses(poses[:, 0], calibrated) - compose_poses(pose, calibrated)
     signs = nozzle / [0.9e-3, 0.9e-3, 0.09]

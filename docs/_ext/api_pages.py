@@ -138,6 +138,7 @@ MODULES = (
     "gpuvision.inspection.deposits",
     "gpuvision.inspection.height_noise",
     "gpuvision.inspection.paste",
+    "gpuvision.inspection.phase_sigmas",
     "gpuvision.inspection.reference_surface",
     "gpuvision.inspection.top_height",
     "gpuvision.servoing.axis",

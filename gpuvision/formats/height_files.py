@@ -69,7 +69,7 @@ class ImageScale:
 
 
 class HeightMapFile(NamedTuple):
-    """Heights of a file with their grid and their standard deviation.
+    """Heights of a file with their grid and their standard deviations.
 
     Attributes
     ----------
@@ -78,13 +78,24 @@ class HeightMapFile(NamedTuple):
     grid
         Grid of the heights.
     sigma
-        Standard deviation of each height [m], (rows, columns); None if the file has none. Of a scan: its random error
-        and the error of the line's phase in its pixel (``map_sigma`` and ``map_phase``) together.
+        Random standard deviation of each height [m], (rows, columns); None if the file has none.
+    phase
+        Standard deviation [m] by the phase of the line in its pixel (``map_phase`` of a scan), (rows, columns), NaN
+        where it is unknown: neighbouring cells share this error. None if the file has none.
     """
 
     z: npt.NDArray[Any]
     grid: Grid
     sigma: npt.NDArray[Any] | None = None
+    phase: npt.NDArray[Any] | None = None
+
+    @property
+    def total_sigma(self) -> npt.NDArray[Any] | None:
+        """Standard deviation of each height by ``sigma`` and ``phase`` together [m]; None without ``sigma``."""
+        if self.sigma is None or self.phase is None:
+            return self.sigma
+        both: npt.NDArray[Any] = np.hypot(self.sigma, np.where(np.isfinite(self.phase), self.phase, 0.0))
+        return both.astype(self.sigma.dtype)
 
 
 def read_heights(path: str | os.PathLike[str], scale: ImageScale | None = None) -> HeightMapFile:
@@ -149,9 +160,7 @@ def scanned_map(arrays: Mapping[str, npt.NDArray[Any]], path: Path) -> HeightMap
             or any(each is not None and each.shape != z.shape for each in (sigma, phase))
         ):
             raise ReadError(f"{path}: map_z has shape {z.shape}, expected one row per map_y and one column per map_x")
-        if sigma is not None and phase is not None:
-            sigma = np.hypot(sigma, np.where(np.isfinite(phase), phase, 0.0)).astype(sigma.dtype)
-        return HeightMapFile(z, _even_grid(x.astype(np.float64), y.astype(np.float64), path), sigma)
+        return HeightMapFile(z, _even_grid(x.astype(np.float64), y.astype(np.float64), path), sigma, phase)
 
 
 def _even_grid(x: Float64, y: Float64, path: Path) -> Grid:

@@ -18,6 +18,7 @@ from gpuvision.inspection.aperture_cells import cells_of
 from gpuvision.inspection.apertures import Aperture
 from gpuvision.inspection.coverage import covered
 from gpuvision.inspection.height_noise import complete_sigmas
+from gpuvision.inspection.phase_sigmas import common_sigma, complete_phase
 from gpuvision.inspection.top_height import top_height
 from gpuvision.matching.artwork.shapes import Float64
 from gpuvision.normal_distribution import MAD_TO_SIGMA
@@ -66,7 +67,7 @@ class Coplanarity(NamedTuple):
     lowest
         Name of the lead with the largest gap.
     noise
-        Standard deviation of the heights [m] that the sigmas use; NaN if unknown.
+        Standard deviation of the heights [m] that the sigmas use, with the phase; NaN if unknown.
     """
 
     names: tuple[str, ...]
@@ -152,6 +153,7 @@ def measure_coplanarity(
     regions: Sequence[Aperture],
     *,
     sigma: float | npt.NDArray[np.floating] | None = None,
+    phase: npt.NDArray[np.floating] | None = None,
     correlation_area: float = 1.0,
     centre: tuple[float, float] | None = None,
 ) -> Coplanarity:
@@ -169,6 +171,9 @@ def measure_coplanarity(
         Random standard deviation of the heights [m]: one for all, or one per cell. Default: from the third differences
         of neighbours in the regions, which is too small if neighbours share noise. It is NaN (unknown) if no region
         has four neighbours in a row or column.
+    phase : numpy.ndarray, optional
+        Standard deviation of an error that neighbouring cells share [m], one per cell, NaN where it is unknown: of the
+        phase of a laser line in its pixel. All cells of a lead share it, two leads do not. Default: none.
     correlation_area : float
         Number of cells whose noise is common, 1 or more. Default 1.
     centre : tuple of float, optional
@@ -196,7 +201,13 @@ def measure_coplanarity(
     parts = [_region(heights, grid, each) for each in regions]
     noise = _noise(parts) if sigma is None else sigma
     sigmas = complete_sigmas(np.asarray(noise, np.float64), grid.shape)
-    return _compare_tops(regions, _tops(regions, parts, sigmas, grid, correlated), centre, float(np.median(sigmas)))
+    tops = _tops(regions, parts, sigmas, grid, correlated)
+    phases = complete_phase(None if phase is None else np.asarray(phase, np.float64), grid.shape)
+    if phases is not None:
+        common = [common_sigma(phases[rows, columns], inside) for _, inside, rows, columns in parts]
+        tops[:, 1] = np.hypot(tops[:, 1], common)
+        sigmas = np.hypot(sigmas, phases)
+    return _compare_tops(regions, tops, centre, float(np.median(sigmas)))
 
 
 def _compare_tops(

@@ -19,6 +19,7 @@ from gpuvision.inspection import height_noise
 from gpuvision.inspection.aperture_cells import Bools, Window, aperture_windows, cells_of, owner_map
 from gpuvision.inspection.apertures import Aperture, BoardPlacement
 from gpuvision.inspection.deposits import DepositSums, MeasureDeposits, deposit_boxes, deposit_surfaces
+from gpuvision.inspection.phase_sigmas import complete_phase, phase_sigmas
 from gpuvision.inspection.reference_surface import MAX_ORDER, ReferenceSurface, fit_reference
 from gpuvision.inspection.top_height import top_height
 from gpuvision.matching.artwork.shapes import Float64
@@ -29,6 +30,7 @@ from gpuvision.validation import finite, integer
 _DOUBLINGS = 4  # of the width of the ring, until it has enough cells
 _MOST_RINGS = 50  # rings from which the correlation is estimated. Chosen: they have 100 000 cells
 _TOP_PATCH = 0.15  # half width of the patch of the largest height, in square roots of the area. Chosen
+_SIGNIFICANCE = 3.0  # standard deviations of the volume from which on a deposit has an offset
 _STATUS = {Status.OK: "measured", Status.LOW_SIGNAL: "missing", Status.NO_DATA: "holes"}
 
 
@@ -122,7 +124,7 @@ class Deposits(NamedTuple):
     reference
         Height of the reference surface at the centre [m].
     noise
-        Standard deviation of the heights [m] that the sigmas use: median over all cells.
+        Standard deviation of the heights [m] that the sigmas use, with the phase: median over all cells.
     board_scatter
         Robust standard deviation of the board about the reference surfaces [m]: noise and roughness.
     correlation_area
@@ -159,6 +161,7 @@ def measure_deposits(
     settings: PasteSettings,
     *,
     sigma: float | npt.NDArray[np.floating] | None = None,
+    phase: npt.NDArray[np.floating] | None = None,
     correlation_area: float | None = None,
     precision: Precision = None,
     device: Device | None = None,
@@ -180,6 +183,9 @@ def measure_deposits(
     sigma : float or numpy.ndarray, optional
         Random standard deviation of the heights [m]: one for all, or one per cell. Default: the robust standard
         deviation of the board about the reference surfaces, which includes the roughness of the board.
+    phase : numpy.ndarray, optional
+        Standard deviation of an error that neighbouring cells share [m], one per cell, NaN where it is unknown: of the
+        phase of a laser line in its pixel. Default: none.
     correlation_area : float, optional
         Number of cells whose noise is common, 1 or more. Default: estimated from the board about the reference
         surfaces, up to 4 cells apart.
@@ -206,6 +212,10 @@ def measure_deposits(
     reference surface. They do not contain errors that all heights share (scale, calibration), nor the sampling of steep
     walls: a vertical wall of height h and length p changes the volume by up to h p c / 2 with cells of size c, if it is
     parallel to the cells, and by much less otherwise.
+
+    The phase counts as one error of all cells of a deposit, and one error of its reference, independent of each other:
+    an upper bound of the standard deviation for reference surfaces of order 0 and 1. See
+    `gpuvision.inspection.phase_sigmas.phase_sigmas`.
     """
     heights = np.asarray(z, np.float64)
     if heights.shape != grid.shape:
@@ -215,12 +225,15 @@ def measure_deposits(
     job = _Job(
         heights,
         height_noise.complete_sigmas(noise, grid.shape),
+        complete_phase(None if phase is None else np.asarray(phase, np.float64), grid.shape),
         grid,
         settings,
         _correlation_area(heights, grid, board, settings, correlation_area),
         placement,
     )
-    return _deposits(apertures, job, board, _sums(job, board.known, precision, device))
+    sums = _sums(job, board.known, precision, device)
+    _add_phase(sums, job, board.known)
+    return _deposits(apertures, job, board, sums)
 
 
 class _Known(NamedTuple):
@@ -251,6 +264,7 @@ class _Job(NamedTuple):
 
     z: Float64
     sigmas: Float64
+    phases: Float64 | None
     grid: Grid
     settings: PasteSettings
     correlated: float
@@ -319,6 +333,7 @@ def _sums(job: _Job, known: Sequence[_Known], precision: Precision, device: Devi
         threshold=settings.level,
         correlation_area=job.correlated,
         least_valid=settings.least_valid,
+        significance=_SIGNIFICANCE,
         to_board=np.linalg.inv(job.placement.matrix),
     )
     sigmas = np.maximum(job.sigmas, np.finfo(real).tiny)
@@ -333,26 +348,58 @@ def _sums(job: _Job, known: Sequence[_Known], precision: Precision, device: Devi
     return {name: np.asarray(to_numpy(values), np.float64) for name, values in sums._asdict().items()}
 
 
+def _add_phase(sums: dict[str, Float64], job: _Job, known: Sequence[_Known]) -> None:
+    """Add the error of the phase to the standard deviations; a volume that is no longer significant has no offset."""
+    sums["height_max_phase"] = np.zeros(len(known))
+    if job.phases is None:
+        return
+    for index, each in enumerate(known):
+        window = each.window
+        found = phase_sigmas(
+            _heights_above(job, each),
+            job.phases[window.rows, window.columns],
+            job.grid,
+            window,
+            job.placement,
+            threshold=job.settings.level,
+            volume=float(sums["volume"][index]),
+            centroid=each.aperture.centroid + job.placement.matrix @ sums["offset"][index],
+        )
+        for name in ("volume", "area", "height_mean", "offset"):
+            total = sums[f"{name}_sigma"]
+            total[index] = np.hypot(total[index], getattr(found, name))
+        sums["height_max_phase"][index] = found.height_max
+    weak = np.abs(sums["volume"]) < _SIGNIFICANCE * sums["volume_sigma"]
+    sums["status"][weak] = Status.LOW_SIGNAL
+    sums["offset"][weak] = sums["offset_sigma"][weak] = math.nan
+
+
+def _heights_above(job: _Job, each: _Known) -> Float64:
+    """Return the heights of an aperture's window above its reference surface [m]."""
+    window = each.window
+    x, y = np.meshgrid(job.grid.x[window.columns], job.grid.y[window.rows])
+    return job.z[window.rows, window.columns] - each.surface.heights(x, y) - job.settings.pad_height
+
+
 def _tops_and_references(
-    job: _Job, known: Sequence[_Known], statuses: Sequence[str]
+    job: _Job, known: Sequence[_Known], statuses: Sequence[str], phases: Float64
 ) -> tuple[list[tuple[float, float]], list[float]]:
     """Return the height of the highest patch with its standard deviation, and the height of the board, of each."""
     grid, settings = job.grid, job.settings
     tops, references = [], []
-    for each in known:
+    for each, phase in zip(known, phases, strict=True):
         aperture, window, surface = each.aperture, each.window, each.surface
         references.append(float(surface.heights(aperture.centroid[:1], aperture.centroid[1:])[0]) + settings.pad_height)
         if statuses[each.number] == "holes":
             tops.append((math.nan, math.nan))
             continue
-        x, y = np.meshgrid(grid.x[window.columns], grid.y[window.rows])
-        height = job.z[window.rows, window.columns] - surface.heights(x, y) - settings.pad_height
+        height = _heights_above(job, each)
         half = max(round(_TOP_PATCH * math.sqrt(aperture.area / (grid.cell_x * grid.cell_y))), 1)
         spread = job.sigmas[window.rows, window.columns]
         top = top_height(np.where(window.cells, height, math.nan), window.cells, spread, half)
         basis = surface.basis(*aperture.centroid[:, None])[:, 0]
         variance = job.correlated * (top.sigma**2 + float(basis @ surface.covariance @ basis))
-        tops.append((top.height, math.sqrt(variance)))
+        tops.append((top.height, math.hypot(math.sqrt(variance), phase)))
     return tops, references
 
 
@@ -370,13 +417,13 @@ def _deposits(apertures: Sequence[Aperture], job: _Job, board: _Board, sums: Map
     statuses = ["outside" if each is None else "no reference" for each in board.windows]
     for each, flags in zip(board.known, sums["status"], strict=True):
         statuses[each.number] = _STATUS[Status(int(flags))]
-    tops, references = _tops_and_references(job, board.known, statuses)
+    tops, references = _tops_and_references(job, board.known, statuses, sums["height_max_phase"])
     top = np.array(tops).reshape(-1, 2)
     areas = np.array([each.area for each in apertures])
     unknown = [math.nan] * len(apertures)
-    measured = {
-        name: _spread(values, board.known, unknown) for name, values in sums.items() if name not in ("status", "valid")
-    }
+    others = ("status", "valid", "height_max_phase")
+    measured = {name: _spread(values, board.known, unknown) for name, values in sums.items() if name not in others}
+    noise = job.sigmas if job.phases is None else np.hypot(job.sigmas, job.phases)
     return Deposits(
         names=tuple(each.name for each in apertures),
         status=tuple(statuses),
@@ -387,7 +434,7 @@ def _deposits(apertures: Sequence[Aperture], job: _Job, board: _Board, sums: Map
         height_max_sigma=_spread(top[:, 1], board.known, unknown),
         reference=_spread(np.array(references), board.known, unknown),
         valid=_spread(sums["valid"], board.known, [0.0 if each is None else math.nan for each in board.windows]),
-        noise=float(np.median(job.sigmas[board.free] if board.free.any() else job.sigmas)),
+        noise=float(np.median(noise[board.free] if board.free.any() else noise)),
         board_scatter=board.scatter,
         correlation_area=job.correlated,
         **measured,

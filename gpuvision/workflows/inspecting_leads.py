@@ -159,7 +159,8 @@ def inspect_leads(
     placement : BoardPlacement, optional
         Place of the regions in the height map. Default: they are in the coordinates of the height map.
     sigma : float, optional
-        Random standard deviation of all heights [m]. Default: from the height map, or else estimated.
+        Random standard deviation of all heights [m]. Default: ``heights.sigma``, or else estimated.
+        ``heights.phase`` is added in both cases, as an error that the cells of a lead share.
     correlation_area : float
         Number of cells whose noise is common, 1 or more. Default 1.
     centre : tuple of float, optional
@@ -188,6 +189,7 @@ def inspect_leads(
         heights.grid,
         moved,
         sigma=heights.sigma if sigma is None else finite(sigma, "sigma", above=0.0),
+        phase=heights.phase,
         correlation_area=correlation_area,
         centre=None if gravity is None else (float(gravity[0]), float(gravity[1])),
     )

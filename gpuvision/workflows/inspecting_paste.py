@@ -316,8 +316,8 @@ def inspect_paste(
     search_range : tuple of float
         Largest shift [m] and rotation [rad] of the search. Default 2 mm and 3 degrees.
     sigma : float, optional
-        Random standard deviation of all heights [m]. Default: from the height map, or else estimated; see
-        `measure_deposits`.
+        Random standard deviation of all heights [m]. Default: ``heights.sigma``, or else estimated; see
+        `measure_deposits`. ``heights.phase`` is added in both cases, as an error that neighbouring cells share.
     correlation_area : float, optional
         Number of cells whose noise is common. Default: estimated; see `measure_deposits`.
     limits : VolumeLimits
@@ -352,7 +352,14 @@ def inspect_paste(
     else:
         placement = BoardPlacement(x=pose[0], y=pose[1], theta=pose[2], side=side)
     deposits = measure_deposits(
-        heights.z, heights.grid, apertures, placement, settings, sigma=noise, correlation_area=correlation_area
+        heights.z,
+        heights.grid,
+        apertures,
+        placement,
+        settings,
+        sigma=noise,
+        phase=heights.phase,
+        correlation_area=correlation_area,
     )
     return PasteInspection(
         heights=heights,

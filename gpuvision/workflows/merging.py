@@ -198,7 +198,7 @@ class HeightMapMerge:
                 "map_source": (heights.source, "flags: 1 first, 2 second, 4 disagree, 8 unconfirmed and dropped"),
             }
             if heights.sigma is not None:
-                write_tiff(inside / SIGMA_FILE, heights.sigma, grid, quantity="random sigma of height")
+                write_tiff(inside / SIGMA_FILE, heights.sigma, grid, quantity="sigma of height (noise and phase)")
                 held["map_sigma"] = (heights.sigma, "m")
             arrays, units = ({name: each[part] for name, each in held.items()} for part in (0, 1))
             write_npz(inside / "range_image.npz", arrays, units)
@@ -238,7 +238,8 @@ def read_height_map(path: str | Path) -> tuple[HeightMap, Grid]:
     if not file.exists():
         raise FileNotFoundError(f"{file}: no such file")
     arrays = read_npz(file)[0] if file.suffix.lower() == ".npz" else {}
-    z, grid, sigma = scanned_map(arrays, file) if arrays else read_heights(file)
+    read = scanned_map(arrays, file) if arrays else read_heights(file)
+    z, sigma = read.z, read.total_sigma
     for name, kinds in (("map_status", "iu"), ("map_intensity", "iuf")):
         if name in arrays and arrays[name].dtype.kind not in kinds:
             expected = "real numbers" if "f" in kinds else "integers"
@@ -248,7 +249,7 @@ def read_height_map(path: str | Path) -> tuple[HeightMap, Grid]:
             raise ReadError(f"{file}: {name} has shape {arrays[name].shape}, expected {z.shape} as map_z")
     status = arrays.get("map_status", np.where(np.isfinite(z), Status.OK, Status.NO_DATA)).astype(np.uint8)
     intensity = np.asarray(arrays.get("map_intensity", np.where(np.isfinite(z), 0.0, z)))
-    return HeightMap(z, intensity, status, sigma), grid
+    return HeightMap(z, intensity, status, sigma), read.grid
 
 
 def merge_scans(

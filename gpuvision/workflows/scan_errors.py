@@ -2,7 +2,8 @@
 
 Random errors differ from sample to sample or from profile to profile: the noise of the readout, the jitter of the
 transport. Systematic errors are the same in all profiles: the calibration. The error by the phase of the line in its
-pixel is the same wherever the line has the same place. The three are never added.
+pixel is the same wherever the line has the same place. The three stay apart in the files of a scan; `measured.ratio` of
+the budget and the merge of scans combine the first and the last.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ Array = npt.NDArray[Any]
 _PROFILES = 256  # largest number of profiles that determine the measured scatter. Chosen: its cost stays below 0.1 s
 _FEWEST = 100  # smallest number of samples that determine a median absolute deviation, to about 12 %
 _PLANE_SHARE = 8.0 / 9.0  # variance of a sample's residual from the plane through its 3 x 3 samples, over its variance
+_HARMONICS = (1, 2)  # of the error over the phase: a threshold cuts two flanks
 
 
 class PointSigma(NamedTuple):
@@ -72,6 +74,8 @@ class ScanErrors:
         the line at one place, see `gpuvision.ranging.line_phase.phase_error`. Not part of ``systematic``.
     map_phase : numpy.ndarray, optional
         ``phase`` of the height map [m], over the cells.
+    phase_scatter : float
+        Share of the variance of ``phase`` that scatters about a local plane, 0 to 1, see `phase_scatter`. Default 0.
     """
 
     position: Array
@@ -82,6 +86,7 @@ class ScanErrors:
     map_systematic: Array | None = None
     phase: PointSigma | None = None
     map_phase: Array | None = None
+    phase_scatter: float = 0.0
 
 
 def sigma_outputs(sensor: Sensor) -> tuple[str, ...]:
@@ -141,13 +146,15 @@ def predict_errors(
         transport = _displacement(sensor.transport, points, position, transports + _jitter(sensor), device)
         systematic = _rotating_systematic(sensor, sensor.transport, points, position, transports, device)
     random = PointSigma(*(np.hypot(*each) for each in zip(readout, transport, strict=True)))
+    phase = _phase(sensor, fields, readout, device)
     return ScanErrors(
         position=fields["sigma"],
         readout=readout,
         transport=transport,
         random=random,
         systematic=systematic,
-        phase=_phase(sensor, fields, readout, device),
+        phase=phase,
+        phase_scatter=0.0 if phase is None else phase_scatter(fields["position"]),
     )
 
 
@@ -184,7 +191,7 @@ def focus_errors(sensor: Sensor, stack: FocusStack, peak: FocusPeak, points: Ran
 
 def _phase(sensor: Sensor, fields: Mapping[str, Array], readout: PointSigma, device: Device) -> PointSigma | None:
     """Return the errors by the place of the line in its pixel: they move a point as the noise of the readout does."""
-    if not isinstance(sensor.readout, LineReadout) or "width" not in fields:
+    if not isinstance(sensor.readout, LineReadout) or not {"position", "width"} <= fields.keys():
         return None
     good = fields["status"] == Status.OK
     peak, width, total = (fields[name][good] for name in ("peak", "width", "total"))
@@ -288,6 +295,44 @@ def scatter_about_plane(z: Array) -> float:
     return float(MAD_TO_SIGMA * deviation / math.sqrt(_PLANE_SHARE))
 
 
+def phase_scatter(position: Array) -> float:
+    """Return the share of the phase's variance that scatters about the plane through 3 x 3 samples.
+
+    Parameters
+    ----------
+    position : numpy.ndarray
+        Line positions [px], (profiles, samples); NaN without a line.
+
+    Returns
+    -------
+    float
+        0 where neighbouring samples have the line at one place in the pixel, 1 where they have it at any place.
+
+    Notes
+    -----
+    A harmonic ``exp(2 pi i k p)`` of the error, where the position p has the slopes a and b [px per profile and per
+    sample], deviates from the plane by ``1 - (1 + 2 cos(2 pi k a)) (1 + 2 cos(2 pi k b)) / 9``. Of two harmonics the
+    larger share counts. The slopes are means over the 3 x 3 samples, so that noise of the positions has little effect.
+    """
+    profiles, samples = position.shape
+    if profiles < 3 or samples < 3:
+        return 0.0
+    middles = np.unique(np.linspace(1, profiles - 2, min(profiles - 2, _PROFILES)).astype(int))
+    above, here, below = (position[middles + step].astype(np.float64) for step in (-1, 0, 1))
+    along = (below - above) / 2.0
+    along = (along[:, :-2] + along[:, 1:-1] + along[:, 2:]) / 3.0
+    across = (above + here + below) / 3.0
+    across = (across[:, 2:] - across[:, :-2]) / 2.0
+    shares = [0.0]
+    for harmonic in _HARMONICS:
+        a, b = (1.0 + 2.0 * np.cos(2.0 * math.pi * harmonic * each) for each in (along, across))
+        deviation = 1.0 - a * b / 9.0
+        known = np.isfinite(deviation)
+        if known.any():
+            shares.append(float(np.median(deviation[known] ** 2)) / _PLANE_SHARE)
+    return min(max(shares), 1.0)
+
+
 def error_budget(errors: ScanErrors | None, z: Array, map_sigma: Array | None, *, camera: bool) -> dict[str, Any]:
     """Return the error budget of a scan for its report: medians [m], None where they are unknown.
 
@@ -308,8 +353,9 @@ def error_budget(errors: ScanErrors | None, z: Array, map_sigma: Array | None, *
         ``random``: ``readout``, ``transport`` and ``total``, each with x, y and z; ``systematic``: ``calibration``;
         ``phase``: of the line in its pixel, with x, y and z; ``map``: ``random``, ``systematic`` and ``phase`` of the
         heights; ``position``: of the readout [px or m]; ``measured``:
-        ``scatter`` of z about a local plane, its ``ratio`` to the predicted readout noise, and ``speckle``, the value
-        of ``[line] speckle`` [px] that explains a ratio above 1.
+        ``scatter`` of z about a local plane, its ``ratio`` to the predicted one (the noise of the readout, and the
+        part of the phase that differs between neighbours), and ``speckle``, the value of ``[line] speckle`` [px] that
+        explains a ratio above 1. It is None where noise and phase together explain the scatter.
     """
     scatter = _finite(scatter_about_plane(z))
     measured: dict[str, Any] = {"scatter": scatter, "ratio": None, "speckle": None}
@@ -324,9 +370,13 @@ def error_budget(errors: ScanErrors | None, z: Array, map_sigma: Array | None, *
         }
     predicted, position = _median(errors.readout.z), _median(errors.position)
     if scatter is not None and predicted and position is not None:
-        measured["ratio"] = scatter / predicted
-        if camera and scatter > predicted:
-            measured["speckle"] = position * math.sqrt((scatter / predicted) ** 2 - 1.0)
+        phase = 0.0 if errors.phase is None else _median(errors.phase.z) or 0.0
+        moving = phase * math.sqrt(errors.phase_scatter)
+        explained = math.hypot(predicted, moving)
+        measured["ratio"] = scatter / explained
+        # The scatter is a median absolute deviation: of a sine it exceeds the root mean square by this factor.
+        if camera and scatter > math.hypot(predicted, MAD_TO_SIGMA * moving):
+            measured["speckle"] = position * math.sqrt(scatter**2 - explained**2) / predicted
     return {
         "random": {
             "readout": _medians(errors.readout),
@@ -358,8 +408,10 @@ def budget_line(budget: Mapping[str, Any]) -> str:
             if budget["systematic"] is None
             else f"{_micrometres(budget['systematic']['calibration']['z'])} systematic",
         )
+        if budget["phase"] is not None:
+            parts = (*parts, f"{_micrometres(budget['phase']['z'])} by the phase of the line in its pixel")
     if scatter is not None:
-        compared = "" if ratio is None else f" ({ratio:.2f} times the readout's)"
+        compared = "" if ratio is None else f" ({ratio:.2f} times the predicted)"
         parts = (*parts, f"z scatters by {_micrometres(scatter)} about a local plane{compared}")
     return "; ".join(parts)
 

@@ -237,7 +237,7 @@ class Scan:
         and ``scan.png`` show the organised points. ``range_image.npz`` holds both. ``report.json`` holds the report.
         With a noise model ``range_image_sigma.tiff`` holds the random standard deviation of the height map; with the
         covariance of a calibration ``range_image_systematic.tiff`` holds the systematic one. The PLY and NPZ files have
-        the standard deviations of the points, ``sigma_x`` and ``systematic_x`` and so on.
+        the standard deviations of the points, ``sigma_x``, ``systematic_x`` and ``phase_x`` and so on.
 
         Files of an earlier scan for a standard deviation or a format that this scan does not have are removed, if they
         were not changed since.
@@ -307,10 +307,11 @@ class Scan:
         return self.sensor.name or "Height map"
 
     def _point_sigmas(self) -> dict[str, Array]:
-        """Return the standard deviations of the points [m] by name: random ``sigma_x``, ``systematic_x`` and so on."""
+        """Return the standard deviations of points [m] by name: random ``sigma_x``, ``systematic_x``, ``phase_x``."""
         if self.errors is None:
             return {}
-        groups = {"sigma": self.errors.random, "systematic": self.errors.systematic}
+        errors = self.errors
+        groups = {"sigma": errors.random, "systematic": errors.systematic, "phase": errors.phase}
         known = {name: each for name, each in groups.items() if each is not None}
         return {f"{name}_{axis}": getattr(each, axis) for name, each in known.items() for axis in "xyz"}
 

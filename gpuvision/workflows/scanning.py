@@ -238,8 +238,9 @@ def _with_range_outputs(sensor: Sensor, precision: Precision) -> LineReadout | P
     positions = ("position",) if isinstance(sensor.transport, RotatingSheet) else ("g", "h")
     light = "peak" if sensor.kind == "camera" else "total"
     errors = sigma_outputs(sensor)
-    shape = ("width", "total") if errors and sensor.kind == "camera" else ()  # of the line, for the error of its phase
-    outputs = (*positions, light, "status", *shape, *errors)
+    # Of the line, for the error of its phase.
+    shape = ("position", "width", "total") if errors and sensor.kind == "camera" else ()
+    outputs = tuple(dict.fromkeys((*positions, light, "status", *shape, *errors)))
     return dataclasses.replace(sensor.readout, outputs=outputs, precision=precision)
 
 
@@ -286,7 +287,7 @@ def _points(
 
     With a noise model also return the predicted errors.
     """
-    positions = [fields[name] for name in ("position", "g", "h") if name in fields]
+    positions = [fields[name] for name in (("g", "h") if "g" in fields else ("position",))]
     transports, status = sensor.transports(int(frame_numbers[-1]) + 1), fields["status"]
     if sensor.encoder is not None:
         status[sensor.encoder.not_advancing()[frame_numbers]] |= np.uint8(Status.NOT_INVERTIBLE)

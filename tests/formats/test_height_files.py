@@ -60,7 +60,7 @@ def write(tmp_path):
 
 @pytest.mark.parametrize("section", ["Surface", "Part"])
 def test_a_surface_of_a_gocator(write, section):
-    z, grid, sigma = read_heights(write(SURFACE.format(section=section)))
+    z, grid, sigma, _ = read_heights(write(SURFACE.format(section=section)))
     np.testing.assert_allclose(z, EXPECTED, rtol=1e-12)
     np.testing.assert_allclose([grid.left, grid.top, grid.cell_x, grid.cell_y], [-2e-3, 5e-3, 20e-6, 30e-6], rtol=1e-9)
     assert grid.shape == z.shape
@@ -107,10 +107,10 @@ def test_a_gocator_file_beyond_a_limit_is_refused(write, monkeypatch):
 def test_a_16_bit_image_with_a_scale(tmp_path):
     levels = np.array([[0, 1, 2], [3, 40000, 65535]], np.uint16)
     cv2.imwrite(str(tmp_path / "map.png"), levels)
-    z, grid, _ = read_heights(tmp_path / "map.png", ImageScale(cell_x=10e-6, cell_y=20e-6, step=-1e-7, offset=5e-3))
+    z, grid, *_ = read_heights(tmp_path / "map.png", ImageScale(cell_x=10e-6, cell_y=20e-6, step=-1e-7, offset=5e-3))
     np.testing.assert_allclose(z, [[np.nan, 5e-3 - 1e-7, 5e-3 - 2e-7], [5e-3 - 3e-7, 1e-3, 5e-3 - 6.5535e-3]])
     assert grid == Grid(left=0.0, top=20e-6, cell_x=10e-6, cell_y=20e-6, columns=3, rows=2)
-    z, _, _ = read_heights(tmp_path / "map.png", ImageScale(cell_x=1.0, cell_y=1.0, step=1.0, hole=float("nan")))
+    z, *_ = read_heights(tmp_path / "map.png", ImageScale(cell_x=1.0, cell_y=1.0, step=1.0, hole=float("nan")))
     np.testing.assert_array_equal(z, levels)
     cv2.imwrite(str(tmp_path / "colour.png"), np.zeros((2, 2, 3), np.uint8))
     with pytest.raises(ValueError, match="a colour image"):

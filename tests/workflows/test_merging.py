@@ -99,7 +99,7 @@ def test_occlusion_is_filled_and_disagreement_flagged(scans: tuple[Path, Path], 
     assert report["weights"] == "inverse variance"
     assert report["tolerance_m"] == 0.0
     assert abs(report["difference"]["median_m"]) < 1e-6 < report["difference"]["robust_sigma_m"]
-    with pytest.raises(ReadError, match="its values are the random sigma of height"):
+    with pytest.raises(ReadError, match=r"its values are the sigma of height \(noise and phase\)"):
         read_tiff(out / SIGMA_FILE)
     assert report["cells"]["second"] == np.count_nonzero(source == SECOND)
     assert report["cells"]["disagrees"] == np.count_nonzero(source & DISAGREES)

@@ -26,6 +26,7 @@ from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.scan_errors import (
     budget_line,
     error_budget,
+    phase_scatter,
     predict_errors,
     scatter_about_plane,
     sigma_outputs,
@@ -84,12 +85,14 @@ def test_predicted_errors_are_the_scatter(
     assert budget["measured"]["ratio"] == pytest.approx(1.0, abs=0.06)
     assert budget["random"]["transport"] == {"x": 0.0, "y": pytest.approx(JITTER), "z": 0.0}
     assert budget["random"]["total"]["z"] == pytest.approx(np.median(made.errors.random.z[np.isfinite(z)]), rel=1e-6)
+    assert f"; {1e6 * budget['phase']['z']:.3g} um by the phase of the line in its pixel; " in budget_line(budget)
     made.write(tmp_path / "out")
     assert json.loads((tmp_path / "out" / "report.json").read_text())["error_budget"] == budget
     points = read_ply(tmp_path / "out" / "range_image.ply")
     with np.load(tmp_path / "out" / "range_image.npz") as held:
         for axis in "xyz":
-            for name, group in (("sigma", made.errors.random), ("systematic", made.errors.systematic)):
+            for name in ("sigma", "systematic", "phase"):
+                group = made.errors.random if name == "sigma" else getattr(made.errors, name)
                 np.testing.assert_array_equal(points[f"{name}_{axis}"], getattr(group, axis))
                 np.testing.assert_array_equal(held[f"{name}_{axis}"], getattr(group, axis))
         np.testing.assert_array_equal(held["map_sigma"], sigma)
@@ -342,10 +345,46 @@ def test_the_map_scatters_by_noise_and_phase(
         design = np.stack([np.ones(z.size), x.ravel(), y.ravel(), x.ravel() ** 2], axis=1)
         known = np.isfinite(z.ravel())
         residual = z.ravel()[known] - design[known] @ np.linalg.lstsq(design[known], z.ravel()[known])[0]
-        assert read.sigma is not None
-        assert 0.9 < np.std(residual) / np.sqrt(np.mean(read.sigma[5:-5, 20:-20].ravel()[known] ** 2)) < 1.15
+        assert read.total_sigma is not None
+        assert 0.9 < np.std(residual) / np.sqrt(np.mean(read.total_sigma[5:-5, 20:-20].ravel()[known] ** 2)) < 1.15
         assert made.heights.sigma is not None
         assert np.std(residual) > more * np.nanmedian(to_numpy(made.heights.sigma))
         budget = made.report()["error_budget"]
         assert budget["map"]["phase"] == pytest.approx(np.nanmedian(made.errors.map_phase))
         assert budget["measured"]["ratio"] < 1.1  # neighbouring profiles share the error of the phase
+
+
+def test_no_speckle_is_advised_for_the_phase_of_a_moving_line(device: Device, rng: np.random.Generator) -> None:
+    """A line that moves by 0.3 px per profile: its phase scatters, and is not taken for speckle."""
+    sensor = noisy_camera(threshold=46.0, minimum_peak=None)
+    sensor = dataclasses.replace(sensor, readout=dataclasses.replace(sensor.readout, gain=0.0))
+    for speckle in (0.0, 0.06):
+        rows = 20.2 + 0.3 * np.arange(60.0)[:, None] + 0.013 * np.arange(480.0) + rng.normal(0.0, speckle, (60, 480))
+        light = 8.0 + 150.0 * np.exp(-0.5 * ((np.arange(64)[:, None] - rows[:, None]) / 1.4) ** 2)
+        frames = np.clip(np.rint(light + rng.normal(0.0, READ_NOISE, light.shape)), 0, 255).astype(np.uint8)
+        made = scan(frames, sensor, device=device)
+        assert made.errors is not None
+        assert made.errors.phase_scatter > 0.8
+        measured = made.error_budget()["measured"]
+        if speckle:
+            assert measured["speckle"] == pytest.approx(speckle, rel=0.15)
+        else:
+            assert measured["speckle"] is None
+            assert measured["ratio"] < 1.2
+
+
+def test_the_share_of_the_phase_that_scatters(rng: np.random.Generator) -> None:
+    """Against the residuals of a sine and its harmonic from the plane through the 3 x 3 samples."""
+    profile, sample = np.mgrid[:120, :130]
+    for along, across, expected in ((0.0, 0.01, 0.0), (0.02, 0.015, 0.0), (0.1, 0.013, None), (1.0, 0.0, 0.0)):
+        position = 30.0 + along * profile + across * sample
+        found = phase_scatter(position + rng.normal(0.0, 0.03, position.shape))
+        shares = []
+        for harmonic in (1, 2):
+            wave = np.exp(2j * np.pi * harmonic * position)
+            mean = sum(wave[i : 118 + i, j : 128 + j] for i in range(3) for j in range(3)) / 9.0
+            shares.append(float(np.mean(abs(wave[1:-1, 1:-1] - mean) ** 2)) * 9.0 / 8.0)
+        assert found == pytest.approx(max(shares), rel=0.15, abs=0.02)
+        assert expected is None or found == pytest.approx(expected, abs=0.05)
+    assert phase_scatter(30.0 + 0.3 * profile + 0.0 * sample) == 1.0
+    assert phase_scatter(np.full((5, 5), np.nan)) == phase_scatter(np.zeros((2, 9))) == 0.0

@@ -221,7 +221,7 @@ def test_the_threshold_of_the_recording(commands: Commands, noise: str) -> None:
     commands.table["line"] |= {"threshold": "auto"}
     commands.table["recording"] = {"background": "median"}  # the simulated frames have no background
     commands.write("sensor.toml", commands.table)
-    ran = commands.simulate("--profiles", 5, noise)
+    ran = commands.simulate("--profiles", 2, noise)
     assert ran.code == 0, ran.err
     sim = commands.folder / "sim"
     scanned = commands.scan(sim)

@@ -22,6 +22,7 @@ from gpuvision.profiling.offline.builds import GpuModel, KernelBuild
 from gpuvision.profiling.offline.check import LIMITS, check_builds, fault_of, one_build_each
 from gpuvision.profiling.offline.targets import TARGETS, CompilerError, Usage, usage_of_amd, usage_of_ptxas
 
+ROOT = Path(__file__).resolve().parents[2]
 _DIRECTIVE = re.compile(r"^[ \t]*#[ \t]*(if|ifdef|ifndef|elif)\b([^\n]*)", re.MULTILINE)
 # Macros that only builds for CPUs have: vectors, stores around the caches, prefetching, PoCL.
 _OF_CPUS = {"VECTOR_VARIANT", "PAST_CACHES", "PREFETCH", "POCL_DEVICE_ADDRESS_BITS"}
@@ -117,6 +118,15 @@ def test_builds_are_work_item_variants_without_duplicates() -> None:
     assert len(names) == len(set(names))
     assert {each.source for each in one_build_each(known_builds())} == {each.source for each in known_builds()}
     assert one_build_each(known_builds())[0] is known_builds()[0]
+
+
+def test_table_in_the_repository_has_every_build() -> None:
+    """If this fails, write `profiling/results/offline-gpus.json` again: see CONTRIBUTING.md, "Add an operation"."""
+    rows = json.loads((ROOT / "profiling" / "results" / "offline-gpus.json").read_text())["rows"]
+    expected = {(each.source, each.name) for each in known_builds()}
+    for target in TARGETS:
+        assert {(row["source"], row["case"]) for row in rows if row["target"] == target} == expected
+    assert [row for row in rows if "fault" in row] == []
 
 
 def test_model_of_a_gpu_has_the_properties_that_launches_read() -> None:

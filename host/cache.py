@@ -7,7 +7,6 @@ owns it and nobody else may write it.
 from __future__ import annotations
 
 import atexit
-import contextlib
 import os
 import shutil
 import stat
@@ -139,14 +138,26 @@ def private_folder(folder: Path, entries: dict[str, str]) -> Path:
         try:
             for name, text in entries.items():
                 write_private(made / name, text)
-            _remove(folder)
-            with contextlib.suppress(OSError):  # another process made the same folder meanwhile
-                made.rename(folder)
+            if not _renamed(made, folder) and not _holds(folder, entries):
+                _remove(folder)
+                _renamed(made, folder)
         finally:
             shutil.rmtree(made, ignore_errors=True)
         if not _holds(folder, entries):
             raise PermissionError(f"{folder} cannot be made private; remove it")
     return folder
+
+
+def _renamed(made: Path, folder: Path) -> bool:
+    """Return whether a folder could be renamed: not where the new name exists, such as by another process.
+
+    A folder that another process made is never removed: its OpenCL loader may be reading the entries.
+    """
+    try:
+        made.rename(folder)
+    except OSError:
+        return False
+    return True
 
 
 def _remove(path: Path) -> None:

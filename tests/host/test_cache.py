@@ -63,6 +63,21 @@ def test_folder_and_files_are_for_the_user_alone(folder: Path, umask: int) -> No
     assert (mode(folder / "vendors" / "x"), mode(folder / "vendors" / "x" / "a.icd")) == (0o700, 0o600)
 
 
+def test_a_folder_that_another_process_makes_meanwhile_is_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other process may be loading the drivers of its folder: it is never removed, also for a moment."""
+    entries, own_write = {"a.icd": "liba.so"}, cache.write_private
+    vendors = folder / "vendors" / "x"
+
+    def slow_write(path: Path, text: str) -> None:
+        own_write(path, text)
+        own_write(vendors / path.name, text)  # the other process is faster
+
+    monkeypatch.setattr(cache, "write_private", slow_write)
+    monkeypatch.setattr(cache, "_remove", lambda path: pytest.fail(f"{path.name} is removed"))
+    assert cache.private_folder(vendors, entries) == vendors
+    assert [each.name for each in vendors.parent.iterdir()] == ["x"]
+
+
 def test_an_open_folder_is_closed_and_a_writable_one_emptied(folder: Path) -> None:
     (folder / "vendors").mkdir(parents=True)
     (folder / "devices.json").write_text("{}")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+import functools
 import gc
 import subprocess
 import sys
 import threading
 import weakref
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -264,24 +266,15 @@ def test_a_queue_of_the_caller_is_not_replaced(device: Device, lose: Any) -> Non
         bound()
 
 
-class Lost:
-    """Queue that fails at the end of a stream."""
+def losing(stream: Pipeline[Any]) -> Pipeline[Any]:
+    """Let the queues of an open stream fail when it closes; the producer may still launch work in them."""
 
-    def __init__(self, queue: Any) -> None:
-        self._queue = queue
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._queue, name)
-
-    def finish(self) -> None:
-        self._queue.finish()
+    def fail_after(finish: Callable[[], None]) -> None:
+        finish()
         raise error_of("OUT_OF_RESOURCES", "clFinish")
 
-
-def losing(stream: Pipeline[Any]) -> Pipeline[Any]:
-    """Let the queues of an open stream fail when it closes."""
-    for queues in stream._queues:
-        queues.upload = Lost(queues.upload)
+    for queues in dict.fromkeys(stream._queues):
+        queues.finish = functools.partial(fail_after, queues.finish)
     return stream
 
 

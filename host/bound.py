@@ -404,8 +404,8 @@ def _refuse_calls() -> None:
     def refuse(*_: object, **__: object) -> None:
         check_process()
 
-    setattr(Bound, "_enqueue", refuse)  # noqa: B010
-    setattr(Bound, "on_host", refuse)  # noqa: B010
+    for name in ("_enqueue", "on_host"):
+        setattr(Bound, name, refuse)
 
 
 after_fork(_refuse_calls)

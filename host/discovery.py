@@ -140,9 +140,9 @@ class ProbedDevice(ListedDevice):
     def rank(self) -> tuple[int, ...]:
         """Sort key of the preference: GPUs, PoCL, Intel's CPU runtime, other devices, simulators.
 
-        Among GPUs, the maker's driver precedes a generic driver, a GPU with memory of its own precedes a GPU that uses
-        the host's memory, and then the number of compute units and the size of the memory decide. Compute units of
-        different makers differ in size; the order among them is a guess, which ``GPUVISION_DEVICE`` replaces.
+        Among GPUs, the vendor's driver precedes a generic driver. Then a discrete GPU precedes an integrated GPU, which
+        shares the memory of the host. Then the number of compute units and the size of the memory decide. Compute units
+        of different vendors differ in size; ``GPUVISION_DEVICE`` replaces this guess.
         """
         place = _PREFERRED.index(self.kind) if self.kind in _PREFERRED else len(_PREFERRED)
         return (

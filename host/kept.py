@@ -10,7 +10,7 @@ from typing import Any
 
 # OpenCL kernel objects are not thread-safe: each thread has separate bound instances.
 _thread = threading.local()
-# Number of the present generation of bound instances: a thread drops those of earlier generations at its next call.
+# Current generation of bound instances. Each thread drops its instances of earlier generations at its next call.
 _generation = 0
 _clearers: list[Callable[[], None]] = []
 

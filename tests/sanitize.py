@@ -123,7 +123,7 @@ def sanitize(kernel: str) -> Finding:
             str(log),
         ]
         command = ["oclgrind", *options, sys.executable, __file__, "--inside", kernel]
-        # Own caches: programs and verdicts of the simulator must not mix with those of other runtimes.
+        # A separate cache: other runtimes must not read the programs and verdicts of the simulator.
         environment = os.environ | {"XDG_CACHE_HOME": folder}
         try:
             done = subprocess.run(

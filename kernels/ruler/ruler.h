@@ -11,7 +11,7 @@
 //     RULER_CAPACITY     largest length that the arrays of samples hold
 //     RULER_BITS         fractional bits of fixed-point positions (vector variant)
 //     PAIRS              an edge is a pair of edges of opposite polarity: a stripe
-//     PER_RULER (with PAIRS)   each ruler has its own polarity and kind, see ruler_set_kind: single edge or pair
+//     PER_RULER (with PAIRS)   polarity and kind (single edge or pair) are given per ruler, see ruler_set_kind
 //     CHOOSE_STRONGEST, CHOOSE_FIRST, CHOOSE_LAST, CHOOSE_ALL (up to MAX_EDGES edges)   edge selection
 //     SATURATION, AMBIGUITY   flag saturated samples, and edges with a comparable second edge
 //     CURVED             correct the position for a curved edge

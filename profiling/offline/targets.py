@@ -195,7 +195,7 @@ _SHARED = re.compile(r"(\d+) bytes smem")
 def usage_of_ptxas(log: str) -> list[Usage]:
     """Return the resources that ``ptxas -v`` reports.
 
-    A function that is not inlined has a frame of its own; the cumulative stack size includes it.
+    A function that is not inlined has a separate stack frame; the cumulative stack size includes it.
     """
     found = []
     _, *parts = re.split(r"(?=Compiling entry function)", log)

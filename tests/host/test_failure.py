@@ -32,7 +32,7 @@ def error_of(code: str, routine: str = "clEnqueueNDRangeKernel") -> cl.Error:
 
 @pytest.fixture
 def own(device: Device) -> Device:
-    """Return the device in a context of its own, which a test may lose."""
+    """Return the device in a separate context, which a test may lose."""
     return Device(device.handle, device.label, device.kind, inline_device=device.inline_device)
 
 
@@ -293,7 +293,7 @@ def test_closing_reports_a_failure_that_the_loop_did_not(memory: dict[str, Any])
 
 
 class Failing(PsdReadout):
-    """Operation whose launches in a stream fail like those of a lost device."""
+    """Operation whose launches in a stream fail as on a device without memory."""
 
     def bind(self, *args: Any, **kwargs: Any) -> Any:
         bound = super().bind(*args, **kwargs)

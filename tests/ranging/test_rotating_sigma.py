@@ -1,4 +1,4 @@
-"""Changes of a rotating sheet by its standard deviations: each parameter once, by its own amount."""
+"""Changes of a rotating sheet: each parameter once, by its standard deviation."""
 
 from __future__ import annotations
 

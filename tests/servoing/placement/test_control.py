@@ -454,7 +454,7 @@ def test_a_fixed_wait_beyond_the_longest_time_is_refused() -> None:
 
 
 def test_refused_poses_are_not_counted_as_the_first_pose() -> None:
-    """Three frames are refused, as by the coarse registration: the steered frames are those of a run without them."""
+    """Three frames are refused, as by the coarse registration; the other frames are steered as without refusals."""
     plant = SimulatedPlant(start=(80e-6, 0.0, 0.0))
     sensor = _sensor(plant, PRESET, is_noisy=False)
     nothing = np.full((3, 3), np.nan)

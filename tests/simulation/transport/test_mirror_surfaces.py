@@ -17,7 +17,7 @@ MATERIALS = (Material(diffuse=Lambert(albedo=0.5)), Material(diffuse=Lambert(alb
 
 @pytest.mark.parametrize("is_inverted", [False, True])
 def test_given_normals_face_outwards(is_inverted: bool, rng: np.random.Generator) -> None:
-    """Triangles of a ball, of either winding, with normals of either sign that lean from those of the triangles."""
+    """Triangles of a ball with either winding, and tilted normals of either sign."""
     corners = 0.005 * trimesh.creation.icosphere(1).triangles
     corners = corners[:, ::-1] if is_inverted else corners
     outwards = corners.mean(axis=1)

@@ -235,9 +235,11 @@ kernel void fan_intervals(global const INPUT *restrict fans, global real *restri
     global const INPUT *at = fans + i * FAN;
     Vector corners[3];
     int good = 1;
-    for (int n = 0; n < 3; n++)
-        corners[n] = (Vector){(real)(at[3 * n] - middle[0]), (real)(at[3 * n + 1] - middle[1]),
-                              (real)(at[3 * n + 2] - middle[2])};
+    for (int n = 0; n < 3; n++) { // by field: Mesa 25.0 does not copy a structure to an element of an array
+        corners[n].x = (real)(at[3 * n] - middle[0]);
+        corners[n].y = (real)(at[3 * n + 1] - middle[1]);
+        corners[n].z = (real)(at[3 * n + 2] - middle[2]);
+    }
     for (int n = 0; n < FAN; n++) good &= !not_finite((real)at[n]);
     global real *to = intervals + i * kept * 2;
     Hidden hidden;

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 import os
 import re
@@ -12,12 +11,20 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from gpuvision.host.cache import cache_folder, read_private, write_private
+from gpuvision.host.cache import read_private, write_private
 from gpuvision.host.debug import flatten_includes
 from gpuvision.host.program import options
 from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.profiling.offline.builds import KernelBuild
-from gpuvision.profiling.offline.targets import CompilerError, Target, Usage, check_compilers, compile_text, versions
+from gpuvision.profiling.offline.targets import (
+    CompilerError,
+    Target,
+    Usage,
+    cache_path,
+    check_compilers,
+    compile_text,
+    versions,
+)
 
 _COMMENT = re.compile(r"[ \t]*//[^\n]*")
 
@@ -159,9 +166,8 @@ def fault_of(usage: Usage, build: KernelBuild, target: Target, limits: ResourceL
 
 
 def _cached_usage(build: KernelBuild, target: Target) -> list[Usage]:
-    text, words = _text(build.source), options(build.defines)
-    key = json.dumps([text, words, target.name, target.options, versions(target)])
-    path = cache_folder() / "offline" / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.json"
+    text, words = kernel_text(build.source), options(build.defines)
+    path = cache_path(text, words, target, ".json")
     kept = read_private(path)
     if kept is not None:
         return [Usage(**each) for each in json.loads(kept)]
@@ -171,6 +177,6 @@ def _cached_usage(build: KernelBuild, target: Target) -> list[Usage]:
 
 
 @functools.cache
-def _text(source: str) -> str:
+def kernel_text(source: str) -> str:
     """Return a kernel file with its headers and without comments, so that a changed comment needs no compilation."""
     return _COMMENT.sub("", flatten_includes(KERNEL_FOLDER, source, ()))

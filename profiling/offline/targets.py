@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.util
+import json
 import re
 import shutil
 import subprocess
@@ -18,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from gpuvision.host.cache import cache_folder
 from gpuvision.host.errors import GpuVisionError
 
 CLANG = "clang-16"
@@ -152,6 +154,32 @@ def compile_text(text: str, options: Sequence[str], target: Target) -> list[Usag
     CompilerError
         The file does not compile, calls a function without a body, or keeps a compiler busy beyond the time limit.
     """
+    assembly = compile_assembly(text, options, target)
+    if target.vendor == "amd":
+        return usage_of_amd(assembly)
+    with tempfile.TemporaryDirectory(prefix="gpuvision-offline-") as folder:
+        source = Path(folder, "kernel.ptx")
+        source.write_text(assembly)
+        command = [find_ptxas() or "ptxas", "-v", f"-arch={target.name}", "-o", str(Path(folder, "kernel.cubin"))]
+        done = _run([*command, str(source)])
+        if done.returncode:
+            raise CompilerError(_first_errors(done.stderr))
+        return usage_of_ptxas(done.stderr)
+
+
+def compile_assembly(text: str, options: Sequence[str], target: Target) -> str:
+    """Compile a kernel file for a target and return the assembly: PTX for NVIDIA.
+
+    Parameters
+    ----------
+    text, options, target
+        As for `compile_text`.
+
+    Raises
+    ------
+    CompilerError
+        The file does not compile, or keeps the compiler busy beyond the time limit.
+    """
     with tempfile.TemporaryDirectory(prefix="gpuvision-offline-") as folder:
         source, assembly = Path(folder, "kernel.cl"), Path(folder, "kernel.s")
         source.write_text(text)
@@ -163,13 +191,13 @@ def compile_text(text: str, options: Sequence[str], target: Target) -> list[Usag
         done = _run([CLANG, *languages, *target.options, *words, *quiet, *options, "-o", str(assembly), str(source)])
         if done.returncode:
             raise CompilerError(_first_errors(done.stderr))
-        if target.vendor == "amd":
-            return usage_of_amd(assembly.read_text())
-        command = [find_ptxas() or "ptxas", "-v", f"-arch={target.name}", "-o", str(Path(folder, "kernel.cubin"))]
-        done = _run([*command, str(assembly)])
-        if done.returncode:
-            raise CompilerError(_first_errors(done.stderr))
-        return usage_of_ptxas(done.stderr)
+        return assembly.read_text()
+
+
+def cache_path(text: str, options: Sequence[str], target: Target, suffix: str) -> Path:
+    """Return the path of the cache file of a compiled kernel: a digest of text, options and compilers."""
+    key = json.dumps([text, options, target.name, target.options, versions(target)])
+    return cache_folder() / "offline" / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}{suffix}"
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:

@@ -1,0 +1,184 @@
+"""Coalescing of memory requests: interpreter of PTX, and the factors of the kernels that stream."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import gpuvision as gv
+from gpuvision.profiling.offline import targets
+from gpuvision.profiling.offline.coalescing import Trace, trace
+from gpuvision.profiling.offline.ptx import parse_kernel
+from gpuvision.profiling.offline.ptx_operations import compute
+from gpuvision.profiling.offline.targets import TARGETS, compile_assembly
+from gpuvision.profiling.offline.warp import Group, Memory, Requests
+
+needs_compilers = pytest.mark.skipif(
+    targets.shutil.which(targets.CLANG) is None or not TARGETS["sm_90"].bitcode.exists(),
+    reason="the offline compilers are not installed",
+)
+
+PROGRAM = """
+kernel void strided(global const float *from, global float *to, int stride, int count) {
+    const int i = get_global_id(0);
+    if (i < count) to[i] = from[i * stride] + 1.0f;
+}
+kernel void pairs(global const float2 *from, global float2 *to) {
+    to[get_global_id(0)] = from[get_global_id(0)].yx;
+}
+kernel void turned(global const int *from, global int *to) {
+    local int kept[64];
+    const int i = get_local_id(0);
+    int sum = 0;
+    for (int k = 0; k <= i; k++) sum += from[k];
+    kept[i] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    to[i] = kept[63 - i];
+}
+"""
+
+
+def interpreted(
+    name: str, source: NDArray[Any], target: NDArray[Any], *scalars: int, offset: int = 0, items: int = 64
+) -> dict[tuple[str, str], Requests]:
+    kernel = parse_kernel(compile_assembly(PROGRAM, [], TARGETS["sm_90"]), name)
+    memory = Memory()
+    arguments = [memory.add("from", source, offset), memory.add("to", target), *scalars]
+    Group(kernel, memory, arguments, group=(0, 0, 0), groups=(1, 1, 1), size=(items, 1, 1)).run()
+    return memory.requests
+
+
+@needs_compilers
+@pytest.mark.parametrize(("stride", "factor"), [(1, 1.0), (2, 2.0), (8, 8.0), (100, 8.0)])
+def test_factor_of_a_stride(stride: int, factor: float) -> None:
+    source, target = np.arange(64 * stride, dtype=np.float32), np.zeros(64, np.float32)
+    requests = interpreted("strided", source, target, stride, 64)
+    np.testing.assert_array_equal(target, source[::stride] + 1)
+    # 64 work-items are two warps; 32 numbers of 4 bytes fill 4 sectors.
+    assert requests["from", "load"] == Requests(2, int(8 * factor), 8, 256)
+    assert requests["from", "load"].factor == factor
+    assert requests["to", "store"] == Requests(2, 8, 8, 256)
+
+
+@needs_compilers
+def test_items_beyond_the_end_make_no_requests() -> None:
+    target = np.zeros(64, np.float32)
+    requests = interpreted("strided", np.ones(33, np.float32), target, 1, 33)
+    np.testing.assert_array_equal(target, np.repeat([2.0, 0.0], [33, 31]).astype(np.float32))
+    assert requests["from", "load"] == Requests(2, 5, 5, 132)
+
+
+@needs_compilers
+def test_barrier_and_loops_of_different_length() -> None:
+    source, target = np.arange(64, dtype=np.int32), np.zeros(64, np.int32)
+    interpreted("turned", source, target)
+    np.testing.assert_array_equal(target, np.cumsum(source)[::-1])
+
+
+@needs_compilers
+def test_access_that_stops_a_gpu_raises() -> None:
+    source, target = np.arange(128, dtype=np.float32), np.zeros(128, np.float32)
+    interpreted("pairs", source, target)
+    np.testing.assert_array_equal(target, source.reshape(-1, 2)[:, ::-1].ravel())
+    with pytest.raises(ValueError, match=r"address not aligned to 8 bytes"):
+        interpreted("pairs", source, target, offset=4)
+    with pytest.raises(IndexError, match="access of 8 bytes"):
+        interpreted("pairs", source[:-2], target)
+    with pytest.raises(IndexError, match="access of 8 bytes"):
+        interpreted("pairs", source, target[:-2])
+
+
+def test_arithmetic_of_ptx() -> None:
+    a, b = np.array([-7, 7, -7, 1 << 30], np.int32), np.array([2, -2, -2, 4], np.int32)
+    assert compute(("div", "s32"), [a, b]).tolist() == [-3, -3, 3, 1 << 28]
+    assert compute(("rem", "s32"), [a, b]).tolist() == [-1, 1, -1, 0]
+    assert compute(("mul", "wide", "s32"), [a, b]).tolist() == [-14, -14, 14, 1 << 32]
+    assert compute(("mul", "hi", "s32"), [a, b]).tolist() == [-1, -1, 0, 1]
+    assert compute(("shr", "s32"), [a, np.full(4, 40, np.uint32)]).tolist() == [-1, 0, -1, 0]
+    assert compute(("bfe", "s32"), [a, np.full(4, 1, np.uint32), np.full(4, 2, np.uint32)]).tolist() == [0, -1, 0, 0]
+    x = np.array([np.nan, 1e20, -2.7, 2.5], np.float32)
+    assert compute(("cvt", "rzi", "s32", "f32"), [x]).tolist() == [0, (1 << 31) - 1, -2, 2]
+    assert compute(("cvt", "rni", "f32", "f32"), [x])[2:].tolist() == [-3.0, 2.0]
+    assert compute(("setp", "geu", "f32"), [x, np.float32(2) + 0 * x]).tolist() == [True, True, False, True]
+    assert compute(("setp", "ge", "f32"), [x, np.float32(2) + np.zeros_like(x)]).tolist() == [False, True, False, True]
+    with pytest.raises(NotImplementedError, match="PTX instruction tanh"):
+        compute(("tanh", "approx", "f32"), [x])
+
+
+RNG = np.random.default_rng(3)
+_TO_SHEET = ((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 1e-5, 1.0))
+_REGION = ((0.0, 511.0), (0.0, 1023.0))
+_CAMERA = gv.Camera(
+    matrix=((250.0, 0.0, 127.5), (0.0, 250.0, 31.5), (0.0, 0.0, 1.0)),
+    distortion=(-0.1, 0.02, 1e-4, -2e-4, *(0.0,) * 10),
+)
+_POINTS = 1024
+
+
+def _currents(dtype: Any, *, planar: bool = False) -> NDArray[Any]:
+    currents = (1000.0 * RNG.uniform(1.0, 2.0, (_POINTS, 2))).astype(dtype)
+    return np.ascontiguousarray(currents.T) if planar else currents
+
+
+def _frames(dtype: Any, *, along: str = "columns", samples: int = 256) -> NDArray[Any]:
+    """Return a frame with a line that crosses it slowly, as most lines do: 96 samples along a profile."""
+    length = 96
+    centre = length * (0.4 + 0.2 * np.linspace(0.0, 1.0, samples))
+    frame = 200.0 * np.exp(-0.5 * ((np.arange(length)[:, None] - centre) / 2.0) ** 2)
+    frame += RNG.uniform(0.0, 8.0, frame.shape)
+    return np.ascontiguousarray(frame if along == "columns" else frame.T)[None].astype(dtype)
+
+
+def _image(dtype: Any, channels: int = 1) -> NDArray[Any]:
+    image = RNG.integers(0, 256, (16, 256, channels)).astype(dtype)
+    return image if channels > 1 else image[..., 0]
+
+
+_PLANE = gv.Triangulation(homography=_TO_SHEET, region=_REGION, sigma=(0.1, 0.1))
+_U, _V = (RNG.uniform(0.0, 500.0, _POINTS).astype(np.float32) for _ in range(2))
+_XY = RNG.uniform(10.0, 200.0, (_POINTS, 2)).astype(np.float32)
+# Name, operation, inputs, largest coalescing factor of the loads and of the stores.
+STREAMS: list[tuple[str, Any, list[NDArray[Any]], float, float]] = [
+    ("psd", gv.PsdReadout(strip_length=6e-3), [_currents(np.float32)], 2.0, 1.0),
+    ("psd codes", gv.PsdReadout(strip_length=6e-3), [_currents(np.uint16)], 2.0, 1.0),
+    ("psd double", gv.PsdReadout(strip_length=6e-3), [_currents(np.float64)], 2.0, 1.0),
+    ("psd planar", gv.PsdReadout(strip_length=6e-3, layout="planar"), [_currents(np.uint16, planar=True)], 1.0, 1.0),
+    ("triangulation", _PLANE, [_U, _V], 1.0, 1.0),
+    ("points", gv.UndistortPoints(model=_CAMERA), [_XY], 2.0, 1.9),
+    ("line, columns", gv.LineReadout(threshold=20), [_frames(np.uint8)], 2.1, 1.0),
+    ("line, columns, codes", gv.LineReadout(threshold=20), [_frames(np.uint16)], 1.5, 1.0),
+    ("line, columns, float", gv.LineReadout(threshold=20), [_frames(np.float32)], 1.25, 1.0),
+    ("centroid, columns", gv.LineReadout(method="centroid", threshold=20), [_frames(np.uint8)], 1.0, 1.0),
+    ("line, rows", gv.LineReadout(threshold=20, along="rows"), [_frames(np.uint8, along="rows")], 32.0, 1.0),
+    (
+        "centroid, rows",
+        gv.LineReadout(method="centroid", threshold=20, along="rows"),
+        [_frames(np.float32, along="rows")],
+        8.0,
+        1.0,
+    ),
+    ("image", gv.UndistortImage(model=_CAMERA), [_image(np.uint8)], 1.65, 1.0),
+    ("image, colour", gv.UndistortImage(model=_CAMERA, channels=3), [_image(np.uint8, 3)], 3.4, 2.5),
+    ("image, computed", gv.UndistortImage(model=_CAMERA, coordinates="computed"), [_image(np.uint8)], 1.65, 1.0),
+]
+
+
+@needs_compilers
+@pytest.mark.parametrize(
+    ("operation", "inputs", "loads", "stores"), [each[1:] for each in STREAMS], ids=[each[0] for each in STREAMS]
+)
+def test_streams_are_coalesced(operation: Any, inputs: list[NDArray[Any]], loads: float, stores: float) -> None:
+    traced: Trace = trace(operation, inputs)
+    assert traced.of("load").factor <= loads
+    assert traced.of("store").factor <= stores
+    assert traced.of("load").count > 0
+    for field, value in traced.outputs.items():
+        expected = getattr(operation(*inputs), field)
+        if value.dtype.kind == "f":
+            # Compilers differ in contraction: a few units in the last place.
+            np.testing.assert_allclose(value, expected, rtol=4e-6, atol=4e-6 * np.nanmax(np.abs(expected)))
+        else:
+            np.testing.assert_array_equal(value, expected)

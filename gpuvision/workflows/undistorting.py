@@ -192,14 +192,15 @@ def _undistorted_image(
 
 
 def _undistorted_points(file: Path, model: Lens | Camera, device: Device) -> npt.NDArray[Any]:
-    """Read points of an NPY file and undistort them."""
+    """Read points of an NPY file and undistort them, in single precision on a device without doubles."""
     points = read_array(file)
     if points.ndim < 1 or points.shape[-1] != 2 or points.dtype not in (np.float32, np.float64):
         raise RecordingError(
             f"{file}: {points.dtype} of shape {points.shape}, expected float32 or float64 points of shape (..., 2)"
         )
     flat = np.ascontiguousarray(points.reshape(-1, 2))
-    undistorted = UndistortPoints(model=model)(flat, device=device).points
+    real = flat.dtype if device.has_double else np.dtype(np.float32)
+    undistorted = UndistortPoints(model=model)(flat.astype(real, copy=False), device=device).points
     return to_numpy(undistorted).reshape(points.shape)
 
 

@@ -30,7 +30,8 @@ def _image(part_in_pipette: np.ndarray, device: Device, noise_number: int = 0) -
     board = ReflectanceMap.of(drawing, pixel=PIXEL, region=((-5e-3, -5e-3), (5e-3, 5e-3)), blur_px=0.5)
     part_in_camera = compose_poses(NOZZLE.pose, part_in_pipette)
     render = RenderBoard(board=board, shape=SHAPE, sensor=read_cmos_sensor("pb1024"))
-    result = render(invert_pose(part_in_camera)[None, None], np.array([noise_number], np.uint32), device=device)
+    camera = invert_pose(part_in_camera)[None, None].astype(np.float64 if device.has_double else np.float32)
+    result = render(camera, np.array([noise_number], np.uint32), device=device)
     return to_numpy(result.image)[0]
 
 

@@ -249,6 +249,7 @@ class BoardMeasurer:
         etch_factor = np.where(self.features.spacing == 0, 1.0, 0.0)
         edges = line_rows(rulers.normal, rulers.point - placement, measured - placement, rulers.sigma, etch_factor)
         rows = np.concatenate([edges, fiducials.rows(placement)])
+        real = np.float64 if self.device.has_double else np.float32
         return SolvePose(
             transform=transform,
             scale=None,
@@ -257,8 +258,7 @@ class BoardMeasurer:
             min_inlier_fraction=self.limits.min_share,
             search_range=search_range,
             max_trials=_TRIALS,
-            precision="double" if self.device.has_double else "single",
-        )(np.ascontiguousarray(rows if has_etch_bias else rows[:, :-1]), device=self.device)
+        )(np.ascontiguousarray(rows if has_etch_bias else rows[:, :-1], real), device=self.device)
 
     def _test_scale(self, solution: PoseSolution, scale: float) -> PoseSolution:
         """Test the given scale: solve again with the scale as one more unknown (nested model).

@@ -84,7 +84,9 @@ class SimulatedCamera:
         seed: int = 0,
     ) -> None:
         render = board_renderer(board, machine.camera, seed=seed)
-        self._bound = render.bind(Device.best() if device is None else device, (1, _SUBPOSES, 3), np.dtype(np.float64))
+        device = Device.best() if device is None else device
+        self._real = np.dtype(np.float64 if device.has_double else np.float32)
+        self._bound = render.bind(device, (1, _SUBPOSES, 3), self._real)
         delay = machine.delay
         self._period, self._latency, self._exposure = machine.period, delay.latency, delay.exposure
         self._nozzle, self._camera_in_pipette = nozzle, invert_pose(pipette_in_camera)
@@ -112,7 +114,7 @@ class SimulatedCamera:
         exposed = arrived - self._latency
         parts = (np.arange(_SUBPOSES) + 0.5) / _SUBPOSES - 0.5
         poses = compose_poses(self._nozzle(exposed + parts * self._exposure), self._camera_in_pipette)
-        self._bound.inputs[0].set(np.ascontiguousarray(poses[None]))
+        self._bound.inputs[0].set(np.ascontiguousarray(poses[None], self._real))
         self._bound.inputs[1].set(np.array([self._frame], np.uint32))
         result = self._bound.run()
         return Frame(to_numpy(result.image)[0], exposed, arrived)

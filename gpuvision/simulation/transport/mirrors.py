@@ -37,6 +37,9 @@ Integers = npt.NDArray[np.int64]
 
 # Images of a point in curved mirrors that the kernel has room for: at first, and at most (the count is one byte).
 _FIRST_IMAGES, _MAX_IMAGES = 32, 255
+# Largest difference of the images of a point in two triangles of an edge, relative to the scene, in single precision:
+# EDGE of kernels/mirrors/mirrors.cl. In double precision the clearance is larger.
+_SAME_IMAGE = 1e-5
 
 
 class _MirroredParts(NamedTuple):
@@ -299,7 +302,7 @@ class Mirrors:
         point, spot, move, density, triangle = (np.concatenate(each) for each in zip(*found, strict=True))
         # An image on the edge of two triangles is found on both; one is kept.
         order = np.lexsort((*spot.T, point))
-        is_duplicate = np.abs(np.diff(spot[order], axis=0)).max(axis=1, initial=0.0) <= self._surfaces.clearance
+        is_duplicate = np.abs(np.diff(spot[order], axis=0)).max(axis=1, initial=0.0) <= self._image_tolerance
         once = order[np.append(True, ~is_duplicate | (np.diff(point[order]) != 0))[: len(order)]]
         return point[once], spot[once], move[once], density[once], triangle[once]
 
@@ -373,6 +376,13 @@ class Mirrors:
             clearance=self._surfaces.clearance,
             device=self._device,
         )
+
+    @functools.cached_property
+    def _image_tolerance(self) -> float:
+        """Distance of images in two triangles up to which they are one image on the common edge [m]."""
+        if self._device.has_double:
+            return self._surfaces.clearance
+        return _SAME_IMAGE * float(np.abs(self.scene.corners).max(initial=0.0))
 
     @functools.cached_property
     def _fans(self) -> VisibleIntervals:

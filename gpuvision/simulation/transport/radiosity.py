@@ -213,7 +213,7 @@ class Radiosity:
         Parameters
         ----------
         receivers : numpy.ndarray
-            (..., 6), float32 or float64: position [m] and normal.
+            (..., 6), float32 or float64: position [m] and normal. Computed as float32 on a device without doubles.
         exitance : numpy.ndarray
             (count,): exitance of the patches [W/m^2].
         min_exitance : float
@@ -222,9 +222,9 @@ class Radiosity:
             (`FormFactors`) may exceed that.
         """
         operation = PatchLight(patches=self.patches, scene=self.scene)
-        real = np.float64 if receivers.dtype == np.float64 else np.float32
+        real = self._real if receivers.dtype == np.float64 else np.float32
         strong = np.where(exitance >= min_exitance, exitance, 0.0).astype(real)
-        return operation(receivers, strong, device=self.device)
+        return operation(receivers.astype(real, copy=False), strong, device=self.device)
 
     @functools.cached_property
     def form_factors(self) -> Reals:

@@ -301,7 +301,7 @@ def test_an_image_on_an_edge_counts_once(device: Device) -> None:
     points = np.hstack([points, np.tile([1e-4, 0.0, 0.0], (40, 1))])
     row, spot, *_ = images._images(points, lens)
     np.testing.assert_array_equal(row, np.arange(40))
-    np.testing.assert_allclose((spot - middle) @ back, 5e-3, rtol=1e-6)
+    np.testing.assert_allclose((spot - middle) @ back, 5e-3, rtol=1e-6 if device.has_double else 1e-4)
     raw = images._points(8)(points, lens, device=device) if device.has_double else None
     assert raw is None or np.all(raw.image_count == 2)
 

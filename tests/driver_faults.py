@@ -58,31 +58,29 @@ FAULTS = (
     DriverFault(
         "rusticl",
         "22.3",
-        r"test_line\.py::test_faintest_light\[.*centroid|test_line_irradiance\.py::test_sizes_and_canaries\[.*20011|"
-        r"test_mirrors\.py::test_an_image_on_an_edge_counts_once\[",
-        "Mesa 22.3 misses limits of error: centroid of the faintest light, irradiance at some of 20 011 receivers, "
-        "mirror images on an edge (causes not found)",
+        r"test_line\.py::test_faintest_light\[.*centroid",
+        "Mesa 22.3 misses the limit of error of the centroid of the faintest light (cause not found)",
     ),
     DriverFault(
         "rusticl",
         "22.3",
         r"test_feature_pose\.py::test_(pose_is|errors_are_as|a_region_of|a_mirrored_side|search_distance|results_must|"
         r"a_blob_of|one_kind_of)_",
-        "Mesa 22.3 finds no pose from rulers and blobs in an image: NaN, AMBIGUOUS or NO_DATA (cause not found)",
+        "Mesa 22.3 finds no pose from rulers and blobs in an image: NaN, AMBIGUOUS or NO_DATA; passes with Mesa 25.0.7",
     ),
     DriverFault(
         "rusticl",
         "22.3",
         r"test_registration_pairs\.py::test_(copper_of_another_width|a_scale_is_not_hidden)_",
         "Mesa 22.3 computes wrong pose steps with five or more unknowns (affine, or similarity with an etch bias): "
-        "AMBIGUOUS, where PoCL finds the pose",
+        "AMBIGUOUS, where PoCL finds the pose; passes with Mesa 25.0.7",
     ),
     DriverFault(
         "rusticl",
         "22.3",
         r"test_registration\.py::test_(a_board_is_found|images_of_any|another_camera|a_repeated_pitch|real_boards|"
         r"a_real_board|what_was_applied|what_leaves)_",
-        "Mesa 22.3 finds no pose of a board in an image: LOW_SIGNAL (cause not found: fits of rigid poses are correct)",
+        "Mesa 22.3 finds no pose of a board in an image: LOW_SIGNAL; passes with Mesa 25.0.7",
     ),
 )
 

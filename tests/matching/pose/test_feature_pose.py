@@ -115,6 +115,7 @@ def length_of(bound: BoundFeatures) -> int:
     return bound.operation.ruler.length
 
 
+@pytest.mark.double
 def test_pose_is_that_of_the_operations_one_by_one(
     features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
 ) -> None:
@@ -252,7 +253,7 @@ def test_a_device_with_separate_memory_gives_the_same_pose(
 
 def test_results_must_lie_apart(features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device) -> None:
     operation = bind(features, device).operation
-    frames = seen[0], NEAR, np.zeros(2, np.float32)
+    frames = seen[0], NEAR.astype(np.float64 if device.has_double else np.float32), np.zeros(2, np.float32)
     result = operation(*frames, device=device)
     with pytest.raises(ValueError, match="arrays apart"):
         operation(*frames, device=device, out=result._replace(scale=result.residual_scale))

@@ -21,7 +21,17 @@ from gpuvision.host.errors import (
     StreamError,
 )
 from gpuvision.host.kept import clear_cache
-from gpuvision.host.launch import Launch, Precision, Spec, Specs, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host.launch import (
+    Launch,
+    Precision,
+    Spec,
+    Specs,
+    Variant,
+    real_defines,
+    real_of,
+    two_floats,
+    uses_vectors,
+)
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, table_offsets, type_defines
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Pipeline, PipelineLimits
@@ -111,6 +121,7 @@ __all__ = [
     "round_up",
     "table_offsets",
     "to_numpy",
+    "two_floats",
     "type_defines",
     "uses_vectors",
     "vector_work",

@@ -17,6 +17,7 @@ from numpy.typing import DTypeLike
 
 from gpuvision.host import discovery
 from gpuvision.host.arrays import SHARED_FLAGS, DeviceArray
+from gpuvision.host.double_rate import SLOW_RATIO, double_ratio
 from gpuvision.host.errors import DeviceLimitError, DeviceMemoryError, DeviceUnusableError, NoDeviceError
 from gpuvision.host.failure import launch_failure
 from gpuvision.host.kept import clear_with
@@ -99,6 +100,15 @@ class Device:
         self.max_allocation = int(handle.max_mem_alloc_size)
         self.cache_bytes = max(int(handle.global_mem_cache_size), _MIN_LAST_CACHE)
         self.shares_memory = self.is_cpu and _has_fine_grained_memory(handle)
+
+    @functools.cached_property
+    def has_fast_double(self) -> bool:
+        """Whether doubles are worth their time inside single-precision work.
+
+        Not on a device without doubles, nor on a GPU with doubles at 1/32 of the float rate or less. The first access
+        on a GPU measures the rate, once for each driver; see ``gpuvision.host.double_rate``.
+        """
+        return double_ratio(self.handle) < SLOW_RATIO
 
     def _new_context(self) -> Any:
         return cl.Context([self.handle] if self.inline_device is None else [self.handle, self.inline_device])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from gpuvision.host.device import Device
 from gpuvision.host.program import Define
@@ -188,6 +189,29 @@ def real_defines(device: Device, real: np.dtype[Any]) -> dict[str, Define]:
     if not device.has_double:
         raise ValueError(f"device {device.label} has no double precision; use precision='single'")
     return {"REAL_IS_DOUBLE": None}
+
+
+def two_floats(values: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """Return numbers as pairs of floats, for ``kernels/common/two_float.h``.
+
+    Parameters
+    ----------
+    values : array_like of float
+        Numbers (...,); below 3e38.
+
+    Returns
+    -------
+    numpy.ndarray
+        (..., 2) float32: the nearest float, and the rest. The relative error is below 2^-48.
+
+    Examples
+    --------
+    >>> two_floats([1.0, 0.1]).tolist()
+    [[1.0, 0.0], [0.10000000149011612, -1.4901161415892261e-09]]
+    """
+    wide = np.asarray(values, np.float64)
+    high = wide.astype(np.float32)
+    return np.stack([high, (wide - high).astype(np.float32)], axis=-1)
 
 
 class Launchable(Protocol):

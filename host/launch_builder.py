@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 from numpy.typing import DTypeLike
 
 from gpuvision.host.device import Device
@@ -20,6 +21,7 @@ from gpuvision.host.launch import (
     nbytes_of,
     real_defines,
     real_of,
+    two_floats,
     uses_vectors,
 )
 from gpuvision.host.program import Define
@@ -110,6 +112,23 @@ class LaunchBuilder:
     def widest(self) -> np.dtype[Any]:
         """Widest floating-point type of the device."""
         return np.dtype(np.float64 if self.device.has_double else np.float32)
+
+    @functools.cached_property
+    def doubles_positions(self) -> bool:
+        """Whether kernels keep positions in double precision; otherwise they keep two floats (``two_float.h``).
+
+        In double-precision work and on float64 input, and in single-precision work where doubles are fast.
+        """
+        return np.float64 in (self.real, self.dtype) or self.device.has_fast_double
+
+    @property
+    def position_defines(self) -> dict[str, Define]:
+        """Macros that select the type of positions, for ``common/places.h``."""
+        return flags(DOUBLE_POSITIONS=self.doubles_positions, TWO_FLOAT_POSITIONS=not self.doubles_positions)
+
+    def positions(self, values: npt.NDArray[np.float64]) -> npt.NDArray[np.floating[Any]]:
+        """Return a table of positions in the type of the kernel: float64, or pairs of float32 along a new last axis."""
+        return values if self.doubles_positions else two_floats(values)
 
     @functools.cached_property
     def uses_vectors(self) -> bool:

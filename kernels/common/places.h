@@ -1,11 +1,36 @@
-// Positions [m]: double wherever the device has it (build option DOUBLE_POSITIONS), independent of the real type.
+// Positions [m] with more digits than a float, independent of the real type.
 //
 // At 1e-6 of a segment's length from the segment a difference of two single-precision positions has no digit left.
 // Differences are taken in `place`, the rest is computed in `real`.
+//
+// Options: DOUBLE_POSITIONS: doubles, on devices with fast doubles; TWO_FLOAT_POSITIONS: two floats (two_float.h), on
+// other devices; neither: floats.
 #ifndef PLACES_H
 #define PLACES_H
 #include "common/lanes.h"
 
+#ifdef TWO_FLOAT_POSITIONS
+#include "common/two_float.h"
+
+typedef float2 place; // in memory: high part, low part
+typedef two_floats places;
+
+INLINE reals convert_to_reals(places value) { return value.high; }
+INLINE places convert_places(reals value) { return (places){value, (reals)0}; }
+INLINE places place_minus(reals a, place b) { return two_plus_real(two_sum(a, (reals)-b.x), (reals)-b.y); }
+INLINE places place_plus(places a, place b) { return two_plus(a, two_floats_of(b)); }
+INLINE places place_plus_real(places a, reals b) { return two_plus_real(a, b); }
+// a + b, of which only the nearest real is used.
+INLINE reals real_of_sum(places a, place b) {
+    const two_floats high = two_sum(a.high, (reals)b.x);
+    return high.high + (high.low + (a.low + (reals)b.y));
+}
+// x row[0] + y row[1] + z row[2] + row[3]
+INLINE places place_dot(places x, places y, places z, global const place *row) {
+    return two_dot_plus(x, two_floats_of(row[0]), y, two_floats_of(row[1]), z, two_floats_of(row[2]), two_floats_of(row[3]));
+}
+
+#else
 #ifdef DOUBLE_POSITIONS
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 typedef double place;
@@ -31,11 +56,20 @@ INLINE reals convert_to_reals(places value) { return LANED(convert_real)(value);
 INLINE places load_places(const place *from) { return *(const places_at *)from; }
 INLINE void store_places(places value, place *to) { *(places_at *)to = value; }
 
+INLINE places place_minus(places a, place b) { return a - b; }
+INLINE places place_plus(places a, place b) { return a + b; }
+INLINE places place_plus_real(places a, reals b) { return a + convert_places(b); }
+INLINE reals real_of_sum(places a, place b) { return convert_to_reals(a + b); }
+INLINE places place_dot(places x, places y, places z, global const place *row) {
+    return x * row[0] + (y * row[1] + (z * row[2] + row[3]));
+}
+
 // The mask of a comparison of places, with the number of bits per lane of a real.
 #ifdef VECTOR_VARIANT
 #define mask_of_places(comparison) convert_bits16(comparison)
 #else
 #define mask_of_places(comparison) (-(bits)(comparison))
+#endif
 #endif
 
 #endif

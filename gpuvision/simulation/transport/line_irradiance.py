@@ -18,7 +18,6 @@ from gpuvision.host import (
     StatusArray,
     Variant,
     ceil_div,
-    flags,
     type_defines,
 )
 from gpuvision.operation import VisionOperation
@@ -95,15 +94,18 @@ class LitSegments:
         for array in (self.exitance, self.ends, self.normals):
             array.flags.writeable = False
 
-    def tables(self, place: np.dtype[Any], real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
-        """Return the tables of the emitters in the order of ``kernels/line_irradiance/line_irradiance.cl``."""
+    def tables(self, real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
+        """Return the tables of the emitters in the order of ``kernels/line_irradiance/line_irradiance.cl``.
+
+        Tables of positions have float64.
+        """
         across = self.ends[:, 1] - self.ends[:, 0]
         length = np.linalg.norm(across, axis=1)
         emits = np.flatnonzero((length > 0.0) & (self.exitance > 0.0))
         if not len(emits):
             # OpenCL has no buffers of size 0.
             shapes = (3,), (1, 12), (1, 9), (2,), (1, 4), (1, 3)
-            types = place, place, real, np.uint32, place, real
+            types = np.float64, np.float64, real, np.uint32, np.float64, real
             return tuple(np.zeros(shape, dtype) for shape, dtype in zip(shapes, types, strict=True))
         along, normals = _unit(across[emits]), self.normals[emits]
         frames = np.stack([along, normals, np.cross(along, normals)], axis=1)
@@ -123,11 +125,11 @@ class LitSegments:
         rows = np.dstack([frames, _inside(frames, middle - begin[firsts])])
         shifts = _inside(np.repeat(frames, segments, axis=0), np.repeat(begin[firsts], segments, axis=0) - begin)
         return (
-            middle.astype(place),
-            rows.reshape(-1, 12).astype(place),
+            middle,
+            rows.reshape(-1, 12),
             -frames.reshape(-1, 9).astype(real),
             np.append(firsts, len(emits)).astype(np.uint32),
-            np.column_stack([shifts, length[emits]]).astype(place),
+            np.column_stack([shifts, length[emits]]),
             np.column_stack([length[emits], length[emits] ** 2, self.exitance[emits] / math.tau]).astype(real),
         )
 
@@ -176,9 +178,9 @@ class LineIrradiance(VisionOperation[Irradiance]):
     the integral of dt / r^3, the irradiance if the whole segment were on the receiver's normal; E <= E0. The error per
     segment is below 2e-6 E0 in single and 1e-14 (1 + D / h) E0 in double, at any distance: h is the receiver's height
     above the lit surface, D the distance of the segment's far end or of the middle of all segments. So the error is
-    relative except where the segment is at a grazing angle to the receiver. On a device without double, positions are
-    single, which adds 1.2e-7 of the largest coordinate over h. The tests hold these limits at random and extreme
-    configurations.
+    relative except where the segment is at a grazing angle to the receiver. On a device without doubles, or with
+    doubles at 1/32 of the float rate or less, positions are two floats (kernels/common/two_float.h), which adds
+    2^-42 (1 + D / h) E0 to the error. The tests hold these limits at random and extreme configurations.
 
     Receivers are transformed once into a frame for all segments of one direction on surfaces of one normal, as on flat
     faces. In single, directions that differ by 1e-13 share a frame, which adds up to 1e-13 D / h.
@@ -206,8 +208,7 @@ class LineIrradiance(VisionOperation[Irradiance]):
         build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, narrows=True, variant=self.variant)
         build.check_dtype("float32", "float64", of="receivers")
         build.check_shape(shape[-1:] == (6,), "receivers (..., 6), place and normal")
-        tables = self.segments.tables(build.widest, build.real)
-        firsts = tables[3]
+        middle, rows, axes, firsts, starts, lines = self.segments.tables(build.real)
         count = math.prod(shape[:-1])
         share = build.share(count, per_core=_STRIPS_PER_CORE, multiple=_LANES)
         # With fewer receivers the start of a work-item would cost more time than it saves.
@@ -218,9 +219,13 @@ class LineIrradiance(VisionOperation[Irradiance]):
             "line_irradiance",
             work=work,
             outputs=build.outputs({"irradiance": shape[:-1], "status": shape[:-1]}),
-            defines={**type_defines("INPUT", dtype), **flags(DOUBLE_POSITIONS=device.has_double)},
+            defines={**type_defines("INPUT", dtype), **build.position_defines},
             arguments=[
-                *tables,
+                *map(build.positions, (middle, rows)),
+                axes,
+                firsts,
+                build.positions(starts),
+                lines,
                 np.uint32(np.count_nonzero(np.diff(firsts) == 1)),
                 np.uint32(len(firsts) - 1),
                 np.uint64(count),

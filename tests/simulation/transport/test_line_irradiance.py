@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from typing import Any
@@ -222,7 +223,7 @@ def test_segments_that_lie_alike(device: Device, variant: Any, precision: Any, r
     segments = LitSegments(ends @ rotation + 0.3, normals @ rotation, np.ones(41))
     places = ends[:, 0] + rng.uniform(1e-4, 1e-2, (41, 3)) * normals + [1e-3, 1e-3, 1e-3]
     receivers = np.hstack([places @ rotation + 0.3, rng.normal(size=(41, 3))])
-    frames = segments.tables(np.dtype(np.float64), np.dtype(np.float32))[1]
+    frames = segments.tables(np.dtype(np.float32))[1]
     assert len(frames) < 8
     assert_exact(receivers[:8], segments, device, variant, precision)
 
@@ -247,6 +248,29 @@ def test_at_a_millionth_of_its_length(
     for shift in (0.0, 1.0):
         assert_exact(*moved_scene(np.array(receivers), FLOOR, random_rotation(rng), shift), device, variant, precision)
     assert_exact(np.array(receivers, np.float32), lit(FLOOR), device, variant, precision)
+
+
+@TWO_WAYS
+@pytest.mark.parametrize("alike", [False, True])
+def test_positions_without_doubles(device: Device, variant: Any, alike: bool, rng: np.random.Generator) -> None:
+    """Two floats keep the digits of positions where single precision would lose all of them."""
+    if variant == "vector" and not device.takes_vectors:
+        pytest.skip("no vectors on this device")
+    slow = copy.copy(device)
+    slow.has_fast_double = False
+    receivers = [(x, 0.0, h, 0.3, 0.2, -1.0) for x in (0.2, 0.5, 1.0) for h in (1e-6, 1e-5, 1e-3)]
+    scene = [(np.add(FLOOR[0], by), np.add(FLOOR[1], by), FLOOR[2]) for by in rng.uniform(-0.1, 0.1, (19, 3))]
+    if not alike:  # each in a frame of its direction
+        scene = [(start, start + rng.normal(size=3) * [1.0, 1.0, 0.0], normal) for start, _, normal in scene]
+    rounded, segments = moved_scene(np.array(receivers), [FLOOR, *scene], random_rotation(rng), 1.0)
+    rounded = rounded.astype(np.float32)
+    frames = len(segments.tables(np.dtype(np.float32))[1])
+    assert frames == (1 if alike else 20)
+    value, most = reference.irradiance(rounded.astype(float), segments.ends, segments.normals, segments.exitance)
+    result = LineIrradiance(segments=segments, variant=variant)(np.tile(rounded, (16, 1)), device=slow)
+    worst = most * np.max(reach(rounded.astype(float), segments), axis=1)
+    error = np.abs(result.irradiance.reshape(16, -1) - value)
+    assert np.all(error <= 2e-6 * most + 2.0**-42 * worst), f"{np.max(error / most)} of the whole light"
 
 
 @pytest.mark.double

@@ -1,0 +1,84 @@
+"""Rate of double precision: measured on GPUs once for each driver, and kept."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from gpuvision.host import Device, LaunchBuilder, double_rate
+from gpuvision.ranging.psd import PsdReadout
+
+READOUT = PsdReadout(strip_length=6e-3)
+
+
+def handle_of(driver: str = "1", *, doubles: int = 63, kind: int = cl.device_type.GPU) -> Any:
+    """Return a device handle with a driver, floating-point capabilities and a type."""
+    platform = SimpleNamespace(name="maker", version="OpenCL 3.0")
+    return SimpleNamespace(platform=platform, name="card", driver_version=driver, double_fp_config=doubles, type=kind)
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
+    """Drivers that were measured, one a measurement; double precision takes 32 times the time on driver 1."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    drivers: list[str] = []
+
+    def seconds(handle: Any, real: type[Any]) -> float:
+        drivers.append(handle.driver_version)
+        slow = 32.0 if handle.driver_version == "1" else 2.0
+        return slow if real is np.float64 else 1.0
+
+    monkeypatch.setattr(double_rate, "_seconds", seconds)
+    return drivers
+
+
+def test_a_gpu_is_measured_once_for_each_driver(measured: list[str], tmp_path: Path) -> None:
+    assert [double_rate.double_ratio(handle_of(driver)) for driver in ("1", "2", "1", "2")] == [32.0, 2.0, 32.0, 2.0]
+    assert measured == ["1", "1", "2", "2"]  # single and double of each
+    kept = json.loads((tmp_path / "gpuvision" / "double_rates.json").read_text())
+    assert sorted(kept.values()) == [2.0, 32.0]
+
+
+@pytest.mark.parametrize("damage", ["", "[]", "{", '{"k": "fast"}'])
+def test_a_damaged_file_is_measured_again(measured: list[str], tmp_path: Path, damage: str) -> None:
+    double_rate.double_ratio(handle_of())
+    (tmp_path / "gpuvision" / "double_rates.json").write_text(damage)
+    assert double_rate.double_ratio(handle_of()) == 32.0
+    assert len(measured) == 4
+
+
+def test_a_cpu_and_a_device_without_doubles_are_not_measured(measured: list[str]) -> None:
+    assert double_rate.double_ratio(handle_of(kind=cl.device_type.CPU)) == 2.0
+    assert double_rate.double_ratio(handle_of(doubles=0)) == math.inf
+    assert not measured
+
+
+def test_the_kernel_of_the_measurement_runs(device: Device) -> None:
+    times = [double_rate._seconds(device.handle, real) for real in (np.float32, np.float64)[: 1 + device.has_double]]
+    assert all(1e-6 < seconds < 10.0 for seconds in times)
+
+
+def test_cpu_runtimes_with_doubles_have_fast_doubles(device: Device) -> None:
+    assert device.has_fast_double == device.has_double
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_positions_of_single_precision_follow_the_rate(device: Device, precision: Any) -> None:
+    slow = copy.copy(device)
+    slow.has_double, slow.has_fast_double = True, False
+    build = LaunchBuilder(READOUT, slow, (3, 2), np.dtype(np.float32), precision=precision)
+    in_double = precision == "double"
+    assert build.doubles_positions == in_double
+    assert set(build.position_defines) == {"DOUBLE_POSITIONS" if in_double else "TWO_FLOAT_POSITIONS"}
+    table = build.positions(np.array([[0.1, 2.0]]))
+    assert (table.shape, table.dtype) == (((1, 2), np.float64) if in_double else ((1, 2, 2), np.float32))
+    wide = LaunchBuilder(READOUT, slow, (3, 2), np.dtype(np.float64), precision="single", narrows=True)
+    assert wide.doubles_positions

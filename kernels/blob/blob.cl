@@ -476,7 +476,7 @@ static inline void measure(global const CODE *image, int rows, int columns, real
                     constant real *table, blob_layout layout, EDGE_SPACE blob_edges *edges
 #ifndef VECTOR_VARIANT
                     ,
-                    local real *profile, local real *slopes, local int *flags
+                    local ruler_memory *rulers
 #endif
 ) {
     const real cosine = cos(turned), sine = sin(turned);
@@ -490,13 +490,13 @@ static inline void measure(global const CODE *image, int rows, int columns, real
         const reals from_x = shape.x + shape.size * (cosine * bx - sine * by);
         const reals from_y = shape.y + shape.size * (sine * bx + cosine * by);
         const reals along_x = cosine * nx - sine * ny, along_y = sine * nx + cosine * ny;
-        ruler_edge edge;
 #ifdef VECTOR_VARIANT
+        ruler_edge edge;
         ruler_measure_lanes(image, rows, columns, x + from_x, y + from_y, along_x, along_y, table, 0, &edge);
         take_edges(edge, i, layout, shape, cosine, sine, from_x, from_y, edges);
 #else
-        ruler_measure(image, rows, columns, (real4)(x + from_x, y + from_y, along_x, along_y), table, 0, profile,
-                      slopes, flags, &edge);
+        const real4 ruler = {x + from_x, y + from_y, along_x, along_y};
+        const ruler_edge edge = ruler_measure(image, rows, columns, ruler, table, 0, rulers);
         if (get_local_id(0) == 0) take_edges(edge, i, layout, shape, cosine, sine, from_x, from_y, edges);
 #endif
     }
@@ -521,8 +521,8 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
     const uint first = get_global_id(0) * each, end = min(first + each, count);
     const int mine = 1;
 #else
-    local real profile[RULER_CAPACITY], slopes[RULER_SLOPES_CAPACITY], shared_state[5];
-    local int flags;
+    local ruler_memory rulers;
+    local real shared_state[5];
     local blob_edges shared;
     const uint first = get_group_id(0), end = first + 1;
     const int mine = get_local_id(0) == 0;
@@ -546,8 +546,7 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
 #ifdef VECTOR_VARIANT
             measure(image, rows, columns, place[0], place[1], from, from.angle, table, layout, &edges);
 #else
-            measure(image, rows, columns, place[0], place[1], from, from.angle, table, layout, &shared, profile, slopes,
-                    &flags);
+            measure(image, rows, columns, place[0], place[1], from, from.angle, table, layout, &shared, &rulers);
 #endif
             if (mine) {
 #ifndef VECTOR_VARIANT

@@ -145,11 +145,11 @@ kernel void board_pose(global const CODE *restrict image, global const BoardRule
     const int count = ROWS_PER_LINE * lines, padded = (count + LANES - 1) / LANES * LANES;
     SHARED real row[8][CAPACITY];
     const line_rows lined = {row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7]};
-    ruler_edge edge[MAX_EDGES];
     SHARED real place[3][MAX_RULERS];
     const edge_places places_of = {place[0], place[1], place[2]};
 #ifdef VECTOR_VARIANT
     const int item = 0, items = LANES;
+    ruler_edge edge[MAX_EDGES];
     for (int first = 0; first < lines * each; first += LANES) {
         ruler_measure(image, rows, columns, (global const real *)(rulers + first), RULER_NUMBERS, lines * each - first,
                       table, model, edge);
@@ -161,19 +161,20 @@ kernel void board_pose(global const CODE *restrict image, global const BoardRule
         }
     }
 #else
-    local real profile[RULER_CAPACITY], slopes[RULER_SLOPES_CAPACITY];
-    local int flags;
-    const int item = get_local_id(0), items = RULER_GROUP;
-    for (int i = 0; i < lines * each; i++) {
-        const real4 ruler = {rulers[i].x_px, rulers[i].y_px, rulers[i].cosine, rulers[i].sine};
-        ruler_measure(image, rows, columns, ruler, table, model, profile, slopes, &flags, edge);
-        if (item == 0) {
-            put_edge(edge[0].position, edge[0].sigma, rulers + i, i, places_of);
-            edges[i] = edge[0].position;
-            edge_status[i] = (uchar)edge[0].status;
+    local ruler_memory shared;
+    const int item = get_local_id(0), items = RULER_GROUP, count_of_rulers = lines * each;
+    for (int first = 0; first < count_of_rulers; first += RULERS_PER_GROUP) {
+        const int i = first + ruler_of_item();
+        global const BoardRuler *of = rulers + min(i, count_of_rulers - 1);
+        const real4 ruler = {of->x_px, of->y_px, of->cosine, of->sine};
+        const ruler_edge edge = ruler_measure(image, rows, columns, ruler, table, model, &shared);
+        if (ruler_lane() == 0 && i < count_of_rulers) {
+            put_edge(edge.position, edge.sigma, of, i, places_of);
+            edges[i] = edge.position;
+            edge_status[i] = (uchar)edge.status;
         }
-        barrier(CLK_LOCAL_MEM_FENCE);
     }
+    barrier(CLK_LOCAL_MEM_FENCE);
 #endif
     for (int first = item; first < lines; first += items) {
         reals x[MAX_RULERS_PER_LINE], y[MAX_RULERS_PER_LINE], certainty[MAX_RULERS_PER_LINE], distances[MAX_RULERS_PER_LINE];

@@ -5,7 +5,7 @@
 // derivative of a Gaussian (TAPS taps on either side). An edge is a local maximum of the gradient above the threshold.
 //
 // Variants: VECTOR_VARIANT: one work-item takes 16 rulers, one in each lane; else a work-group of RULER_GROUP items takes
-//           one ruler, with its arrays in local memory.
+//           RULERS_PER_GROUP rulers, with their arrays in local memory (ruler_group.h).
 // Options:
 //     CODE, and CODE_uchar, CODE_ushort or CODE_float   type of the pixels
 //     RULER_CAPACITY     largest length that the arrays of samples hold
@@ -151,35 +151,44 @@ static inline reals ruler_strength(reals slope, private const ruler_place *place
     return as_reals((as_masks(slope) ^ place->sign_flip) & place->sign_keep);
 }
 
+// Whether gradient peak.here is a local maximum of the strength, and at least the threshold.
+static inline masks ruler_is_peak(ruler_peak peak, private const ruler_place *place, constant real *table) {
+    const reals strength = ruler_strength(peak.here, place);
+    return mask_of(strength >= table[RULER_THRESHOLD]) & mask_of(strength > ruler_strength(peak.before, place)) &
+           mask_of(strength >= ruler_strength(peak.after, place));
+}
+
+#ifdef PAIRS
+// Whether a peak closes a pair of edges with the peak before it, `from`; with PER_RULER also whether its ruler looks for
+// single edges. `strength` becomes that of the weaker edge of the pair.
+static inline masks ruler_closes(ruler_peak from, masks has_from, ruler_peak peak, private const ruler_place *place,
+                                 constant real *table, private reals *strength) {
+    const reals gap = peak.at - from.at, weaker = fabs(from.here);
+#ifdef PER_RULER
+    const masks fits = has_from & mask_of(from.here * place->polarity > 0) & mask_of(peak.here * place->polarity < 0) &
+                       mask_of(gap >= place->nearest) & mask_of(gap <= place->farthest);
+    *strength = (place->is_pair & mask_of(weaker < *strength)) ? weaker : *strength;
+    return ~place->is_pair | fits;
+#else
+    *strength = *strength < weaker ? *strength : weaker;
+    return has_from & (mask_of(from.here > 0) ^ mask_of(peak.here > 0)) & mask_of(gap >= table[RULER_NEAREST]) &
+           mask_of(gap <= table[RULER_FARTHEST]) & mask_of(from.here * place->polarity >= 0);
+#endif
+}
+#endif
+
 #ifdef VECTOR_VARIANT
-static inline reals ruler_slope(private const reals *profile, int i, constant real *table) {
+// Gradient i of the profiles; computed when it is needed: no array of gradients.
+static inline reals ruler_gradient(private const reals *profile, int i, constant real *table) {
     reals slope = 0;
     for (int k = 1; k <= TAPS; k++)
         slope += table[RULER_TAPS + k - 1] * (profile[i + TAPS + k] - profile[i + TAPS - k]);
     return slope;
 }
-#define RULER_SPACE private
-// Gradient i of the profiles; computed when it is needed: no array of gradients.
-static inline reals ruler_gradient(private const reals *profile, int i, constant real *table) {
-    return ruler_slope(profile, i, table);
-}
-#else
-static inline real ruler_slope(local const real *profile, int i, constant real *table) {
-    real slope = 0;
-    for (int k = 1; k <= TAPS; k++)
-        slope += table[RULER_TAPS + k - 1] * (profile[i + TAPS + k] - profile[i + TAPS - k]);
-    return slope;
-}
-#define RULER_SPACE local
-// Gradient i; the work-group has computed all gradients.
-static inline real ruler_gradient(local const real *gradients, int i, constant real *table) { return gradients[i]; }
-#endif
 
-// Find the edges along the profiles of 16 rulers (vector), or the gradients of one ruler (work-item). `flags`: flags of the
-// rulers.
-static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place *place, masks flags, constant real *table,
+// Find the edges along the profiles of 16 rulers. `flags`: flags of the rulers.
+static inline void ruler_find(private const reals *values, const ruler_place *place, masks flags, constant real *table,
                        private ruler_edge *edges) {
-    const real threshold = table[RULER_THRESHOLD];
     masks found = 0, wins;
     reals best = 0, rival = 0;
     ruler_peak peak = {0, 0, 1, 0};
@@ -199,25 +208,12 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
     for (int i = 1; i < slopes - 1; i++) {
         peak.after = ruler_gradient(values, i + 1, table);
         peak.at = i;
-        reals strength = ruler_strength(peak.here, place);
-        const masks is_peak = mask_of(strength >= threshold) & mask_of(strength > ruler_strength(peak.before, place)) &
-                              mask_of(strength >= ruler_strength(peak.after, place));
+        const masks is_peak = ruler_is_peak(peak, place, table);
         if (any_compared(is_peak)) {
+            reals strength = ruler_strength(peak.here, place);
             masks candidate = is_peak;
 #ifdef PAIRS
-            const reals gap = peak.at - other.at, weaker = fabs(other.here);
-#ifdef PER_RULER
-            const masks fits = has_other & mask_of(other.here * place->polarity > 0) &
-                               mask_of(peak.here * place->polarity < 0) & mask_of(gap >= place->nearest) &
-                               mask_of(gap <= place->farthest);
-            candidate &= ~place->is_pair | fits;
-            strength = (place->is_pair & mask_of(weaker < strength)) ? weaker : strength;
-#else
-            candidate &= has_other & (mask_of(other.here > 0) ^ mask_of(peak.here > 0)) &
-                         mask_of(gap >= table[RULER_NEAREST]) & mask_of(gap <= table[RULER_FARTHEST]);
-            candidate &= mask_of(other.here * place->polarity >= 0);
-            strength = strength < weaker ? strength : weaker;
-#endif
+            candidate &= ruler_closes(other, has_other, peak, place, table, &strength);
             const ruler_peak from = other;
             other = ruler_either(is_peak, peak, other);
             has_other |= is_peak;
@@ -267,7 +263,6 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
 #endif
 }
 
-#ifdef VECTOR_VARIANT
 #include "ruler/ruler_lanes.h"
 
 // Measure 16 rulers of a given layout with its flags, one in each lane; fills edges[MAX_EDGES].
@@ -301,63 +296,6 @@ static inline void ruler_measure(global const CODE *image, int rows, int columns
     ruler_measure_placed(image, columns, &place, flags, table, model, edges);
 }
 #else
-// Split (x, y) into a pixel that has neighbours and the fraction within it.
-static inline masks ruler_split(const ruler_place *place, int pitch, reals *x, reals *y) {
-    masks column = LANED(convert_bits)(*x), row = LANED(convert_bits)(*y);
-    column = column < place->last_column ? column : place->last_column;
-    row = row < place->last_row ? row : place->last_row;
-    *x -= LANED(convert_real)(column);
-    *y -= LANED(convert_real)(row);
-    return place->pixel + row * pitch + column;
-}
-
-static inline reals ruler_bilinear(reals a, reals b, reals c, reals d, reals x, reals y) {
-    a += x * (b - a);
-    c += x * (d - c);
-    return a + y * (c - a);
-}
-
-static inline real ruler_sum(global const CODE *image, const ruler_place *place, int pitch, int i, constant real *table,
-                      constant real *model, int *flags) {
-    real sum = 0;
-    for (int line = 0; line < WIDTH; line++) {
-        real x = place->x + i * place->along_x + line * place->across_x;
-        real y = place->y + i * place->along_y + line * place->across_y;
-#if defined(LENS) || defined(CAMERA)
-        *flags |= ruler_distort(&x, &y, place, model);
-#endif
-        global const CODE *pixel = image + ruler_split(place, pitch, &x, &y);
-        const real sample = ruler_bilinear(pixel[0], pixel[1], pixel[pitch], pixel[pitch + 1], x, y);
-        *flags |= ruler_sample_flags(sample, table);
-        sum += sample;
-    }
-    *flags |= ruler_sum_flags(sum);
-    return sum;
-}
-
-// Measure one ruler of a given layout with its flags by a work-group; edges[MAX_EDGES] are valid for its first item.
-static inline void ruler_measure_placed(global const CODE *image, int columns, private const ruler_place *place, int flags,
-                                 constant real *table, constant real *model, local real *profile, local real *slopes,
-                                 local int *shared_flags, private ruler_edge *edges) {
-    const int item = get_local_id(0), length = (int)table[RULER_LENGTH];
-    if (item == 0) *shared_flags = 0;
-    barrier(CLK_LOCAL_MEM_FENCE);
-    for (int i = item; i < length; i += RULER_GROUP)
-        profile[i] = ruler_sum(image, place, columns, i, table, model, &flags);
-    if (flags) atomic_or(shared_flags, flags);
-    barrier(CLK_LOCAL_MEM_FENCE);
-    for (int i = item; i < length - 2 * TAPS; i += RULER_GROUP) slopes[i] = ruler_slope(profile, i, table);
-    barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0) ruler_find(slopes, place, *shared_flags, table, edges);
-}
-
-// Measure one ruler (x, y, cos, sin) by a work-group; edges[MAX_EDGES] are valid for its first item.
-static inline void ruler_measure(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
-                          constant real *model, local real *profile, local real *slopes, local int *shared_flags,
-                          private ruler_edge *edges) {
-    ruler_place place;
-    const int flags = ruler_layout(rows, columns, ruler.x, ruler.y, ruler.z, ruler.w, table, &place);
-    ruler_measure_placed(image, columns, &place, flags, table, model, profile, slopes, shared_flags, edges);
-}
+#include "ruler/ruler_group.h"
 #endif
 #endif

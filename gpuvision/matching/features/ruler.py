@@ -24,6 +24,7 @@ from gpuvision.host import (
     LaunchBuilder,
     StatusArray,
     Variant,
+    ceil_div,
     flags,
     opencl_type,
     table_offsets,
@@ -46,6 +47,7 @@ SAMPLING_SIGMA_PX = 0.02
 MAX_WIDTH = 255
 MAX_EDGES = 64
 _LANES, _GROUP = 16, 64
+_SAMPLES_PER_GROUP = 512  # capacity for samples of a work-group, 8 for each item: 4 KiB of local memory
 # Sizes of the kernel's arrays of samples: the length is an argument of the kernel, not a compilation for each length.
 _CAPACITIES = (128, MAX_LENGTH)
 _SIGNS = {"any": 0.0, "rising": 1.0, "falling": -1.0}
@@ -215,8 +217,8 @@ class RulerEdges(VisionOperation[Edges]):
     count : int, optional
         Number of rulers, n. None takes the number from the rulers of a call; `bind` needs a number.
     variant : {"auto", "vector", "work_item"}
-        Kernel variant: "vector" computes 16 samples at a time (CPU runtimes), "work_item" one work-group per ruler
-        (GPUs).
+        Kernel variant: "vector" computes 16 rulers at a time (CPU runtimes), "work_item" one work-group per four
+        rulers, or per ruler of more than 128 samples (GPUs).
 
     Raises
     ------
@@ -326,6 +328,11 @@ class RulerEdges(VisionOperation[Edges]):
         return math.ceil(3.0 * self.smoothing_px / self.step_px)
 
     @property
+    def _capacity(self) -> int:
+        """Number of samples that the kernel's arrays hold."""
+        return next(each for each in _CAPACITIES if self.length <= each)
+
+    @property
     def _binary_places(self) -> int:
         """Number of binary places after the point of a fixed-point position [bits].
 
@@ -362,7 +369,8 @@ class RulerEdges(VisionOperation[Edges]):
                 "RulerEdges takes an image and rulers; to bind it, set RulerEdges.count to the number of rulers"
             )
         each = max(build.share(self.count, per_core=_SHARES_PER_CORE, multiple=_LANES), _LANES)
-        work = build.work(self.count, each=each, group=_GROUP, grouping="per_element")
+        groups = ceil_div(self.count, each if build.uses_vectors else _SAMPLES_PER_GROUP // self._capacity)
+        work = build.work(groups, each=1, group=_GROUP, grouping="per_element")
         found = (self.count, self.max_edges) if self.edge_selection == "all" else (self.count,)
         shapes = dict.fromkeys(("position", "amplitude", "width", "sigma"), found)
         return build.launch(
@@ -388,7 +396,8 @@ class RulerEdges(VisionOperation[Edges]):
             **({} if self.model is None else self._model_defines(self.model)),
             **type_defines("CODE", dtype),
             **RULER_OFFSETS,
-            "RULER_CAPACITY": next(each for each in _CAPACITIES if self.length <= each),
+            "RULER_CAPACITY": self._capacity,
+            "RULERS_PER_GROUP": _SAMPLES_PER_GROUP // self._capacity,
             "WIDTH": self.width,
             "TAPS": self._reach,
             "MAX_EDGES": self._places,

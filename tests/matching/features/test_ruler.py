@@ -19,6 +19,7 @@ from canary import Guarded
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
+from gpuvision.host.kept import clear_cache
 from gpuvision.matching.features.ruler import RulerEdges, best_smoothing
 from gpuvision.reference import ruler as reference
 from gpuvision.status import Status
@@ -140,6 +141,38 @@ def test_lengths_and_polarities_share_a_program(device: Device) -> None:
     assert options(length=129) == options(length=240)
 
 
+@VARIANTS
+@pytest.mark.parametrize("edge_selection", ["strongest", "all"])
+def test_pairs_among_many_edges(device: Device, variant: Any, edge_selection: Any, rng: np.random.Generator) -> None:
+    """A long ruler across noise: each pair of neighbouring edges of the reference, over several words of bits."""
+    image = 100.0 + 60.0 * cv2.GaussianBlur(rng.normal(0.0, 1.0, (100, 300)), (0, 0), 1.2)
+    image = image.astype(np.float32)
+    ruler, length = one_ruler(150.0, 50.0, 0.2), 200
+    operation = RulerEdges(
+        threshold=4.0,
+        length=length,
+        width=3,
+        smoothing_px=1.0,
+        edge_selection=edge_selection,
+        max_edges=40,
+        pairs=True,
+        polarity="rising",
+        variant=variant,
+    )
+    (edges,) = expected(operation, image, ruler)
+    pairs = [(one, other) for one, other in itertools.pairwise(edges) if one["gradient"] > 0.0 > other["gradient"]]
+    assert 10 < len(pairs) <= 40
+    ours = operation(image, ruler, device=device)
+    middle = np.array([0.5 * (one["position"] + other["position"]) for one, other in pairs])
+    if edge_selection == "all":
+        np.testing.assert_allclose(ours.position[0, : len(pairs)], middle, rtol=0, atol=2e-3)
+        assert np.isnan(ours.position[0, len(pairs) :]).all()
+        assert (ours.status[0, len(pairs) :] == Status.LOW_SIGNAL).all()
+    else:
+        weaker = [min(abs(one["gradient"]), abs(other["gradient"])) for one, other in pairs]
+        assert abs(ours.position[0] - middle[int(np.argmax(weaker))]) < 2e-3
+
+
 def test_shortest_and_a_single_line(device: Device) -> None:
     image = reference.step_image((20, 20), 0.0, 10.25, 0.8).astype(np.float32)
     operation = RulerEdges(threshold=20.0, length=9, width=1, smoothing_px=1.0)
@@ -192,9 +225,11 @@ def test_choices(device: Device, variant: Any, edge_selection: Any, rng: np.rand
             assert_like(mine, [wanted])
 
 
-def test_more_edges_than_places(device: Device) -> None:
+@VARIANTS
+def test_more_edges_than_places(device: Device, variant: Any) -> None:
     image = reference.stripe_image(SHAPE, 0.0, 75.0, 20.0, 1.0).astype(np.float32)
-    ours = RulerEdges(threshold=15.0, edge_selection="all", max_edges=1)(image, one_ruler(), device=device)
+    operation = RulerEdges(threshold=15.0, edge_selection="all", max_edges=1, variant=variant)
+    ours = operation(image, one_ruler(), device=device)
     assert ours.status.shape == (1, 1)
     assert ours.status[0, 0] == Status.AMBIGUOUS
     assert abs(ours.position[0, 0] + 10.0) < 0.05
@@ -351,9 +386,10 @@ def test_up_to_the_border(device: Device, variant: Any, dtype: Any) -> None:
     np.testing.assert_allclose(across.position, ours.position, atol=1e-4)
 
 
-def test_saturated_and_ambiguous_edges_come_with_a_value(device: Device) -> None:
+@VARIANTS
+def test_saturated_and_ambiguous_edges_come_with_a_value(device: Device, variant: Any) -> None:
     image = np.clip(np.rint(reference.step_image(SHAPE, 0.0, 75.0, 1.0, 50.0, 300.0)), 0, 255).astype(np.uint8)
-    operation = replace(STRONGEST, saturation=255.0, ambiguity=0.8)
+    operation = replace(STRONGEST, saturation=255.0, ambiguity=0.8, variant=variant)
     ours = operation(image, one_ruler(), device=device)
     assert ours.status[0] == Status.SATURATED
     assert abs(ours.position[0]) < 0.5
@@ -417,6 +453,47 @@ def test_canaries_and_bound_calls(device: Device, variant: Any, rng: np.random.G
         if theirs is not None:
             np.testing.assert_array_equal(mine.get(), theirs)
             np.testing.assert_array_equal(out, theirs)
+
+
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_a_group_may_have_fewer_rulers(device: Device, count: int, rng: np.random.Generator) -> None:
+    """Work-groups of four rulers: the last group computes what is there, and writes nothing beyond."""
+    values, rulers = step(rng)
+    image = image_of(values, np.uint8)
+    operation = replace(STRONGEST, variant="work_item")  # shares programs with `test_against_the_reference`
+    every = operation(image, rulers, device=device)
+    guarded = Guarded(operation(image, rulers[:count], device=device))
+    some = operation(image, np.ascontiguousarray(rulers[:count]), device=device, out=guarded.out)
+    guarded.assert_intact()
+    for mine, theirs in zip(some, every, strict=True):
+        if mine is not None:
+            np.testing.assert_array_equal(mine, theirs[:count])
+
+
+@pytest.mark.parametrize(
+    "group", [16, pytest.param(32, marks=pytest.mark.slow), pytest.param(256, marks=pytest.mark.slow)]
+)
+def test_results_do_not_depend_on_the_size_of_the_group(
+    device: Device, group: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Noise gives many candidates; the strongest one and its rival are the same for each split of the gradients."""
+    image = (100.0 + 40.0 * cv2.GaussianBlur(rng.normal(0.0, 1.0, SHAPE), (0, 0), 1.2)).astype(np.float32)
+    rulers = reference.random_rulers(0.4, 86.0, 9, rng, MIDDLE)
+    operation = RulerEdges(threshold=5.0, smoothing_px=1.0, ambiguity=0.9, variant="work_item")
+    usual = operation(image, rulers, device=device)
+    assert (usual.status == 0).any()
+    assert (usual.status == Status.AMBIGUOUS).any()
+    for k, found in enumerate(expected(operation, image, rulers)):
+        ranked = sorted(found, key=lambda edge: -abs(edge["gradient"]))
+        assert abs(usual.position[k] - ranked[0]["position"]) < 1e-3
+        is_rivalled = abs(ranked[1]["gradient"]) >= 0.9 * abs(ranked[0]["gradient"])
+        assert usual.status[k] == (Status.AMBIGUOUS if is_rivalled else 0)
+    monkeypatch.setattr("gpuvision.matching.features.ruler._GROUP", group)
+    clear_cache()  # a kept instance has the usual group
+    for mine, theirs in zip(operation(image, rulers, device=device), usual, strict=True):
+        if mine is not None:
+            np.testing.assert_array_equal(mine, theirs)
+    clear_cache()
 
 
 def test_no_rulers(device: Device) -> None:

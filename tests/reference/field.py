@@ -56,6 +56,36 @@ def refine_pose(field: Any, start: Any, points: Float64, scale: float) -> Float6
     return np.asarray(least_squares(residuals, start, xtol=1e-12, ftol=1e-14, gtol=1e-14, x_scale=[0.1, 0.1, 0.05]).x)
 
 
+def pose_statistics(field: Any, pose: Any, points: Float64, scale: float, prior_points: float) -> dict[str, Any]:
+    """Return the fields of a refined pose from the distances of the points and their numerical derivatives.
+
+    The covariance is H^-1 S H^-1 (Huber, 1981, section 6.3) with the derivatives h of the distances r, w the weight of
+    the Geman-McClure loss, H = sum w (4 sqrt(w) - 3) h h^T over the positive terms, and S the mean of sum (w r)^2 h h^T
+    and of S for equal variances, weighted by the numbers of points and of ``prior_points``.
+    """
+    away = distance(field, to_field(pose, points))
+    steps = 1e-7 * np.eye(3)
+    ends = [[distance(field, to_field(pose + sign * step, points)) for sign in (1, -1)] for step in steps]
+    rows = np.stack([(high - low) / 2e-7 for high, low in ends], axis=-1)
+    share = scale**2 / (scale**2 + away**2)
+    curvature = np.maximum(share**2 * (4.0 * share - 3.0), 0.0)
+    square = (share**2 * away) ** 2
+    hessian, scatter = (np.einsum("n,ni,nj->ij", each, rows, rows) for each in (curvature, square))
+    free = curvature.sum() - 3.0
+    variance = square.sum() / free
+    own = len(points) / (len(points) + prior_points)
+    # An estimate from n residuals and 3 parameters is too small by (n - 3) / n.
+    spread = own * scatter * curvature.sum() / free + (1.0 - own) * variance * hessian
+    covariance = np.linalg.solve(hessian, np.linalg.solve(hessian, spread).T)
+    return {
+        "covariance": covariance,
+        "information": np.linalg.inv(covariance),
+        "score": float(np.mean(1.0 - share)),
+        "residual_std": float(np.sqrt(variance)),
+        "inlier_fraction": float(np.mean(away < scale)),
+    }
+
+
 def draw_line_points(
     field: Any, pose: Any, rng: np.random.Generator, count: int, reach: float, sigma: float = 0.0
 ) -> Float64:

@@ -279,6 +279,20 @@ def test_the_fourth_nearest_line_of_a_cell_can_be_the_nearest_of_a_point(device:
     np.testing.assert_allclose(pose_errors(fit.poses[0], pose), 0.0, atol=1e-5)
 
 
+@pytest.mark.parametrize("count", [12, 64])
+def test_every_field_of_a_pose_is_that_of_the_reference(device: Device, count: int, rng: np.random.Generator) -> None:
+    """Few points, whose covariance is mostly that of equal variances, and many; a fifth of them lie on no line."""
+    field_map = large(device)
+    points = view(field_map, POSE, rng, count, sigma=0.06)
+    points[: count // 6] += 0.4
+    fit = FieldPoseRefinement(map=field_map)(points, POSE[None].astype(np.float32), device=device)
+    pose = fit.poses[0].astype(np.float64)
+    expected = reference.pose_statistics(field_map.field, pose, points.astype(np.float64), field_map.scale, 4.0)
+    for name, value in expected.items():
+        size = np.sqrt(np.outer(np.diag(value), np.diag(value))) if np.ndim(value) else value
+        np.testing.assert_allclose(getattr(fit, name)[0] / size, value / size, atol=1e-3, err_msg=name)
+
+
 def test_covariance_is_the_scatter(device: Device, rng: np.random.Generator) -> None:
     """Normalised errors of 200 views: a chi squared of three degrees, mean 3 within 4 standard errors of 0.17."""
     field_map = large(device)

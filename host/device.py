@@ -72,8 +72,8 @@ class Device:
         Whether host and device read and write the same allocations without map or copy (fine-grained SVM).
     compute_units : int
         Cores of a CPU, multiprocessors of a GPU.
-    has_double : bool
-        Whether the device computes in double precision.
+    has_double, has_denormals : bool
+        Whether the device computes in double precision, and with denormal numbers in single precision.
     max_allocation : int
         Size of the largest array [bytes].
     cache_bytes : int
@@ -97,6 +97,7 @@ class Device:
         self.takes_vectors = kind not in _WITHOUT_VECTORS
         self.compute_units = int(handle.max_compute_units)
         self.has_double = bool(handle.double_fp_config)
+        self.has_denormals = bool(handle.single_fp_config & cl.device_fp_config.DENORM)
         self.max_allocation = int(handle.max_mem_alloc_size)
         self.cache_bytes = max(int(handle.global_mem_cache_size), _MIN_LAST_CACHE)
         self.shares_memory = self.is_cpu and _has_fine_grained_memory(handle)

@@ -10,7 +10,8 @@ import pyopencl as cl
 from gpuvision.host.errors import DeviceLostError, DeviceMemoryError
 from gpuvision.host.kept import drop_bound
 
-_NO_MEMORY = ("MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY")
+# Mesa 22.3 refuses the size of an array that it cannot allocate.
+_NO_MEMORY = ("MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
 _NO_RESOURCES = "OUT_OF_RESOURCES"
 
 

@@ -44,26 +44,6 @@ FAULTS = (
     DriverFault(
         "rusticl",
         "22.3",
-        r"test_line\.py::test_(any_shape|tall_frames|fit_of_noise_stays_at_its_peak)\[|"
-        r"test_(triangulation|undistort_points)\.py::test_any_shape\[|"
-        r"test_undistort_image\.py::test_(every_window|every_width_of_a_window|any_shape_and_map)\[",
-        "Mesa 22.3 ends the process on vectors of 16 (LLVM ERROR), so that gpuvision refuses the vector variant",
-    ),
-    DriverFault(
-        "rusticl",
-        "22.3",
-        r"test_line\.py::test_(not|nothing)_finite\[.*centroid",
-        "Mesa 22.3 loses infinite samples in the sums of the centroid: no flag NOT_FINITE (cause not found)",
-    ),
-    DriverFault(
-        "rusticl",
-        "22.3",
-        r"test_line\.py::test_faintest_light\[.*centroid",
-        "Mesa 22.3 misses the limit of error of the centroid of the faintest light (cause not found)",
-    ),
-    DriverFault(
-        "rusticl",
-        "22.3",
         r"test_feature_pose\.py::test_(pose_is|errors_are_as|a_region_of|a_mirrored_side|search_distance|results_must|"
         r"a_blob_of|one_kind_of)_",
         "Mesa 22.3 finds no pose from rulers and blobs in an image: NaN, AMBIGUOUS or NO_DATA; passes with Mesa 25.0.7",

@@ -13,6 +13,7 @@ import pytest
 from designs import covering
 from gpuvision.host import Device
 from gpuvision.host.errors import GpuVisionError
+from gpuvision.host.launch import Variant
 
 _ROOT = Path(__file__).resolve().parents[1]
 # Names of the test files that are about one kernel; other files run whole tasks with kernels of these files.
@@ -107,7 +108,8 @@ def is_refused(item: pytest.Item) -> bool:
     """Return whether the device of a test lacks a property that the test needs.
 
     Cases of float64 and double precision, and tests with the mark ``double``, need a device with doubles. Cases of the
-    vector variant need a runtime with vectors of 16: others may abort the process.
+    vector variant, and tests with the mark ``vectors``, need a runtime with vectors of 16: others may abort the
+    process.
     """
     device = device_of(item)
     if device is None:
@@ -116,7 +118,13 @@ def is_refused(item: pytest.Item) -> bool:
     values = [value for each in given for value in (each if isinstance(each, tuple) else (each,))]
     if not device.has_double and (item.get_closest_marker("double") or any(map(_is_double, values))):
         return True
-    return not device.takes_vectors and any(_variant_of(value) == "vector" for value in values)
+    needs_vectors = item.get_closest_marker("vectors") or any(_variant_of(value) == "vector" for value in values)
+    return bool(needs_vectors) and not device.takes_vectors
+
+
+def variants_of(device: Device) -> tuple[Variant, ...]:
+    """Return the kernel variants that a device takes, for tests that choose the variant themselves."""
+    return ("vector", "work_item") if device.takes_vectors else ("work_item",)
 
 
 def split_refused(items: Sequence[pytest.Item]) -> tuple[list[pytest.Item], list[pytest.Item]]:

@@ -340,7 +340,7 @@ class LineReadout(VisionOperation[LineReading]):
                 np.int32(rows),
                 np.int32(columns),
                 *self._levels(dtype),
-                self._packed(build.real, dtype, length),
+                self._packed(build.real, dtype, length, device),
                 None if self.triangulation is None else self.triangulation.packed(build.real, self.axes, profiles),
                 None if profiles is None else profiles.blocks(build.real),
             ],
@@ -405,7 +405,7 @@ class LineReadout(VisionOperation[LineReading]):
             LONG_MOMENT=bits < 32 and length**2 // 2 * np.iinfo(f"uint{bits}").max >= 2**32,
         )
 
-    def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any], length: int) -> Any:
+    def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any], length: int, device: Device) -> Any:
         """Return the parameter table of the kernel."""
         widest = length if self.maximum_width is None else min(self.maximum_width, length)
         noise = self.read_noise**2 + (1.0 / 12.0 if dtype.kind == "u" else 0.0)
@@ -418,6 +418,7 @@ class LineReadout(VisionOperation[LineReading]):
             noise_variance=noise,
             lit_variance=noise + self.gain * self.threshold,
             speckle_variance=self.speckle**2,
+            minimum_total=_minimum_total(length, real, device),
         )
         return np.array(table, real)
 
@@ -433,3 +434,15 @@ class LineTable(NamedTuple):
     noise_variance: float
     lit_variance: float
     speckle_variance: float
+    minimum_total: float
+
+
+def _minimum_total(length: int, real: np.dtype[Any], device: Device) -> float:
+    """Return the smallest total light whose centroid is accurate to rounding.
+
+    A device without denormal numbers takes each light below the smallest normal number as 0, which moves the moment by
+    at most ``length**2 / 2`` of these numbers. Rounding of the position is ``length * 2**-24``.
+    """
+    if device.has_denormals or real == np.float64:
+        return 0.0
+    return length * 2.0**23 * float(np.finfo(real).tiny)

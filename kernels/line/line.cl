@@ -38,6 +38,7 @@ typedef struct {
     real noise_variance;        // NOISE: variance of a dark sample with quantisation [grey level^2]
     real lit_variance;          // NOISE: the same of a sample at the threshold
     real speckle_variance;      // NOISE: variance of the position by speckle [px^2]
+    real minimum_total;         // METHOD_CENTROID, float samples: smallest total light whose position is exact
 } LineTable;
 
 #include "line/line_peak.h"
@@ -150,6 +151,9 @@ static inline reals light_at(const Profiles *profiles, int k) {
 static inline void finish_centroid(const Profiles *profiles, const Centroid *centroid, constant LineTable *table,
                                    const Outputs *to, ulong first, int sample) {
     ints dark = dark_lanes(profiles, centroid->peak);
+#if CODE_BITS == 32
+    dark |= int_mask(centroid->total < table->minimum_total);
+#endif
 #ifdef WIDTH_LIMITS
     dark |= int_mask(centroid->width < table->min_width) | int_mask(centroid->width > table->max_width);
 #endif

@@ -32,7 +32,7 @@ typedef struct {
 // Sums of float samples, each in two numbers: the second one collects the rounding errors of the first.
 typedef struct {
     reals total, total_error, moment, moment_error, width;
-    reals poison;  // 0, or NaN after a sample that is not finite: x * 0 is NaN for infinity and NaN
+    reals poison;  // 0, or NaN after a sample that is not finite
     codes peak;
 } Sums;
 
@@ -84,7 +84,8 @@ static inline Centroid profile_centroid(const Profiles *profiles) {
         for (int k = 0; k < steps; k++) {
             const codes x = sample_of(profiles, first + k);
             sums.peak = x > sums.peak ? x : sums.peak;
-            sums.poison += to_reals(x) * 0;
+            // Not x * 0, which Mesa's compiler replaces by 0 (22.3 and 25.0), also for infinite x.
+            sums.poison = nan_where(mask_of(LANED(not_finite)(to_reals(x))), sums.poison);
             sums.width += choose_reals(int_mask(x > (codes)profiles->threshold), 1, 0);
             s += over_threshold(x, profiles->threshold);
             m += s;

@@ -11,7 +11,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from canary import Guarded
@@ -24,6 +24,7 @@ from gpuvision.host import Device
 from gpuvision.reference import undistort_image as reference
 from gpuvision.status import Status
 from guard_pages import assert_within_pages
+from tiers import variants_of
 
 ON_DEVICES = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 VARIANTS = ["vector", "work_item"]
@@ -140,6 +141,7 @@ WINDOWS = {
 @pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("name", WINDOWS)
+@pytest.mark.vectors
 def test_every_window(device: Device, name: str, channels: int, interpolation: Any, rng: np.random.Generator) -> None:
     options, kind = WINDOWS[name]
     source = (300, 310)
@@ -156,6 +158,7 @@ def test_every_window(device: Device, name: str, channels: int, interpolation: A
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
 @pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.vectors
 def test_every_width_of_a_window(device: Device, channels: int, interpolation: Any, rng: np.random.Generator) -> None:
     """Each row has another scale: the pixels of a run span 10 to 37 columns, one more every few rows."""
     scale, source = np.linspace(0.6, 2.4, 60), (70, 120)
@@ -191,6 +194,7 @@ PROGRAMS = [_PRODUCT[k] for k in covering(_PRODUCT, 2)]
 def test_any_shape_and_map(
     device: Device, source: Any, shape: Any, turn: float, scale: float, shift: Any, options: dict[str, Any]
 ) -> None:
+    assume(options["variant"] in variants_of(device))
     rng = np.random.default_rng(1)
     dtype, variant, channels, *_ = options.values()
     options = {name: options[name] for name in ("border", "interpolation")}

@@ -50,6 +50,7 @@ class Machine:
 
     def __init__(self, *, is_cpu: bool = True, has_double: bool = True) -> None:
         self.is_cpu, self.prefers_vectors, self.has_double = is_cpu, is_cpu, has_double
+        self.has_denormals = True
         self.takes_vectors = True
         self.compute_units, self.cache_bytes = 2, 32 << 20
 

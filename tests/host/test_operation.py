@@ -28,7 +28,7 @@ def pairs(rng):
 def memory(request, device):
     """The device as it is, and as a device with separate memory like a graphics card."""
     if request.param == "shared" and not device.shares_memory:
-        pytest.skip("this device has memory of its own")
+        pytest.skip(f"{device.label} does not share memory with the host")
     if request.param == "shared":
         return device
     separate = Device(device.handle, device.label, device.kind)
@@ -165,7 +165,7 @@ def test_work_in_an_inline_queue_is_done_on_return(device, rng, count):
     assert device.is_inline(queue) or not device.prefers_vectors
     assert not device.is_inline(device.queue)
     if not device.is_inline(queue):
-        pytest.skip("the runtime has no such queue")
+        pytest.skip(f"{device.label} has no inline queues")
     bound = READOUT.bind(device, (count, 2), np.float32, queue=queue)
     for _ in range(5 if count > 16 else 200):
         frame = rng.uniform(0.1, 1.0, (count, 2)).astype(np.float32)
@@ -283,7 +283,7 @@ def test_no_input_and_no_device_are_told(memory, pairs):
 
 def test_an_input_that_another_queue_still_writes_is_waited_for(device):
     if not device.shares_memory:
-        pytest.skip("this device has memory of its own")
+        pytest.skip(f"{device.label} does not share memory with the host")
     large = np.tile(np.array([1.0, 3.0], np.float32), (200_000, 1))
     gate = cl.UserEvent(device.context)
     frame = device.empty(large.shape, large.dtype)
@@ -325,7 +325,7 @@ def test_a_part_of_an_array_is_refused(device):
 
 def test_host_view_is_the_memory_itself(device):
     if not device.shares_memory:
-        pytest.skip("this device has memory of its own")
+        pytest.skip(f"{device.label} does not share memory with the host")
     array = device.empty((5, 3), np.float32)
     view = host_view(array)
     view[...] = 7.0

@@ -303,14 +303,15 @@ def test_with_device_times_the_wake_up_after_the_kernel_is_the_consumer_s(
     device: Device, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The device computes for 10 ms, on the host's clock; the wait for it returns 240 ms later."""
-    wait = SharedSlot.wait
+    kind = SharedSlot if device.shares_memory else StagedSlot
+    wait = kind.wait
 
     def slow(slot: Slot[Any]) -> None:
         wait(slot)
         clock.now += 250 * MS
 
-    monkeypatch.setattr(SharedSlot, "wait", slow)
-    monkeypatch.setattr(SharedSlot, "spans", lambda slot: {"compute": (clock.now - 250 * MS, clock.now - 240 * MS)})
+    monkeypatch.setattr(kind, "wait", slow)
+    monkeypatch.setattr(kind, "spans", lambda slot: {"compute": (clock.now - 250 * MS, clock.now - 240 * MS)})
     source = Timed(2, clock)
     with Pipeline(source, READOUT, device=device, batch=1, ring=2, clock=clock, profile=True) as stream:
         stream._device_clock.offset = 0

@@ -51,6 +51,7 @@ def test_round_deposits_with_an_offset_on_a_turned_board(shape, side):
     np.testing.assert_allclose(found.height_max, 130e-6, rtol=2e-3)
 
 
+@pytest.mark.double
 def test_single_precision_differs_by_rounding(device):
     """A cap with noise: 1 nm of height, 1e-4 of volume and sigma; cells at the threshold count or not."""
     grid = board_grid(160, 150)

@@ -109,6 +109,7 @@ def test_readings_behind_the_mirror_are_flagged() -> None:
     np.testing.assert_array_equal(np.isnan(found.h), [[False, True, True]])
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("step", [0.01, -0.01])
 def test_the_object_moves_during_a_sweep(device: Device, step: float) -> None:
     """A roof that moves along y: every sample is traced at the place of the object at its time."""
@@ -145,6 +146,7 @@ def test_an_encoder_is_interpolated_within_a_sweep() -> None:
 
 def test_limits_hold_after_the_motion(device: Device) -> None:
     reading, place = readings(SCAN, 41, 0.0, 0.03)
+    reading = reading.astype(np.float64 if device.has_double else np.float32)
     limits = ((-0.05, math.inf), (0.004, 0.0105), (-math.inf, math.inf))
     moved = SCAN.sample_transports(5e-3 * np.arange(4.0), 41)
     flags = np.zeros((4, 41), np.uint8)

@@ -54,6 +54,7 @@ from gpuvision.host.work_size import (
     padded_groups,
     padded_rows,
     round_up,
+    strided_groups,
     vector_work,
 )
 
@@ -119,6 +120,7 @@ __all__ = [
     "real_defines",
     "real_of",
     "round_up",
+    "strided_groups",
     "table_offsets",
     "to_numpy",
     "two_floats",

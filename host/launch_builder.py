@@ -31,11 +31,17 @@ from gpuvision.host.work_size import (
     fitted_groups,
     group_per_element,
     padded_groups,
+    strided_groups,
     vector_work,
 )
 
-Grouping = Literal["padded", "fitted", "per_element"]
-_GROUPINGS = {"padded": padded_groups, "fitted": fitted_groups, "per_element": group_per_element}
+Grouping = Literal["padded", "fitted", "strided", "per_element"]
+_GROUPINGS = {
+    "padded": padded_groups,
+    "fitted": fitted_groups,
+    "strided": strided_groups,
+    "per_element": group_per_element,
+}
 
 # Least rows and columns of an image whose last axis of 3 or 4 is taken for colours. Chosen: smaller images are rare,
 # and so are larger batches of frames of 3 or 4 columns.
@@ -175,7 +181,8 @@ class LaunchBuilder:
         least : int
             Fewest elements for the vector variant.
         grouping : {"padded", "fitted", "per_element"}
-            Work-groups of the other variant: `padded_groups`, `fitted_groups` or `group_per_element`.
+            Work-groups of the other variant: `padded_groups`, `fitted_groups`, `strided_groups` or
+            `group_per_element`.
         """
         if self.uses_vectors and count >= least:
             return vector_work(count, each)

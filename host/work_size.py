@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 Shape = tuple[int, ...]
 
+# Elements of a work-item in kernels that stream: ITEM_SAMPLES in kernels/common/item_samples.h.
+ITEM_SAMPLES = 4
+
 
 @dataclass(frozen=True)
 class WorkSize:
@@ -46,6 +49,12 @@ def padded_rows(rows: int, columns: int, group: int = 64) -> WorkSize:
     PoCL compiles a kernel anew for each group size, and without a given size it chooses one by the grid's size.
     """
     return WorkSize((round_up(columns, group), rows), (group, 1))
+
+
+def strided_groups(count: int, group: int) -> WorkSize:
+    """Return the work size of whole groups whose work-items process `ITEM_SAMPLES` elements, a group apart."""
+    each = group * ITEM_SAMPLES
+    return WorkSize((ceil_div(count, each) * group,), (group,), each)
 
 
 def fitted_groups(count: int, group: int) -> WorkSize:

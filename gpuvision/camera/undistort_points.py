@@ -27,7 +27,7 @@ from gpuvision.host import (
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import numbers
 
-_LANES, _GROUP = 16, 256
+_LANES, _GROUP = 16, 64
 # Points of a strip (a work-item's share, vector variant); several strips per core balance the load.
 _SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
 
@@ -64,7 +64,7 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
     precision : {"single", "double"}, optional
         Precision of the arithmetic and the outputs. Default: the precision of the input.
     variant : {"auto", "vector", "work_item"}
-        Kernel variant: 16-wide vectors for CPU runtimes, a work-item per point for GPUs, or by the device (default).
+        Kernel variant: 16-wide vectors for CPU runtimes, a work-item per 4 points for GPUs, or by the device (default).
 
     Raises
     ------
@@ -106,7 +106,7 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
         count = math.prod(shape[:-1])
         share = build.share(count, per_core=_STRIPS_PER_CORE, multiple=_LANES)
         each = min(max(share, _SHORTEST_STRIP), _LONGEST_STRIP)
-        work = build.work(count, each=each, group=_GROUP, least=_LANES, grouping="fitted")
+        work = build.work(count, each=each, group=_GROUP, least=_LANES, grouping="strided")
         return build.launch(
             "undistort_points/undistort_points.cl",
             "undistort_points",
@@ -114,7 +114,7 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
             outputs=build.outputs({"points": shape, "status": shape[:-1]}),
             defines={
                 **self._model_defines(build.real),
-                **type_defines("INPUT", dtype, 16),
+                **type_defines("INPUT", dtype, 2, 4, 16),
                 **flags(INVERSE=self.inverse),
             },
             arguments=[self._packed(build.real), np.uint64(count), np.uint64(work.each)],

@@ -27,7 +27,7 @@ from gpuvision.host import (
     Variant,
     WorkSize,
     flags,
-    padded_groups,
+    strided_groups,
     type_defines,
 )
 from gpuvision.operation import VisionOperation
@@ -185,8 +185,8 @@ class PsdReadout(VisionOperation[PsdReading]):
     precision : {"single", "double", None}
         Precision of the arithmetic and of the outputs; ``None`` follows the input.
     variant : {"auto", "vector", "work_item"}
-        Kernel variant: vectors of 16 samples (CPU runtimes) or one work-item per sample (GPUs); ``"auto"`` follows the
-        device.
+        Kernel variant: vectors of 16 samples (CPU runtimes) or one work-item per 4 samples (GPUs); ``"auto"`` follows
+        the device.
 
     Raises
     ------
@@ -342,7 +342,7 @@ class PsdReadout(VisionOperation[PsdReading]):
             # The last work-item also processes the remainder.
             work = WorkSize((max(samples // each, 1),), (1,), each, vectors=True)
         else:
-            work = padded_groups(samples, _GROUP)
+            work = strided_groups(samples, _GROUP)
         chosen = self.outputs or ()
         sheet = self.triangulation
         table = None if self.linearity is None else np.array(self.linearity, build.real)
@@ -366,7 +366,7 @@ class PsdReadout(VisionOperation[PsdReading]):
         )
 
     def _defines(self, dtype: np.dtype[Any], real: np.dtype[Any]) -> dict[str, Define]:
-        defines = type_defines("INPUT", dtype, 16)
+        defines = type_defines("INPUT", dtype, 2, 4, 16)
         defines |= flags(**{f"WITH_{name.upper()}": True for name in self.outputs or ()})
         if self.triangulation is not None:
             # Random and systematic errors are separate outputs here.

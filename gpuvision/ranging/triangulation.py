@@ -32,7 +32,7 @@ from gpuvision.ranging.triangulation_table import TriangulationTable
 from gpuvision.validation import check_keys, finite, numbers
 
 # Lanes of a vector and work-items of a work-group (speed only; the kernel's build options).
-_LANES, _GROUP = 16, 256
+_LANES, _GROUP = 16, 64
 # Points of a strip in the vector variant. Long strips keep the hardware prefetchers running; several strips per core
 # balance the load.
 _SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
@@ -78,7 +78,8 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
     precision : {"single", "double", None}
         Precision of the arithmetic and of the outputs; ``None`` follows the input.
     variant : {"auto", "vector", "work_item"}
-        Kernel variant: vectors of 16 (CPU runtimes) or one work-item per point (GPUs); ``"auto"`` follows the device.
+        Kernel variant: vectors of 16 (CPU runtimes) or one work-item per 4 points (GPUs); ``"auto"`` follows the
+        device.
 
     Raises
     ------
@@ -110,7 +111,7 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
         points = math.prod(shape)
         share = build.share(points, per_core=_STRIPS_PER_CORE, multiple=_LANES)
         each = min(max(share, _SHORTEST_STRIP), _LONGEST_STRIP)
-        work = build.work(points, each=each, group=_GROUP, least=_LANES, grouping="fitted")
+        work = build.work(points, each=each, group=_GROUP, least=_LANES, grouping="strided")
         spread = None if self.sigma is None else shape
         return build.launch(
             "triangulation/triangulation.cl",
@@ -120,7 +121,7 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
             outputs=build.outputs({"g": shape, "h": shape, "status": shape, "sigma_g": spread, "sigma_h": spread}),
             defines={
                 **self.defines(build.real),
-                **type_defines("INPUT", dtype, 16),
+                **type_defines("INPUT", dtype, 2, 4, 16),
                 **flags(SHEET_SIGMAS=self.sigma is not None),
             },
             arguments=[

@@ -12,13 +12,14 @@
 //          position real [m], total real [A], status uchar, sigma real [m] (standard deviation of the position),
 //          g, h real [m] (point in the sheet of light), sigma_g, sigma_h real [m] (standard deviation of g and h by
 //          sigma), systematic_g, systematic_h real [m] (the same by the covariance of the triangulation)
-// Build options: INPUT, INPUT16 (float, double or ushort), REAL_IS_DOUBLE, PLANAR, DARK_LEVEL (subtract dark currents),
+// Build options: INPUT, INPUT2, INPUT4, INPUT16 (float, double or ushort), REAL_IS_DOUBLE, PLANAR, DARK_LEVEL (subtract dark currents),
 //          GAIN (equalise the channels), LINEARITY, SIGNED (a current can be negative or not finite, or the range is
 //          shorter than the strip), BACKGROUND (shot noise of light and dark current all over the strip),
 //          WITH_POSITION/TOTAL/STATUS/SIGMA/SHEET/G/H/SIGMA_G/SIGMA_H/SYSTEMATIC_G/SYSTEMATIC_H, LENS, LENS_K2, LENS_K3, LENS_K4,
 //          PAST_CACHES, VECTOR_VARIANT.
 // Work:    vector variant: a work-item processes `each` consecutive samples, the last one up to 2 `each` - 1.
-//          Otherwise: one work-item per sample.
+//          Otherwise: a work-item processes 4 samples that lie a work-group apart (common/item_samples.h).
+#include "common/item_samples.h"
 #include "common/load.h"
 #include "common/sheet.h"
 #include "common/status.h"
@@ -51,20 +52,29 @@ typedef struct {
     constant SheetTable *sheet;
 } Readout;
 
+#ifdef VECTOR_VARIANT
 static inline void load_pair(const Readout *io, int sample, reals *left, reals *right) {
-#if defined(PLANAR)
+#ifdef PLANAR
     *left = load_inputs(io->currents + sample);
     *right = load_inputs(io->currents + io->samples + sample);
-#elif defined(VECTOR_VARIANT)
+#else
     global const INPUT *pairs = io->currents + 2 * sample;
     const reals low = load_inputs(pairs), high = load_inputs(pairs + LANES);
     *left = (reals)(low.even, high.even);
     *right = (reals)(low.odd, high.odd);
-#else
-    *left = load_inputs(io->currents + 2 * sample);
-    *right = load_inputs(io->currents + 2 * sample + 1);
 #endif
 }
+#else
+// Load the currents of the samples of this work-item.
+static inline void load_item_currents(const Readout *io, real4 *left, real4 *right) {
+#ifdef PLANAR
+    *left = load_item_samples(io->currents, io->samples);
+    *right = load_item_samples(io->currents + io->samples, io->samples);
+#else
+    load_item_pairs(io->currents, io->samples, left, right);
+#endif
+}
+#endif
 
 #ifdef LINEARITY
 // Correction at position u of a strip [m]: linear between knots that divide the strip evenly from end to end.
@@ -143,12 +153,12 @@ static inline int has_bad(Verdict worst, constant PsdTable *table) {
 }
 #endif
 
-// Read the LANES samples from `sample` on, write the outputs, and add the samples to the verdict. Without `careful` the
-// outputs are written as if all samples were good: the caller repeats a block that has a bad sample with `careful`.
-static inline void read_samples(const int careful, int sample, const Readout *io, Verdict *verdict) {
+// Compute the LANES samples from `sample` on from their currents, write the outputs, and add the samples to the verdict.
+// Without `careful` the outputs are written as if all samples were good: the caller repeats a block that has a bad
+// sample with `careful`.
+static inline void write_samples(const int careful, int sample, reals left, reals right, const Readout *io,
+                                 Verdict *verdict) {
     constant PsdTable *table = io->table;
-    reals left, right;
-    load_pair(io, sample, &left, &right);
     const reals larger = left > right ? left : right;
     const masks saturated = mask_of(larger >= table->saturation);
 #ifdef SIGNED
@@ -233,6 +243,12 @@ static inline void read_samples(const int careful, int sample, const Readout *io
 #ifdef VECTOR_VARIANT
 #define BLOCK 16  // vectors that share a verdict
 
+static inline void read_samples(const int careful, int sample, const Readout *io, Verdict *verdict) {
+    reals left, right;
+    load_pair(io, sample, &left, &right);
+    write_samples(careful, sample, left, right, io, verdict);
+}
+
 // Read the samples of a block; return whether one of them is bad.
 static inline int read_block(const int careful, int first, const Readout *io) {
     Verdict verdict = clean_verdict();
@@ -277,8 +293,15 @@ kernel void psd_readout(global const INPUT *currents, global real *position, glo
     const int begin = get_global_id(0) * each;
     read_range(begin, get_global_id(0) + 1 == get_global_size(0) ? samples : begin + each, &io);
 #else
-    if ((int)get_global_id(0) >= samples) return;
     Verdict unused = clean_verdict();
-    read_samples(1, get_global_id(0), &io, &unused);
+    real4 left, right;
+    load_item_currents(&io, &left, &right);
+    // Each step moves the next sample to the first lane: an index that changes would put the lanes into memory.
+    const ulong first = first_item_sample();
+    for (int k = 0; k < ITEM_SAMPLES && first + k * item_step() < (ulong)samples; k++) {
+        write_samples(1, (int)(first + k * item_step()), left.x, right.x, &io, &unused);
+        left = left.yzww;
+        right = right.yzww;
+    }
 #endif
 }

@@ -27,6 +27,7 @@ from gpuvision.host import (
     padded_rows,
     real_of,
     round_up,
+    strided_groups,
     table_offsets,
     to_numpy,
     type_defines,
@@ -119,6 +120,9 @@ def test_work_sizes() -> None:
     assert padded_groups(0, 64) == WorkSize((0,), (64,), 1)
     assert padded_rows(5, 64) == WorkSize((64, 5), (64, 1), 1)
     assert padded_rows(5, 65) == WorkSize((128, 5), (64, 1), 1)
+    assert strided_groups(257, 64) == WorkSize((128,), (64,), 256)
+    assert strided_groups(256, 64) == strided_groups(1, 64) == WorkSize((64,), (64,), 256)
+    assert strided_groups(0, 64) == WorkSize((0,), (64,), 256)
     assert fitted_groups(64, 64) == WorkSize((64,), (64,), 64)
     assert fitted_groups(63, 64) == WorkSize((64,), (16,), 16)
     assert fitted_groups(33, 64) == WorkSize((48,), (16,), 16)

@@ -142,12 +142,12 @@ _U, _V = (RNG.uniform(0.0, 500.0, _POINTS).astype(np.float32) for _ in range(2))
 _XY = RNG.uniform(10.0, 200.0, (_POINTS, 2)).astype(np.float32)
 # Name, operation, inputs, largest coalescing factor of the loads and of the stores.
 STREAMS: list[tuple[str, Any, list[NDArray[Any]], float, float]] = [
-    ("psd", gv.PsdReadout(strip_length=6e-3), [_currents(np.float32)], 2.0, 1.0),
-    ("psd codes", gv.PsdReadout(strip_length=6e-3), [_currents(np.uint16)], 2.0, 1.0),
-    ("psd double", gv.PsdReadout(strip_length=6e-3), [_currents(np.float64)], 2.0, 1.0),
+    ("psd", gv.PsdReadout(strip_length=6e-3), [_currents(np.float32)], 1.0, 1.0),
+    ("psd codes", gv.PsdReadout(strip_length=6e-3), [_currents(np.uint16)], 1.0, 1.0),
+    ("psd double", gv.PsdReadout(strip_length=6e-3), [_currents(np.float64)], 1.0, 1.0),
     ("psd planar", gv.PsdReadout(strip_length=6e-3, layout="planar"), [_currents(np.uint16, planar=True)], 1.0, 1.0),
     ("triangulation", _PLANE, [_U, _V], 1.0, 1.0),
-    ("points", gv.UndistortPoints(model=_CAMERA), [_XY], 2.0, 1.9),
+    ("points", gv.UndistortPoints(model=_CAMERA), [_XY], 1.0, 1.0),
     ("line, columns", gv.LineReadout(threshold=20), [_frames(np.uint8)], 2.1, 1.0),
     ("line, columns, codes", gv.LineReadout(threshold=20), [_frames(np.uint16)], 1.5, 1.0),
     ("line, columns, float", gv.LineReadout(threshold=20), [_frames(np.float32)], 1.25, 1.0),
@@ -182,3 +182,15 @@ def test_streams_are_coalesced(operation: Any, inputs: list[NDArray[Any]], loads
             np.testing.assert_allclose(value, expected, rtol=4e-6, atol=4e-6 * np.nanmax(np.abs(expected)))
         else:
             np.testing.assert_array_equal(value, expected)
+
+
+@needs_compilers
+@pytest.mark.parametrize(("group_size", "offset", "count"), [(32, 0, 1), (64, 4, 129), (128, 8, 513), (256, 4, 300)])
+@pytest.mark.parametrize("name", ["psd", "psd planar", "triangulation", "points"])
+def test_group_sizes_odd_counts_and_unaligned_arrays(name: str, group_size: int, offset: int, count: int) -> None:
+    operation, whole = next((each[1], each[2]) for each in STREAMS if each[0] == name)
+    planar = name == "psd planar"
+    inputs = [np.ascontiguousarray(each[:, :count] if planar else each[:count]) for each in whole]
+    outputs = trace(operation, inputs, group_size=group_size, offset=offset).outputs
+    for field, value in outputs.items():
+        np.testing.assert_array_equal(value, getattr(operation(*inputs), field))

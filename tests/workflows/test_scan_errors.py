@@ -126,6 +126,7 @@ def test_systematic_errors_are_those_of_the_calibration(device: Device, rng: np.
     assert of_map[known].max() <= np.nanmax(systematic.z) * 1.001
 
 
+@pytest.mark.double
 def test_errors_of_a_rotating_sheet(device: Device, rng: np.random.Generator) -> None:
     sensor = Sensor.load("corner_scene")
     transport: Any = dataclasses.replace(sensor.transport, jitter=2e-4)
@@ -151,6 +152,7 @@ def ratios_of(points: Any, truth: Any, predicted: Any) -> list[float]:
     return [float(a / np.sqrt(np.mean(np.square(b)))) for a, b in zip(drawn, predicted, strict=True)]
 
 
+@pytest.mark.double
 def test_systematic_errors_of_the_transport(device: Device, rng: np.random.Generator) -> None:
     """Steps and directions drawn from the covariance move the points by the predicted systematic errors."""
     covariance = np.array([[4e-6, 1e-6, 0.0], [1e-6, 1e-6, -5e-7], [0.0, -5e-7, 9e-6]])
@@ -182,6 +184,7 @@ def test_no_covariance_of_a_transport(bad: Any) -> None:
         StraightTransport(covariance=bad)
 
 
+@pytest.mark.double
 def test_systematic_errors_of_a_rotating_sheet(device: Device, rng: np.random.Generator) -> None:
     """Sheets drawn with every error of the calibration scatter the points by the predicted systematic errors."""
     corner = Sensor.load("corner_scene")
@@ -227,6 +230,7 @@ def test_systematic_errors_of_a_rotating_sheet(device: Device, rng: np.random.Ge
     assert ratios_of(drawn, true, systematic) == pytest.approx([1.0, 1.0, 1.0], abs=0.1)
 
 
+@pytest.mark.double
 def test_a_calibrated_camera_of_a_rotating_sheet(device: Device) -> None:
     """The same pinhole as a calibrated camera has the same systematic errors; no error is negative."""
     corner = Sensor.load("corner_scene")

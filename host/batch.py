@@ -38,7 +38,7 @@ class Batch(Generic[R]):
     started, ended : int or None
         Start and end of the computation on the device, on the host's clock, where the stream profiles.
     exposure_delay : int
-        Time from the middle of the exposure of a frame to its arrival, as the source states it.
+        Time from the middle of the exposure of a frame to its arrival, as the source states it. Default 0.
     """
 
     number: int

@@ -305,11 +305,11 @@ class Device:
         Parameters
         ----------
         profiling : bool
-            Whether events carry device times.
+            Whether events carry device times. Default False.
         inline : bool
             Whether kernels run in the thread that enqueues them and are complete when the call returns. Useful for
             chains of kernels of a few microseconds each. Runtimes without inline queues (all but PoCL 3 and Intel's
-            CPU runtime) return an ordinary queue.
+            CPU runtime) return an ordinary queue. Default False.
 
         Returns
         -------

@@ -300,7 +300,7 @@ def probed_devices(*, probe_again: bool = False) -> tuple[ProbedDevice, ...]:
     Parameters
     ----------
     probe_again : bool
-        Whether to probe devices again whose cached verdict is bad.
+        Whether to probe devices again whose cached verdict is bad. Default False.
 
     Returns
     -------

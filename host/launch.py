@@ -46,7 +46,7 @@ class Launch:
         a table that this build does not read.
     passes_once : bool
         Whether the kernel does little more than read and write its memory once. Small launches of such kernels run in
-        the calling thread, because waking a worker thread takes longer than the work.
+        the calling thread, because waking a worker thread takes longer than the work. Default False.
     """
 
     source: str
@@ -158,7 +158,7 @@ def real_of(precision: Precision, dtype: np.dtype[Any], *, narrows: bool = False
         Dtype of the input.
     narrows : bool
         Whether the kernel itself converts float64 input to single, where this loses least; then "single" takes
-        float64 input.
+        float64 input. Default False.
 
     Raises
     ------

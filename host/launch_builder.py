@@ -179,7 +179,7 @@ class LaunchBuilder:
         group : int
             Work-group size of the other variant.
         least : int
-            Fewest elements for the vector variant.
+            Fewest elements for the vector variant. Default 0.
         grouping : {"padded", "fitted", "per_element"}
             Work-groups of the other variant: `padded_groups`, `fitted_groups`, `strided_groups` or
             `group_per_element`.
@@ -234,7 +234,7 @@ class LaunchBuilder:
             Macros in addition to the macros of the real type and of the kernel variant.
         streams : bool
             Whether the vector variant of the kernel writes past the caches of a CPU (macro ``PAST_CACHES``) when the
-            launch moves more bytes than the last cache holds.
+            launch moves more bytes than the last cache holds. Default False.
 
         Raises
         ------

@@ -56,7 +56,7 @@ class PipelineLimits:
     Attributes
     ----------
     stop_timeout : float
-        Longest time [s] that the end of a stream waits for the source to return from a read. Chosen.
+        Longest time [s] that the end of a stream waits for the source to return from a read. Chosen. Default 10.0.
     """
 
     stop_timeout: float = 10.0

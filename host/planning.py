@@ -39,25 +39,25 @@ class PlanLimits:
     ----------
     min_ring : int
         Least number of slots of the ring, also used in the trials. Chosen: one slot each for the source, the device and
-        the consumer, and one spare.
+        the consumer, and one spare. Default 4.
     rounds : int
         Number of throughput measurements of a batch size, of which the best one counts. Chosen: pauses of a shared
-        machine hit some of the rounds.
+        machine hit some of the rounds. Default 3.
     latency_batches : int
-        Number of batches whose median time is measured. Chosen.
+        Number of batches whose median time is measured. Chosen. Default 15.
     trial_seconds : float
-        Duration of a throughput measurement [s]. Chosen.
+        Duration of a throughput measurement [s]. Chosen. Default 0.05.
     patience : int
-        Number of batch sizes without a gain after which the search ends. Chosen.
+        Number of batch sizes without a gain after which the search ends. Chosen. Default 3.
     min_gain : float
-        Least ratio of service rates that counts as a gain. Chosen: above the scatter of the measurements.
+        Least ratio of service rates that counts as a gain. Chosen: above the scatter of the measurements. Default 1.05.
     max_inline_seconds : float
         Longest time of a batch that runs inline although worker threads keep up, too [s]. Chosen: a fifth of the time
-        after which Python switches threads, because no Python code runs during an inline kernel.
+        after which Python switches threads, because no Python code runs during an inline kernel. Default 1e-3.
     max_inline_cost : float
         Largest ratio of the processor times per frame, inline to worker threads, at which kernels run inline although
         worker threads keep up, too. Chosen: above the scatter of the measurements, so that equal costs give the same
-        plan each time.
+        plan each time. Default 1.1.
     max_bytes : int or None
         Largest memory of a ring [bytes]. ``None``: half of the free memory of the machine, and at most half of the
         memory of the device. Chosen: the other half is for the results of the user.
@@ -223,10 +223,10 @@ def plan_stream(
     latency : float, optional
         Longest acceptable time from the arrival of a frame to its result in an undisturbed stream [s].
     margin : float
-        Least ratio of the measured service rate to the frame rate.
+        Least ratio of the measured service rate to the frame rate. Default 1.25.
     stall : float
         Pause of the machine or the consumer whose frames the ring must hold [s]. A source that knows its length needs
-        no more slots than it has batches.
+        no more slots than it has batches. Default 0.5.
     inline : bool, optional
         Whether kernels run in the stream's thread instead of the worker threads of the device. Default: inline where
         this keeps up, a batch takes at most ``limits.max_inline_seconds``, and the processor time per frame is at most

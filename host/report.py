@@ -26,7 +26,7 @@ class DurationStatistics:
     Attributes
     ----------
     count : int
-        Number of durations.
+        Number of durations. Default 0.
     mean, maximum : float
         Mean and largest duration [s].
     p50, p99, p999 : float

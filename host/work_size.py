@@ -19,9 +19,9 @@ class WorkSize:
     global_size, local_size : tuple of int
         As in `Launch`.
     each : int
-        Elements of one work-item (vector variant) or of one work-group.
+        Elements of one work-item (vector variant) or of one work-group. Default 1.
     vectors : bool
-        Whether this is the kernel's vector variant (wide vectors, work-groups of one work-item).
+        Whether this is the kernel's vector variant (wide vectors, work-groups of one work-item). Default False.
     """
 
     global_size: Shape

@@ -61,6 +61,7 @@ class CmosSensor:
         pixel is addressed; the "exposure" is the response time, and pixels are read one row after the other.
     response_time : float
         Time over which a direct-read pixel averages its photocurrent [s], above 0 for "direct_read", otherwise 0.
+        Default 0.0.
     readout : SensorReadout
         Taps, pixel clock and shutter. Default: one tap of 40 MHz with a global shutter.
     name : str
@@ -234,7 +235,7 @@ class CmosSensor:
         exposure : float, optional
             Exposure time, or length of the flash [s]; None only for direct-read pixels.
         flash : bool
-            Whether a flash is the only light, see `SensorReadout.timing`.
+            Whether a flash is the only light, see `SensorReadout.timing`. Default False.
 
         Raises
         ------

@@ -113,7 +113,7 @@ def fit_sensor(
     exposures : array_like, optional
         (steps,) exposure times [s], for the dark current. Default: all are equal.
     quantised : bool
-        Whether the grey levels are whole numbers: quantisation (1/12) is then not part of the dark noise.
+        Whether the grey levels are whole numbers: quantisation (1/12) is then not part of the dark noise. Default True.
 
     Returns
     -------

@@ -110,7 +110,7 @@ class SensorReadout:
             Time during which a row collects light [s]; with ``flash`` the length of the flash.
         flash
             Whether a flash is the only light. All rows then collect light at the same time; a rolling shutter has to
-            open all rows before the flash and to read them after it.
+            open all rows before the flash and to read them after it. Default False.
 
         Notes
         -----

@@ -30,7 +30,7 @@ class WorkOffset(NamedTuple):
     rotation : float
         Angle of the program's x axis, counter-clockwise from the x axis of the machine [rad], -pi to pi.
     is_mirrored : bool
-        Whether the program must be mirrored, x to -x, as for the bottom side of a board.
+        Whether the program must be mirrored, x to -x, as for the bottom side of a board. Default False.
     """
 
     x: float
@@ -57,7 +57,7 @@ def work_offset(pose: npt.ArrayLike, camera_at: npt.ArrayLike, *, mirrored: bool
         Machine coordinates of the point at the image centre x, y [m]: position of the axes plus offset of the camera
         from the tool; direction of increasing columns, counter-clockwise from the x axis of the machine [rad].
     mirrored : bool
-        The image shows the bottom side of the board: the program must be mirrored, x to -x.
+        The image shows the bottom side of the board: the program must be mirrored, x to -x. Default False.
 
     Raises
     ------

@@ -58,7 +58,7 @@ class HomographyLimits:
     ----------
     rank_tolerance : float
         Singular values and denominators below this fraction of the largest one count as 0. Chosen: well above the
-        rounding of float64 (2e-16), well below the values of a setup that can be built.
+        rounding of float64 (2e-16), well below the values of a setup that can be built. Default 1e-10.
     residual_rounding : float
         Residuals below this fraction of the largest coordinate are rounding errors, which an F test must not compare.
         Chosen: 64 roundings of float64.
@@ -113,7 +113,7 @@ def to_displacement(
     matrix : numpy.ndarray
         Homography (3, 3) from (x, y, 1) to (G, H, 1), with x and y in -1 to 1.
     rank : {3, 2}
-        Rank that the homography must have: 3, or 2 for a single beam, where only H depends on x.
+        Rank that the homography must have: 3, or 2 for a single beam, where only H depends on x. Default 3.
     rank_tolerance : float
         As `HomographyLimits.rank_tolerance`.
 

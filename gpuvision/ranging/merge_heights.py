@@ -196,11 +196,11 @@ def merge_height_maps(
         Maps with their grids, in one frame; the cells have one size, and the grids differ by whole cells. If both maps
         have standard deviations, they are used.
     max_sigmas, tolerance : float
-        As for `MergeHeights`.
+        As for `MergeHeights`. Defaults 3.0 and 0.0.
     disagreement : {"drop", "first", "second", "lower", "higher", "mean"}
         As for `MergeHeights`.
     require_both : bool
-        As for `MergeHeights`.
+        As for `MergeHeights`. Default False.
     device : Device, optional
         Default `Device.best`.
     max_cells : int

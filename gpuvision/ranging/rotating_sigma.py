@@ -24,17 +24,17 @@ class RotatingSheetSigma:
     focal_length_px : float
         Of the focal length [px]; with a camera, of both focal lengths together. Default 0, as for all parameters.
     principal_point_px : float
-        Of each coordinate of the principal point [px].
+        Of each coordinate of the principal point [px]. Default 0.0.
     axis_point : float
-        Of each coordinate of the point on the axis [m].
+        Of each coordinate of the point on the axis [m]. Default 0.0.
     axis_direction, sheet_normal : float
-        Of each of the two rotations of the direction about perpendicular directions [rad].
+        Of each of the two rotations of the direction about perpendicular directions [rad]. Defaults 0.0 and 0.0.
     sheet_offset : float
-        Of the distance of the sheet from the axis point [m].
+        Of the distance of the sheet from the axis point [m]. Default 0.0.
     first_angle : float
-        Of the angle of profile 0 [rad].
+        Of the angle of profile 0 [rad]. Default 0.0.
     angle_scale : float
-        Of the angle step or of the size of a count of the encoder, relative to it.
+        Of the angle step or of the size of a count of the encoder, relative to it. Default 0.0.
 
     Raises
     ------

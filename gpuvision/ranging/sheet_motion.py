@@ -112,11 +112,12 @@ class StraightTransport:
     start : float
         Transport of profile 0 [m], default 0.
     g_axis, h_axis : (3,) array_like
-        Directions of G and H in the scene; of length 1 if G and H are metres along them.
+        Directions of G and H in the scene; of length 1 if G and H are metres along them. Defaults ``(1.0, 0.0, 0.0)``
+        and ``(0.0, 0.0, 1.0)``.
     direction : (3,) array_like
-        Direction of the transport, from a profile to the next one; it is normalised.
+        Direction of the transport, from a profile to the next one; it is normalised. Default ``(0.0, 1.0, 0.0)``.
     origin : (3,) array_like
-        Point G = H = 0 of the sheet at L = 0 [m].
+        Point G = H = 0 of the sheet at L = 0 [m]. Default ``(0.0, 0.0, 0.0)``.
     jitter : float
         Standard deviation of the transport of a profile [m], >= 0, default 0; part of the predicted random errors.
     bend : BentSheet, optional
@@ -261,9 +262,10 @@ class RotatingSheet:
     lens : Lens, optional
         Radial lens distortion of a camera that is not calibrated, corrected in the positions.
     scene_axes : (3, 3) array_like
-        Axes x, y and z of the scene in the camera frame, orthonormal: the rows of the rotation camera -> scene.
+        Axes x, y and z of the scene in the camera frame, orthonormal: the rows of the rotation camera -> scene. Default
+        ``((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))``.
     scene_origin : (3,) array_like
-        Origin of the scene in the camera frame [m].
+        Origin of the scene in the camera frame [m]. Default ``(0.0, 0.0, 0.0)``.
     horizon : float
         Smallest ``n . r`` of a valid point, default 1e-4: about the sine of the angle between ray and sheet.
 

@@ -27,22 +27,23 @@ class SheetLimits:
     Attributes
     ----------
     significance : float
-        p-value of the F test below which the sheet is bent; as for the lens models.
+        p-value of the F test below which the sheet is bent; as for the lens models. Default 0.001.
     min_readings : int
         Fewest readings of a view that are used: they must show a line. The readings of shorter lines count as outliers.
+        Default 16.
     trials : int
         Number of random triples of readings that the robust start tries. Derived: with 30 % outliers the chance that
-        every triple has an outlier is 0.66^200 < 1e-36.
+        every triple has an outlier is 0.66^200 < 1e-36. Default 200.
     max_iterations : int
-        Largest number of steps of the robust fit and of the final fit.
+        Largest number of steps of the robust fit and of the final fit. Default 30.
     noise_floor_px : float
-        Least noise of a reading [px] that is assumed: real lines are not read better.
+        Least noise of a reading [px] that is assumed: real lines are not read better. Default 1e-4.
     max_scatter_px : float
         Robust standard deviation of the readings about the sheet [px] above which they show no sheet. Chosen: real
-        lines are read within a pixel; a laser image in a wrong pose is off by many.
+        lines are read within a pixel; a laser image in a wrong pose is off by many. Default 2.0.
     min_spread : float
         Ratio of the second to the first principal extent of the points below which all lines coincide: a plane needs
-        targets at different distances.
+        targets at different distances. Default 0.02.
     """
 
     significance: float = 0.001

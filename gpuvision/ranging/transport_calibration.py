@@ -81,7 +81,8 @@ def fit_transport(
     profiles : array_like
         (views,): number of the profile at each view; two numbers at least differ.
     middle : array_like
-        (3,): middle of the target in its coordinates [m]. Its place has the smallest error.
+        (3,): middle of the target in its coordinates [m]. Its place has the smallest error. Default ``(0.0, 0.0,
+        0.0)``.
 
     Returns
     -------

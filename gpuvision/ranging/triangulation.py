@@ -231,7 +231,8 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
         rotation, translation : (3, 3) and (3,) array_like
             World to camera; the translation in metres. Default: the world is the camera frame.
         g_axis, h_axis, origin : (3,) array_like
-            Sheet in the world: directions of G and H, and the point G = H = 0 [m].
+            Sheet in the world: directions of G and H, and the point G = H = 0 [m]. Defaults ``(1.0, 0.0, 0.0)``,
+            ``(0.0, 0.0, 1.0)`` and ``(0.0, 0.0, 0.0)``.
         along, **more
             Other parameters of the class; ``region`` is required.
 

@@ -147,7 +147,8 @@ class Sensor:
     recording, output
         See `Recording` and `Output`.
     auto_threshold
-        Whether a scan estimates the threshold of the readout from the recording (``threshold = "auto"``).
+        Whether a scan estimates the threshold of the readout from the recording (``threshold = "auto"``). Default
+        False.
     light
         Light source and electronics for a simulation, if the file has them.
     encoder
@@ -157,7 +158,7 @@ class Sensor:
         the samples of the sweep.
     noise_known
         Whether the file gives the noise of the readout, so that a scan predicts its errors: ``read_noise``, ``gain`` or
-        ``speckle`` of a camera, ``[psd.noise]`` of a PSD, ``read_noise`` of a focus stack.
+        ``speckle`` of a camera, ``[psd.noise]`` of a PSD, ``read_noise`` of a focus stack. Default False.
     rotating_sigma
         Standard deviations of the calibration of a rotating sheet, if the file has them (``[transport.sigma]``).
     files

@@ -130,7 +130,7 @@ class MotionModel:
         the commands are not known, and the velocity is constant but for random accelerations.
     acceleration_noise : tuple of float
         Spectral densities of the random acceleration [m^2/s^3], [m^2/s^3], [rad^2/s^3]. No effect on an axis with
-        lag 0.
+        lag 0. Default ``(0.0, 0.0, 0.0)``.
     position_noise : tuple of float
         Spectral densities of the random motion [m^2/s], [m^2/s], [rad^2/s]. Default 0.
 

@@ -64,12 +64,12 @@ class LightPaths:
         radiosity). Without "direct" there is no reading.
     sub_sheets : int
         Number of thin sheets that represent a thick one on the direct path, 1 or more. Secondary light is emitted from
-        the middle of the sheet: for other surfaces the sheet is thin.
+        the middle of the sheet: for other surfaces the sheet is thin. Default 1.
     blur : float
         Standard deviation of the image of a point along u [sensor unit]. It is not applied to diffuse secondary light,
-        which varies slowly.
+        which varies slowly. Default 0.0.
     nodes : pair of ints
-        Of `ViewRays`.
+        Of `ViewRays`. Default ``(1, 1)``.
     end_bins : int
         Number of bins beyond either end of the samples in which direct light is imaged and blurred too, 0 or more: the
         light that the ends cut off is then known (`BEYOND_ENDS`), and the true points beyond the ends. Default 0.
@@ -78,8 +78,9 @@ class LightPaths:
         concave edges the patches become smaller (`Patches.from_scene`).
     tolerance : float
         Range error that omitted secondary light may cause [m], 0 or more; 0: all light is computed. See the notes.
+        Default 0.0.
     min_power : float
-        Power of a sample below which it is not read [W].
+        Power of a sample below which it is not read [W]. Default 0.0.
     device : Device, optional
         Device of the kernels; None: `Device.best`.
 

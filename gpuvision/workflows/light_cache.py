@@ -57,7 +57,7 @@ class SimulationTask:
     paths
         Light paths, out of `gpuvision.simulation.sensors.readings.PATHS`.
     tolerance
-        Range error that omitted light may cause [m]; 0: all light is computed.
+        Range error that omitted light may cause [m]; 0: all light is computed. Default 0.0.
     patch_size
         Largest edge of the patches for multi-bounce light [m]; None: a sixteenth of the scene's diagonal.
     """

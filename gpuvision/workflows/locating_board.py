@@ -49,26 +49,27 @@ class LocalizationLimits:
     known_range
         Default search range [m], [rad] with an initial pose (chosen).
     known_range_px
-        The shift as a number of pixels [px]; the larger of the two is used (chosen).
+        The shift as a number of pixels [px]; the larger of the two is used (chosen). Default 4.0.
     unknown_range
         Default search range [m], [rad] without an initial pose (chosen).
     ruler_range
         Largest search range [m], [rad] without a coarse registration: rulers alone find the board within it (chosen).
     ruler_range_px
-        The same shift in pixels, where that is more [px].
+        The same shift in pixels, where that is more [px]. Default 10.0.
     registered_range
-        Search range [m], [rad] after a coarse registration (chosen: several times its error).
+        Search range [m], [rad] after a coarse registration (chosen: several times its error). Default ``(6e-05,
+        0.002)``.
     registered_range_px
-        The same shift in pixels, where that is more [px].
+        The same shift in pixels, where that is more [px]. Default 3.0.
     support_range
         Largest shift of a second pose that is compared with the found one, as a multiple of the search range (chosen:
-        rulers accept poses up to twice the search range off; as far on the other side lies the right one).
+        rulers accept poses up to twice the search range off; as far on the other side lies the right one). Default 4.0.
     min_preference
         Preference of the image for the found pose over a second one that decides [standard deviations] (3: one error in
-        700 for normal errors).
+        700 for normal errors). Default 3.0.
     max_other_share
         The second best pose of an ambiguous coarse registration is excluded if its number of agreeing rulers and
-        fiducials is at most this fraction of the number for the best pose (chosen).
+        fiducials is at most this fraction of the number for the best pose (chosen). Default 0.6.
     """
 
     known_range: tuple[float, float] = (1e-4, 0.3 * math.pi / 180)

@@ -59,7 +59,7 @@ class RobotLimits:
     Parameters
     ----------
     min_points
-        Least number of points on lines: one more than unknowns.
+        Least number of points on lines: one more than unknowns. Default 4.
     max_log_nfa
         Largest accepted `Evidence.log_nfa`: natural logarithm of the expected number of false alarms per search
         (chosen: one in a thousand searches).
@@ -69,10 +69,10 @@ class RobotLimits:
         A larger `Evidence.missing`, up to the first number, is accepted where the image is only thinned out by clutter:
         at least ``min_share`` of the points are on lines, at least as many of the expected lines are seen, and of the
         line that is seen least (`Evidence.least_seen`) at least ``min_least_seen`` (chosen; tests with 30 % of the
-        points replaced, and with wrong fields, confirm it).
+        points replaced, and with wrong fields, confirm it). Defaults 0.7, 0.55 and 0.25.
     min_refined
         Least number of poses of the search grid that are refined (chosen: cost against the chance to miss the best
-        one).
+        one). Default 24.
     """
 
     min_points: int = 4
@@ -287,7 +287,7 @@ def scan_floor(
     rays
         Number of rays, all around.
     blind
-        Distance from the centre up to which the image shows the robot itself [m].
+        Distance from the centre up to which the image shows the robot itself [m]. Default 0.0.
     threshold
         Least height of an edge [grey levels]; None: 4 times the noise, at least a tenth of the image's range.
     model

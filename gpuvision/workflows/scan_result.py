@@ -83,6 +83,7 @@ class ScanLimits:
     ----------
     max_delay : float
         Delay of a frame [s] from which on the summary says that the replay did not hold the requested rate. Chosen.
+        Default 0.01.
     max_cells : int
         Largest number of cells of a height map, default `gpuvision.ranging.regrid.MAX_MAP_CELLS`, 2^26.
     """

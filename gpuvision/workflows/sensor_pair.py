@@ -34,7 +34,7 @@ class FusionLimits:
     ----------
     max_gap : float
         Largest gap between points that is interpolated [median distances of neighbouring samples]. Chosen: one missing
-        sample is interpolated, two are not.
+        sample is interpolated, two are not. Default 2.5.
     """
 
     max_gap: float = 2.5

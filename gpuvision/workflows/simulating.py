@@ -87,7 +87,7 @@ def prepare_simulation(
         Light paths, out of `gpuvision.simulation.sensors.readings.PATHS`; "direct" is required.
     tolerance
         Range error that omitted light may cause [m], 0 or more; 0: nothing is left out. See `LightPaths` for the errors
-        that it covers.
+        that it covers. Default 0.0.
     patch_size
         Largest edge of the patches for multi-bounce light [m]; None: `Light.patch_size` of the sensor, or else a
         sixteenth of the scene's diagonal.
@@ -152,7 +152,7 @@ def simulate(
     mask
         Mask before the sensor; "best": a window for every sample, optimised for this part; None: no mask.
     seed
-        Seed of the noise; None: no noise.
+        Seed of the noise; None: no noise. Default 1.
     limit
         Smallest error that counts as wrong [m]. None: `SimulationLimits.limit_sigmas` times the median of the predicted
         standard deviation, or the task's tolerance if that is larger.

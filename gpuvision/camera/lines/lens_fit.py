@@ -33,25 +33,27 @@ class LensFitLimits:
     Attributes
     ----------
     significance : float
-        p-value below which an F test rejects the smaller model.
+        p-value below which an F test rejects the smaller model. Default 0.05.
     max_rms_ratio : float
         Ratio of the rms of an alternative to the rms of the chosen model, up to which the warnings treat it as equally
-        good.
+        good. Default 1.01.
     max_centre_sigmas : float
         Distance of the centre of an equally good alternative [standard deviations] above which a warning names it.
-        Derived: Gaussian errors exceed 3 standard deviations in 0.3 % of the fits.
+        Derived: Gaussian errors exceed 3 standard deviations in 0.3 % of the fits. Default 3.0.
     max_centre_sigma : float
         Standard deviation of the centre [half-diagonals] above which a warning says that the data do not determine it.
+        Default 0.1.
     max_tail_ratio : float
-        Ratio of the rms to the standard deviation estimated from the median, above which outliers are reported.
+        Ratio of the rms to the standard deviation estimated from the median, above which outliers are reported. Default
+        2.0.
     min_bend_variances : float
         Decrease of the sum of squares [variances] below which the linear uncertainties of several coefficients are
-        rough.
+        rough. Default 100.0.
     lack_of_fit_significance : float
-        p-value of `LackOfFit` below which the residuals count as correlated.
+        p-value of `LackOfFit` below which the residuals count as correlated. Default 0.05.
     max_lack_of_fit : float
         Ratio of the smooth residuals to the noise above which a warning names the lack of fit. Chosen: below 0.5 they
-        add less than 12 % to the residual.
+        add less than 12 % to the residual. Default 0.5.
     """
 
     significance: float = 0.05

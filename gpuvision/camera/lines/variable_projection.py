@@ -36,17 +36,18 @@ class MinimisationLimits:
     Attributes
     ----------
     max_iterations : int
-        Largest number of steps tried.
+        Largest number of steps tried. Default 60.
     max_centre_distance : float
         Largest distance of the distortion centre from the middle of the data [half-diagonals]. Without a bound, data
-        with little distortion move the centre to infinity while k1 tends to 0.
+        with little distortion move the centre to infinity while k1 tends to 0. Default 4.0.
     min_slope : float
-        Least slope of r (1 + k1 r^2 + ...) over the data, relative to the slope at the centre: excludes folds.
+        Least slope of r (1 + k1 r^2 + ...) over the data, relative to the slope at the centre: excludes folds. Default
+        1e-3.
     min_gain : float
         Expected gain of the next step that ends the minimisation [variances of a residual]. Derived: 5e-3 corresponds
-        to 0.07 standard deviations of the parameters.
+        to 0.07 standard deviations of the parameters. Default 5e-3.
     min_curvature : float
-        Least mean square of a bend of the lines [half-diagonals^2] that the closed-form start uses.
+        Least mean square of a bend of the lines [half-diagonals^2] that the closed-form start uses. Default 1e-8.
     """
 
     max_iterations: int = 60

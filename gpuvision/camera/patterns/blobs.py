@@ -31,29 +31,30 @@ class BlobLimits:
     ----------
     min_contrast : float
         Least local contrast, as a fraction of the 90th percentile of the contrast in the image. Measured on photographs
-        with uneven illumination.
+        with uneven illumination. Default 0.15.
     min_contrast_sigmas : float
         Least local contrast [standard deviations of the noise]. Derived: the extremes of noise alone lie about 6 sigma
-        apart in a window.
+        apart in a window. Default 8.0.
     min_area : int
-        Least area of a blob [px].
+        Least area of a blob [px]. Default 6.
     min_fill : float
         Least fraction of its bounding box that a blob covers. Derived: a disc covers 0.785, an ellipse at 45 degrees
-        with axes 1:2 covers 0.63.
+        with axes 1:2 covers 0.63. Default 0.4.
     max_elongation : float
-        Largest ratio of the sides of the bounding box.
+        Largest ratio of the sides of the bounding box. Default 3.5.
     area_range : (float, float)
-        Accepted areas relative to the median area; perspective varies the areas of one pattern.
+        Accepted areas relative to the median area; perspective varies the areas of one pattern. Default ``(0.4, 2.5)``.
     window_pitches : float
-        Side of the threshold window [pitches]. Derived: two pitches contain blobs and background everywhere.
+        Side of the threshold window [pitches]. Derived: two pitches contain blobs and background everywhere. Default
+        2.0.
     smoothing_pitches : float
-        Half the side of the smoothing box before thresholding [pitches].
+        Half the side of the smoothing box before thresholding [pitches]. Default 0.04.
     blob_count : (int, int)
-        Accepted numbers of blobs in a trial of the scale search.
+        Accepted numbers of blobs in a trial of the scale search. Default ``(5, 60000)``.
     sufficient_count : int
-        Number of blobs with symmetric neighbours that ends the scale search.
+        Number of blobs with symmetric neighbours that ends the scale search. Default 50.
     sufficient_share : float
-        Share of such blobs among all blobs that ends the scale search.
+        Share of such blobs among all blobs that ends the scale search. Default 0.6.
     """
 
     min_contrast: float = 0.15

@@ -52,26 +52,27 @@ class ChessboardLimits:
     Attributes
     ----------
     min_corners : int
-        Least number of inner corners.
+        Least number of inner corners. Default 6.
     max_candidates : int
-        Largest number of saddle points in a level of the image pyramid; the strongest are used.
+        Largest number of saddle points in a level of the image pyramid; the strongest are used. Default 40000.
     min_saddle : float
-        Least curvature of a saddle point, relative to the curvature of the ``strongest``-th saddle point.
+        Least curvature of a saddle point, relative to the curvature of the ``strongest``-th saddle point. Default 0.03.
     strongest : int
-        Rank of the saddle point that ``min_saddle`` refers to.
+        Rank of the saddle point that ``min_saddle`` refers to. Default 20.
     max_asymmetry : float
         Largest difference of the two principal curvatures' magnitudes relative to their sum; 0 at an ideal corner.
+        Default 0.75.
     min_contrast : float
-        Least contrast of the squares about a corner relative to the median contrast of the board.
+        Least contrast of the squares about a corner relative to the median contrast of the board. Default 0.5.
     max_deviation_medians : float
-        Largest deviation of a corner from its neighbours as a multiple of the median deviation.
+        Largest deviation of a corner from its neighbours as a multiple of the median deviation. Default 7.0.
     min_position_tolerance : float
-        Deviation in position that is always accepted [grid steps].
+        Deviation in position that is always accepted [grid steps]. Default 0.005.
     max_shift : float
-        Largest shift of a corner by the refinement [grid steps].
+        Largest shift of a corner by the refinement [grid steps]. Default 0.3.
     max_edge_distance : float
         Largest mean square distance of the edges in a corner's window from the corner, as a multiple of the median over
-        all corners: rejects windows with edges that miss the corner.
+        all corners: rejects windows with edges that miss the corner. Default 4.0.
     """
 
     min_corners: int = 6

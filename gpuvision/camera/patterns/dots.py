@@ -31,20 +31,20 @@ class DotLimits:
     Attributes
     ----------
     min_dots : int
-        Least number of dots in a grid.
+        Least number of dots in a grid. Default 9.
     max_coverage : float
-        Largest fraction of the grid that dots cover. Derived: squares of a chessboard cover 0.5.
+        Largest fraction of the grid that dots cover. Derived: squares of a chessboard cover 0.5. Default 0.48.
     max_deviation_medians : float
         Largest deviation of a dot from its neighbours, in position and in shape, as a multiple of the median deviation
-        in the image.
+        in the image. Default 7.0.
     min_position_tolerance : float
-        Deviation in position that is always accepted [pitches].
+        Deviation in position that is always accepted [pitches]. Default 0.003.
     min_shape_tolerance : float
-        Deviation of area, width and height that is always accepted (logarithm of the ratio).
+        Deviation of area, width and height that is always accepted (logarithm of the ratio). Default 0.06.
     min_contrast : float
-        Least contrast relative to the median contrast of the neighbouring dots.
+        Least contrast relative to the median contrast of the neighbouring dots. Default 0.25.
     max_background_residual : float
-        Largest deviation of the background from a plane [contrasts].
+        Largest deviation of the background from a plane [contrasts]. Default 0.5.
     blobs : BlobLimits
         Thresholds of the blob detection.
     """

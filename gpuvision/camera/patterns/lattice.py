@@ -26,26 +26,29 @@ class LatticeLimits:
     ----------
     neighbours : int
         Nearest points examined per point. Derived: eight lattice neighbours, and two spurious points between them.
+        Default 10.
     max_asymmetry : float
-        Largest length of the sum of two opposite steps.
+        Largest length of the sum of two opposite steps. Default 0.25.
     min_sine : float
-        Least sine of the angle between two steps that span a lattice.
+        Least sine of the angle between two steps that span a lattice. Default 0.4.
     tolerance, safe_tolerance : float
         Largest distance of a point from its predicted position: in general, and in the first pass, which accepts
-        unambiguous neighbours only.
+        unambiguous neighbours only. Defaults 0.3 and 0.15.
     max_step_change : float
-        Largest change of a step from one point to the next.
+        Largest change of a step from one point to the next. Default 0.2.
     max_product : float
         Largest scalar product of the orientation vectors of two neighbours, where a pattern alternates (-1: opposite).
+        Default -0.5.
     max_seeds : int
-        Seeds from which patches are grown.
+        Seeds from which patches are grown. Default 12.
     joint_points : int
         Points of the main patch nearest to another patch that predict its index; a quarter as many of the other patch.
+        Default 160.
     joint_tolerance : float
-        Largest deviation of the predicted index from a whole number.
+        Largest deviation of the predicted index from a whole number. Default 0.2.
     min_patch_share : float
         Size, relative to the main patch, from which a patch that cannot be joined is an error; smaller ones are
-        dropped.
+        dropped. Default 0.1.
     """
 
     neighbours: int = 10

@@ -36,20 +36,20 @@ class LinePatternLimits:
     Attributes
     ----------
     min_cells : int
-        Least number of whole cells between lines.
+        Least number of whole cells between lines. Default 9.
     min_points : int
-        Least number of points of a line. Derived: two points are always straight.
+        Least number of points of a line. Derived: two points are always straight. Default 3.
     min_coverage : float
-        Least fraction of the grid that cells cover; dots cover less.
+        Least fraction of the grid that cells cover; dots cover less. Default 0.45.
     max_deviation_medians : float
         Largest deviation of a point from its neighbours, in position and line width, as a multiple of the median
-        deviation in the image.
+        deviation in the image. Default 7.0.
     min_position_tolerance : float
-        Deviation in position that is always accepted [grid steps].
+        Deviation in position that is always accepted [grid steps]. Default 0.003.
     min_width_tolerance : float
-        Deviation of the line width that is always accepted (logarithm of the ratio).
+        Deviation of the line width that is always accepted (logarithm of the ratio). Default 0.1.
     min_contrast : float
-        Least contrast relative to the median contrast.
+        Least contrast relative to the median contrast. Default 0.4.
     blobs : BlobLimits
         Thresholds of the detection of cells.
     """

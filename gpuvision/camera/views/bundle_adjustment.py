@@ -108,9 +108,9 @@ class FitState:
     cost
         Sum of the loss over all points [px^2].
     iterations
-        Number of steps tried.
+        Number of steps tried. Default 0.
     converged
-        Whether the fit has converged.
+        Whether the fit has converged. Default False.
     """
 
     values: Floats

@@ -21,38 +21,40 @@ class CalibrationLimits:
     Attributes
     ----------
     significance : float
-        p-value below which an F test rejects the smaller model.
+        p-value below which an F test rejects the smaller model. Default 0.001.
     min_noise_px : float
-        Least noise of a coordinate [px] assumed for the warnings: real points are seldom measured better.
+        Least noise of a coordinate [px] assumed for the warnings: real points are seldom measured better. Default 0.01.
     max_focal_sigma : float
-        Relative standard deviation of f above which a warning says that the views do not determine it.
+        Relative standard deviation of f above which a warning says that the views do not determine it. Default 0.02.
     undetermined_focal_sigma : float
-        Relative standard deviation of f above which the calibration is refused.
+        Relative standard deviation of f above which the calibration is refused. Default 0.3.
     max_centre_sigma_px : float
         Standard deviation of the centre [px] above which a warning says that the views do not determine it; also the
-        distance of an alternative's centre that is reported.
+        distance of an alternative's centre that is reported. Default 3.0.
     max_centre_offset : float
         Distance of the centre from the image's middle [image diagonals] above which a tilted sensor is suspected.
+        Default 0.1.
     max_noise_ratio : float
-        Ratio of the estimated to the given noise above which the model is reported as insufficient.
+        Ratio of the estimated to the given noise above which the model is reported as insufficient. Default 1.2.
     significant_sigmas : float
-        Standard deviations from which a tilt is significant.
+        Standard deviations from which a tilt is significant. Default 3.0.
     min_tilt_degrees : float
-        Tilt [degree] below which decentred lenses look the same. Typical assembly tolerance of lenses.
+        Tilt [degree] below which decentred lenses look the same. Typical assembly tolerance of lenses. Default 1.0.
     outlier_sigmas : float
-        Length of a residual [standard deviations] of an outlier. Derived: one of 1e5 points at normal noise.
+        Length of a residual [standard deviations] of an outlier. Derived: one of 1e5 points at normal noise. Default
+        5.0.
     min_view_share : float
-        Least share of a view's points that must have a weight above 0 under Tukey's loss.
+        Least share of a view's points that must have a weight above 0 under Tukey's loss. Default 0.25.
     max_outside_share : float
-        Largest share of points outside the image; a larger one indicates a wrong ``image_size``.
+        Largest share of points outside the image; a larger one indicates a wrong ``image_size``. Default 0.05.
     sufficient_noise_ratio : float
-        Ratio of the residual to the residual of free homographies, up to which no other start is tried.
+        Ratio of the residual to the residual of free homographies, up to which no other start is tried. Default 1.3.
     lack_of_fit_significance : float
         p-value of the smooth field, or of the test between views, below which the residuals count as correlated.
-        Chosen: with two tests, one of 500 calibrations with independent errors.
+        Chosen: with two tests, one of 500 calibrations with independent errors. Default 0.001.
     max_lack_of_fit : float
         Ratio of the smooth residuals to the noise above which a warning names the lack of fit. Chosen: below 0.5 they
-        add less than 12 % to the residual.
+        add less than 12 % to the residual. Default 0.5.
     """
 
     significance: float = 0.001

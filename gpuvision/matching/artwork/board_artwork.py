@@ -54,7 +54,7 @@ class Pad:
     outline : (n, 2)
         Corners, counter-clockwise [m]; the convex hull where several areas make one pad.
     hole
-        Diameter of its hole, or width of its slot [m]; 0 without one.
+        Diameter of its hole, or width of its slot [m]; 0 without one. Default 0.0.
     opening
         Distance from the copper's edge to the edge of the mask opening [m], the least of four sides: negative where
         the mask covers copper, NaN without a concentric opening (a covered via).

@@ -17,13 +17,13 @@ class BoardReflectance:
     Parameters
     ----------
     laminate_masked, copper_masked : float
-        Laminate and copper under the solder mask.
+        Laminate and copper under the solder mask. Defaults 0.24 and 0.43.
     laminate, copper : float
-        Laminate and copper in the openings of the mask.
+        Laminate and copper in the openings of the mask. Defaults 0.35 and 0.78.
     silk : float
-        Silk.
+        Silk. Default 0.94.
     hole : float
-        Holes.
+        Holes. Default 0.06.
 
     Raises
     ------

@@ -39,7 +39,7 @@ class Shape:
         Corners [m], closed from the last to the first; points with an odd number of crossings to the outside are
         inside.
     dark
-        True where the layer's material (copper, ink, mask opening) is added, False where it is cleared.
+        True where the layer's material (copper, ink, mask opening) is added, False where it is cleared. Default True.
     holes
         Outlines (n, 2) of areas [m] that do not belong to the shape: earlier shapes of the layer are visible there.
     """

@@ -25,27 +25,29 @@ class MeasurementLimits:
     Parameters
     ----------
     second_range_px
-        Search range of the second pass [px] (chosen: several times the error of a first pass).
+        Search range of the second pass [px] (chosen: several times the error of a first pass). Default 4.0.
     sampling_sigma_px
         Standard deviation of the error that bilinear sampling adds to an edge [px]; neighbouring rulers share a part of
         it (measured).
     min_share
         Least share of the rulers and fiducials in the image that must agree with the pose, and least inlier fraction of
-        the pose (chosen).
+        the pose (chosen). Default 0.3.
     min_count
-        Least number of rulers and fiducials that must agree: as many as unknowns of a rigid pose.
+        Least number of rulers and fiducials that must agree: as many as unknowns of a rigid pose. Default 3.
     max_residual_px
-        Largest accepted scale of the residuals [px]: more is another board or a wrong scale (chosen).
+        Largest accepted scale of the residuals [px]: more is another board or a wrong scale (chosen). Default 0.5.
     fiducial_slack_px
         Largest accepted distance of a fiducial beyond its expected search range, besides the etch bias [px] (chosen).
+        Default 1.0.
     range_factor, min_angle
         A pose of the first pass is refused beyond this multiple of the expected search range (rulers find no edge
-        farther away), with at least this angle [rad] (chosen).
+        farther away), with at least this angle [rad] (chosen). Defaults 2.0 and 5e-3.
     scale_significance
         Error of the scale that is significant [standard deviations] (4: one false alarm in 16 000 for normal errors).
+        Default 4.0.
     max_board_scale, max_scale_effect
         A pose is refused if the error of the scale is larger than the first number (chosen: laminate shrinks by up to
-        0.1 %) and moves the pose by more than the second one [standard deviations] (chosen).
+        0.1 %) and moves the pose by more than the second one [standard deviations] (chosen). Defaults 2e-3 and 3.0.
     """
 
     second_range_px: float = 4.0

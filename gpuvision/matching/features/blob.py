@@ -148,7 +148,7 @@ class FindBlobs(VisionOperation[Blobs]):
         Largest number of passes, 1 to 10, default 2: rulers are placed again where the blob was found more than 2 px
         (without ``match`` 0.1 px) from where they were.
     match : bool
-        Whether to match the pixels; otherwise the result is the fit to the edges.
+        Whether to match the pixels; otherwise the result is the fit to the edges. Default True.
     min_inlier_fraction : float
         Least share of the rulers whose edges must agree on the shape, 0 to 1, exclusive, default 0.5.
     saturation : float, optional

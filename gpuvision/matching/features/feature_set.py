@@ -377,7 +377,7 @@ def choose_features(
         Limit of the cost: number of "rulers" (a fiducial costs 16), "px" sampled pixels, or "us" microseconds on the
         device, measured now, with one launch.
     missing : float
-        Expected share of features without a measurement, 0 to below 1.
+        Expected share of features without a measurement, 0 to below 1. Default 0.0.
     device : Device, optional
         Device for microseconds; None: `Device.best`.
 

@@ -36,10 +36,10 @@ class FiducialLimits:
     ----------
     matched_sigma_px, edges_sigma_px
         Standard deviation of the error that remains without noise [px], of matched pixels, and of a fit to edges, which
-        a trace that ends at the contour disturbs (measured).
+        a trace that ends at the contour disturbs (measured). Defaults 0.003 and 0.02.
     size_tolerance_px, size_sigmas
         Largest difference between the measured and the drawn radius: pixels, plus this multiple of the etch bias'
-        standard deviation (chosen).
+        standard deviation (chosen). Defaults 1.0 and 4.0.
     """
 
     matched_sigma_px: float = 0.003

@@ -99,7 +99,7 @@ class Imaging:
         bare : array_like
             Whether the copper is bare; otherwise it is under the mask.
         normal : array_like
-            (..., 2) unit normals.
+            (..., 2) unit normals. Default ``(1.0, 0.0)``.
 
         Notes
         -----

@@ -96,9 +96,9 @@ class FitLines(VisionOperation[LineFits]):
     max_iterations : int
         Number of reweighted fits, 1 or more, default 12.
     weighted : bool
-        Whether the operation takes the standard deviations of the points as a second input.
+        Whether the operation takes the standard deviations of the points as a second input. Default False.
     with_weights : bool
-        Whether to return `LineFits.weights`.
+        Whether to return `LineFits.weights`. Default False.
     precision : {None, "single", "double"}
         Precision of the arithmetic and of the results; None follows the input.
     variant : {"auto", "vector", "work_item"}

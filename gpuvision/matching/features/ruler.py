@@ -192,14 +192,14 @@ class RulerEdges(VisionOperation[Edges]):
         Number of returned edges with ``edge_selection="all"``, 1 to 64, default 8.
     pairs : bool
         Whether to look for two adjacent edges of opposite sign, such as the borders of a trace. The middle of a pair
-        does not depend on the etch bias.
+        does not depend on the etch bias. Default False.
     spacing_px : (float, float), optional
         Least and greatest distance between the edges of a pair [px], rounded to whole samples. None: any distance.
     per_ruler : bool
         Whether three more columns of the rulers state polarity and spacing of each ruler: sign of the step (of the
         first edge of a pair), -1 or 1; least and greatest spacing of the edges of a pair [px], 0 and 0 for a single
         edge. Single edges and pairs are then measured in one launch. With the default ``polarity``, ``pairs``,
-        ``spacing_px`` and ``edge_selection`` only.
+        ``spacing_px`` and ``edge_selection`` only. Default False.
     ambiguity : float, optional
         Ratio of the second strongest to the strongest gradient from which on the edge is flagged AMBIGUOUS, above 0 to
         1, with ``edge_selection="strongest"`` only. None: no check.

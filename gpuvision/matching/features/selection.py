@@ -92,7 +92,7 @@ def select_rulers(
     per_source
         Largest number of rulers on one trace or side of a pad, default 4: a defect there does not affect the others.
     missing
-        Expected share of rulers without an edge, 0 to below 1; it counts in the predicted covariance.
+        Expected share of rulers without an edge, 0 to below 1; it counts in the predicted covariance. Default 0.0.
 
     Raises
     ------

@@ -112,7 +112,7 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
     headings : int or tuple of float
         Number of headings, evenly from 0 all around, default 72; or the headings [rad].
     with_scores : bool
-        Whether to return the score of every pose, besides the least of each block.
+        Whether to return the score of every pose, besides the least of each block. Default False.
     variant : {"auto", "vector", "work_item"}
         Kernel variant: "vector" computes 64 positions at once (CPU runtimes), "work_item" one position per work-item
         (GPUs).

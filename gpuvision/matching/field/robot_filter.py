@@ -38,23 +38,23 @@ class RobotFilterLimits:
     Parameters
     ----------
     wrong_view : float
-        Probability that no candidate of a view is the pose, 0 to 1, exclusive (chosen).
+        Probability that no candidate of a view is the pose, 0 to 1, exclusive (chosen). Default 0.05.
     carried : float
-        Probability that the robot was carried elsewhere between two views, 0 to 1, exclusive (chosen).
+        Probability that the robot was carried elsewhere between two views, 0 to 1, exclusive (chosen). Default 1e-3.
     gate : float
         Squared Mahalanobis distance beyond which a candidate is not the pose of a hypothesis: a right one exceeds the
         default with a probability of 0.001 (chi square, 3 degrees of freedom).
     min_probability : float
-        Least probability of a pose that is not AMBIGUOUS (chosen).
+        Least probability of a pose that is not AMBIGUOUS (chosen). Default 0.9.
     dropped : float
-        Probability below which a hypothesis is dropped (chosen).
+        Probability below which a hypothesis is dropped (chosen). Default 1e-6.
     max_hypotheses : int
-        Largest number of hypotheses (cost).
+        Largest number of hypotheses (cost). Default 16.
     merged : float
-        Squared Mahalanobis distance below which two hypotheses are one (chosen).
+        Squared Mahalanobis distance below which two hypotheses are one (chosen). Default 1.0.
     view_delay : float
         Longest time from the exposure of a view until it is given to the filter [s], above 0; an older view is not
-        used (chosen: 10 frame times at 5 frames per second).
+        used (chosen: 10 frame times at 5 frames per second). Default 2.0.
     """
 
     wrong_view: float = 0.05

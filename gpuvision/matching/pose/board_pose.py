@@ -89,10 +89,10 @@ def place_rulers(
         Homography from the expected board to the (undistorted) image [m to px].
     sigma : array_like, (lines,)
         Standard deviation of the position of a line on the board [m], common to all its rulers and independent of the
-        other lines: rough edges, offset of a mask opening or of the silk.
+        other lines: rough edges, offset of a mask opening or of the silk. Default 0.0.
     etch_factor : array_like, (lines,)
         Shift of a line along its normal per etch bias, for a solver with ``etch_bias_sigma``: 1 for an edge with the
-        normal out of the copper, 0 for the middle of a trace.
+        normal out of the copper, 0 for the middle of a trace. Default 0.0.
 
     Returns
     -------

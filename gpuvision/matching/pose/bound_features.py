@@ -76,7 +76,7 @@ class BoundFeatures:
             x, y [m]: point of the artwork at the middle of the full image; theta [rad]: direction in which the columns
             increase.
         corner : (float, float)
-            Column and row of the frame's first pixel in the full image [px].
+            Column and row of the frame's first pixel in the full image [px]. Default ``(0.0, 0.0)``.
 
         Returns
         -------

@@ -112,7 +112,7 @@ class EdgeCostMap(VisionOperation[EdgeCosts]):
     threshold : float
         Height of an edge that costs about a third [grey levels], above 0.
     border : int
-        Width of a border of cells without edges around the image [cells], 0 or more.
+        Width of a border of cells without edges around the image [cells], 0 or more. Default 0.
 
     Raises
     ------
@@ -172,7 +172,7 @@ class EdgeSearch(VisionOperation[PoseCosts]):
     headings, points : int
         Number of headings, 1 to 4096, and of points, 1 to 4096.
     with_scores : bool
-        Whether to return the score of every pose, besides the least of each block.
+        Whether to return the score of every pose, besides the least of each block. Default False.
     variant : {"auto", "vector", "work_item"}
         Kernel variant: "vector" computes 64 positions at once (CPU runtimes), "work_item" one position per work-item
         (GPUs).

@@ -134,7 +134,7 @@ class CameraFeatures:
     frame_shape : (int, int)
         Rows and columns of the full image, whose middle the pose refers to.
     mirrored : bool
-        Whether the camera sees the artwork from behind.
+        Whether the camera sees the artwork from behind. Default False.
     model : Lens or Camera, optional
         Lens distortion, in pixels of the full image; frames are then distorted. None: no distortion.
     """

@@ -173,7 +173,7 @@ def fitted_line_rows(normal: Any, point: Any, centre: Any, covariance: Any, angl
     centre, covariance : array_like, (..., 2) and (..., 2, 2)
         Results of the fit, in metres in the frame of the measurement.
     angle : array_like, (...,)
-        Angle of the fitted line minus angle of the artwork's line [rad], small.
+        Angle of the fitted line minus angle of the artwork's line [rad], small. Default 0.0.
 
     Returns
     -------
@@ -224,11 +224,11 @@ class SolvePose(VisionOperation[BoardPose]):
     min_scale : float
         Lower limit of the scale, above 0, default 1e-3.
     placement : (float, float)
-        Point of the artwork [m] to which the covariance refers.
+        Point of the artwork [m] to which the covariance refers. Default ``(0.0, 0.0)``.
     with_initial_pose : bool
         Whether there is a second input of shape (..., 3) with the initial pose x, y [m], theta [rad]. Otherwise the
         initial pose is no motion. Edges determine the turn from initial errors up to about 30 degrees, points up to 90
-        degrees.
+        degrees. Default False.
     max_condition : float
         Largest accepted `BoardPose.condition`, above 0, default 300.
     min_inlier_fraction : float

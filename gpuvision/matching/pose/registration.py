@@ -80,7 +80,7 @@ def prepare_board_registration(
     threshold : float
         Least height of an edge [grey levels], default 10.
     tolerance_px, cell_px : float, int
-        As in `CoarseRegistration`; the tolerance should cover the etch bias too.
+        As in `CoarseRegistration`; the tolerance should cover the etch bias too. Defaults 1.0 and 2.
 
     Returns
     -------
@@ -217,7 +217,7 @@ def register_images(
         Search range: largest offset of the placement point in x and in y [px], default 64, and largest angle [rad],
         default 10 degrees.
     blur_px, threshold : float
-        As in `prepare_board_registration`.
+        As in `prepare_board_registration`. Defaults 1.0 and 20.0.
     transform, tolerance_px, cell_px : {"rigid", "similarity", "affine"}, float, int
         As in `CoarseRegistration`. Images of two line cameras, or of two boards, also differ in their scales along x
         and y; the default is therefore "affine".

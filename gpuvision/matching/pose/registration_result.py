@@ -22,20 +22,20 @@ class RegistrationLimits:
     ----------
     min_rulers
         Least number of rulers in the image, and of known edges, to decide on a pose (chosen: four times the three
-        unknowns).
+        unknowns). Default 12.
     significance
         Difference of two counts of rulers that is significant [standard deviations] (3: one error in 700 for normal
-        counts).
+        counts). Default 3.0.
     min_ratio
         Ratio of scores, or of the counts of rulers that speak for one pose only, from which on a pose is preferred to
-        another one (chosen; tests on boards with repeated patterns confirm it).
+        another one (chosen; tests on boards with repeated patterns confirm it). Default 2.0.
     border_cost
         Cost of an edge beyond the image, relative to the mean cost in the image (measured). With 1, poses that keep
         more edges in the image would win over the right one; below 0.5, poses that keep few edges in the image would
-        win.
+        win. Default 0.7.
     refinements
         Number of measurements of the best pose along short rulers, each placed at the pose of the previous one
-        (chosen).
+        (chosen). Default 3.
     """
 
     min_rulers: int = 12

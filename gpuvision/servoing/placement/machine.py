@@ -163,9 +163,9 @@ class ThermalDrift:
     Parameters
     ----------
     expansion : (float, float)
-        Change of the nozzle's position in the camera frame along x and y per kelvin [m/K].
+        Change of the nozzle's position in the camera frame along x and y per kelvin [m/K]. Default ``(0.0, 0.0)``.
     temperature_sigma : float
-        Standard deviation of the temperature since the calibration [K], 0 or more.
+        Standard deviation of the temperature since the calibration [K], 0 or more. Default 0.0.
     """
 
     expansion: tuple[float, float] = (0.0, 0.0)

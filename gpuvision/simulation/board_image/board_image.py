@@ -48,15 +48,15 @@ class BoardImageTable(NamedTuple):
     white
         Electrons, or reflectance, of white.
     dark
-        Dark current [e-].
+        Dark current [e-]. Default 0.0.
     dark_variance
-        Variance of the dark noise [e-^2].
+        Variance of the dark noise [e-^2]. Default 0.0.
     full_well
-        Most electrons of a pixel.
+        Most electrons of a pixel. Default 0.0.
     bend
-        Non-linearity over the full well [1/e-].
+        Non-linearity over the full well [1/e-]. Default 0.0.
     dark_level, gain, max_level
-        Grey level without electrons, grey levels per electron, and the largest one.
+        Grey level without electrons, grey levels per electron, and the largest one. Defaults 0.0, 0.0 and 0.0.
     """
 
     centre_x: float

@@ -86,8 +86,9 @@ class ReflectanceMap:
             Reflectances of the materials. Default: `BoardReflectance`.
         etch_bias : float
             Distance from the drawn edges of the copper to its real edges [m], positive where copper is left over.
+            Default 0.0.
         mask_shift, silk_shift : pair of floats
-            Displacement x, y of the mask openings and of the silk [m].
+            Displacement x, y of the mask openings and of the silk [m]. Defaults ``(0.0, 0.0)`` and ``(0.0, 0.0)``.
 
         Returns
         -------

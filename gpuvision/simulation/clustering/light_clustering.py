@@ -73,7 +73,7 @@ class LightClustering:
         Triangles that may occlude; None: nothing occludes.
     clearance
         Surfaces that rise less than this above a receiver's or a lit surface's plane do not occlude [m]; at least 4e-6
-        of the scene's reach from its middle.
+        of the scene's reach from its middle. Default 0.0.
     clusters
         Whether one segment may represent several. Default True.
     variant

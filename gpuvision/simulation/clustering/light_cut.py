@@ -46,7 +46,7 @@ class LightCut:
         ("exact"; of these "clear" cannot be occluded), represented by a cluster ("clustered"), or "left out". "work" is
         the number of pairs that remain to be computed.
     traversed
-        Whether the tree was traversed. False: every pair is computed, because that is faster.
+        Whether the tree was traversed. False: every pair is computed, because that is faster. Default True.
     """
 
     segments: Reals
@@ -113,7 +113,7 @@ class LightCut:
         dtype
             Of the segments.
         segments, selected
-            Least numbers of rows.
+            Least numbers of rows. Defaults 0 and 0.
         """
         rows = np.zeros((capacity(max(segments, len(self.segments))), 10), dtype)
         rows[: len(self.segments)] = self.segments

@@ -114,7 +114,7 @@ class ErrorAttribution:
         Parameters
         ----------
         min_error : float
-            Samples whose error is not larger than this have no dominant cause [m], 0 or more.
+            Samples whose error is not larger than this have no dominant cause [m], 0 or more. Default 0.0.
 
         Returns
         -------
@@ -242,7 +242,7 @@ def attribute_errors(
         ``"moments"`` or ``"shapley"``, see the module's description. None: "moments" for PSDs, "shapley" for cameras.
         "shapley" counts a height that cannot be read as no error.
     secondary_by_path : bool
-        True: each path of secondary light is a cause. False: one cause "secondary".
+        True: each path of secondary light is a cause. False: one cause "secondary". Default False.
     device : Device, optional
         Device of the readouts; None: `Device.best`.
 

@@ -32,7 +32,7 @@ class StripErrorModel:
     limits
         (u_low, u_high), ends of a strip or of the window [sensor unit]; each a number or (strips,).
     min_power
-        Smallest power at which a strip is read [W]. A strip with less light is dark and has no range.
+        Smallest power at which a strip is read [W]. A strip with less light is dark and has no range. Default 0.0.
     max_shift
         Largest distance between the direct light's position and the reading [sensor unit], a number or (strips,).
         Infinite: only the limits bound the reading.

@@ -66,8 +66,9 @@ class SensorFusion:
     ----------
     max_sigmas : float
         Two readings agree if they differ by at most this many standard deviations of their difference; 0 or more.
+        Default 3.0.
     tolerance : float
-        Additional allowed difference of agreeing readings [m]; 0 or more.
+        Additional allowed difference of agreeing readings [m]; 0 or more. Default 0.0.
     rule : {"flag", "mean", "stronger", "narrower", "predicted"}
         Decision where the sensors disagree. ``"flag"``: no value. ``"mean"``: the plain mean; at a step of
         reflectivity, two sensors that face each other have opposite errors of equal size. ``"stronger"``: the sensor
@@ -75,9 +76,9 @@ class SensorFusion:
         the second or the mean, whichever has the smallest error in a simulation of the part.
     min_ratio : float
         The chosen sensor must be better than the other by this factor, in the quantity of the rule; otherwise there
-        is no value; 1 or more.
+        is no value; 1 or more. Default 1.5.
     accept_single : bool
-        True: a value that only one of the sensors has is accepted.
+        True: a value that only one of the sensors has is accepted. Default True.
 
     Raises
     ------

@@ -20,7 +20,7 @@ class ClosedSurfaceLimits:
     ----------
     min_volume_fraction : float
         Least volume of a closed surface, as a fraction of its bounding box; of flatter surfaces both sides are visible.
-        Chosen: the sign of smaller volumes may be rounding.
+        Chosen: the sign of smaller volumes may be rounding. Default 1e-9.
     """
 
     min_volume_fraction: float = 1e-9

@@ -24,7 +24,7 @@ class Material:
     gloss : Brdf, optional
         Glossy lobe (`Phong`, `Ggx`, `Ward`), or None.
     mirror : float
-        Reflectance of an ideal mirror in the surface, for all angles, 0 to 1.
+        Reflectance of an ideal mirror in the surface, for all angles, 0 to 1. Default 0.0.
     name : str
         Name for reports.
 

@@ -236,7 +236,7 @@ class Ggx(Brdf):
     alpha : float
         Roughness of the GGX distribution, 1e-4 (nearly a mirror) to 1.
     f0 : float
-        Fresnel reflectance at normal incidence, 0 to 1.
+        Fresnel reflectance at normal incidence, 0 to 1. Default 1.0.
 
     Raises
     ------

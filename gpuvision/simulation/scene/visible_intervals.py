@@ -52,7 +52,7 @@ class VisibleIntervals(VisionOperation[Intervals]):
         Scene that can occlude the segments; both sides of a triangle occlude. Triangles that contain the segment, the
         mirror itself, and triangles in the plane of the fan do not occlude.
     max_intervals
-        Largest number of visible parts of a segment, 1 to 49.
+        Largest number of visible parts of a segment, 1 to 49. Default 16.
     precision
         "single" or "double" arithmetic and outputs; None: the type of the input.
     variant

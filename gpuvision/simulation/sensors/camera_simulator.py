@@ -45,21 +45,22 @@ class CameraSimulator:
     readout : LineReadout
         Readout of the line. Without a triangulation it takes the triangulation of the view.
     exposure_time : float
-        Exposure time [s], 0 or more.
+        Exposure time [s], 0 or more. Default 1e-3.
     responsivity : float
         Responsivity of the pixels [A/W], 0 or more. The number of electrons is the charge over the elementary charge.
+        Default 0.4.
     gain : float
-        Conversion gain [grey levels per electron], > 0.
+        Conversion gain [grey levels per electron], > 0. Default 0.01.
     offset : float
-        Grey level without light, 0 or more.
+        Grey level without light, 0 or more. Default 0.0.
     read_noise : float
-        Standard deviation of a pixel without light [electrons], 0 or more.
+        Standard deviation of a pixel without light [electrons], 0 or more. Default 0.0.
     full_well : float
         Capacity of a pixel [electrons], > 0. Infinite: only the number of bits limits the grey level.
     bits : {8, 10, 12, 14, 16}
-        Bits of a grey level: 8, 10, 12, 14 or 16. Frames of more than 8 bits are uint16.
+        Bits of a grey level: 8, 10, 12, 14 or 16. Frames of more than 8 bits are uint16. Default 8.
     ambient : float
-        Power of the ambient light on every profile, uniform along u [W], 0 or more.
+        Power of the ambient light on every profile, uniform along u [W], 0 or more. Default 0.0.
     mask : Mask, optional
         Mask before the pixels, for example a region of interest that follows the line.
     limits : AlignmentLimits
@@ -135,6 +136,7 @@ class CameraSimulator:
             expected grey levels, float32.
         first_profile : int
             Number of the first profile of the block. The noise of a profile depends on the seed and its number only.
+            Default 0.
         """
         if seed is None:
             return self._expected(self.signal(total_exposure(self.detected_light(exposures))))

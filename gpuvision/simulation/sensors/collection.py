@@ -37,9 +37,9 @@ def image_irradiance(
     f_number
         N, > 0.
     magnification
-        m, 0 or more.
+        m, 0 or more. Default 0.0.
     angle
-        Angle between the chief ray and the optical axis [rad].
+        Angle between the chief ray and the optical axis [rad]. Default 0.0.
 
     Raises
     ------

@@ -50,7 +50,7 @@ class MaskLimits:
     ----------
     iterations : int
         Number of fixed-point iterations for the ends of a window. Each one reduces the error by the relative change of
-        the slope between the profile and the end of the window. Chosen.
+        the slope between the profile and the end of the window. Chosen. Default 30.
     """
 
     iterations: int = 30
@@ -66,7 +66,7 @@ class Mask:
         Lower and upper end of each window [sensor unit], float64 (samples, 2), or (profiles, samples, 2) for a mask
         that follows the part. None: no windows. A window with equal ends is closed.
     leak : float
-        Fraction of the light outside the window that passes, 0 to 1.
+        Fraction of the light outside the window that passes, 0 to 1. Default 0.0.
     transmission : numpy.ndarray, optional
         Transmission of each bin, float64 (samples, bins), 0 to 1. None: 1.
 
@@ -285,15 +285,16 @@ def optimise_mask(
         Ground truth, (profiles, samples).
     fixed : bool
         True: one window per sample for all profiles. False: one per sample and profile, a mask that follows the part.
+        Default True.
     objective : {"max", "rms"}
         Minimised quantity over the profiles of a sample: ``"rms"`` or ``"max"`` of the errors. With "max", one profile
         that no mask can improve leaves the other profiles as they are.
     min_passed_fraction : float
         Fraction of the valid light that must pass in every profile, > 0 and at most 1. At most half of the rest is cut
-        at either end.
+        at either end. Default 0.999.
     margin : float
         Distance of the window's ends from the valid light, for a mask with a positioning tolerance [sensor unit], 0
-        or more.
+        or more. Default 0.0.
 
     Returns
     -------

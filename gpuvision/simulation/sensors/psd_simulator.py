@@ -50,16 +50,17 @@ class PsdSimulator:
         Readout of the currents, layout "pairs". Dark level, gain, load, linearity and noise of the readout are
         simulated. Without a triangulation it takes the triangulation of the view.
     responsivity : float
-        Responsivity of the strips [A/W], 0 or more.
+        Responsivity of the strips [A/W], 0 or more. Default 0.4.
     ambient : float
         Power of the ambient light on every strip, uniform along u [W], 0 or more. Above 0 it replaces the background
-        photocurrent of the readout's noise model; that one is simulated as shot noise that no mask stops.
+        photocurrent of the readout's noise model; that one is simulated as shot noise that no mask stops. Default 0.0.
     modulated : bool
-        True: the light is modulated and demodulated, so that ambient light adds its shot noise only.
+        True: the light is modulated and demodulated, so that ambient light adds its shot noise only. Default False.
     mask : Mask, optional
         Mask before the strips.
     quantised : bool
         True: an analogue-to-digital converter makes uint16 codes of the currents, with a step of `readout.ampere`.
+        Default False.
     limits : AlignmentLimits
         Allowed differences between view and readout.
 
@@ -121,7 +122,7 @@ class PsdSimulator:
             Seed of the noise, 0 or more; the quantisation to codes is part of the noise. None: expected currents,
             float64.
         first_profile : int
-            Number of the first profile of the block.
+            Number of the first profile of the block. Default 0.
         """
         signal = self.signal(total_exposure(self.detected_light(exposures)))
         if seed is None:

@@ -44,9 +44,10 @@ class AlignmentLimits:
     ----------
     edge_tolerance : float
         Difference between the edges of the view and of the readout along u. Camera: fraction of a pixel. PSD: fraction
-        of half a strip. Chosen.
+        of half a strip. Chosen. Default 1e-6.
     pitch_tolerance : float
         Difference between the samples of the view and of the readout along v, as a fraction of the pitch. Chosen.
+        Default 1e-6.
     """
 
     edge_tolerance: float = 1e-6

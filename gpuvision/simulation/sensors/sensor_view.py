@@ -60,10 +60,10 @@ class ViewLimits:
     ----------
     spot_radius : float
         Radius of a blurred spot [standard deviations]; light beyond it is omitted. Derived: less than 3e-12 of a
-        Gaussian is farther away.
+        Gaussian is farther away. Default 7.0.
     min_off_sheet : float
         Least distance of the lens from the sheet of light, as a fraction of its distance from the sheet's origin.
-        Chosen.
+        Chosen. Default 1e-9.
     """
 
     spot_radius: float = 7.0
@@ -88,7 +88,7 @@ class SensorView:
     v_edges : numpy.ndarray
         Edges of the strips or columns along v, (samples + 1,), ascending [sensor unit].
     aperture : float
-        Diameter of the lens' aperture [m], > 0.
+        Diameter of the lens' aperture [m], > 0. Default 1e-3.
     axis : sequence of 3 floats, optional
         Direction of the lens' optical axis in the scene, (3,). None: towards the point of the sheet that the centre of
         the sensor sees.

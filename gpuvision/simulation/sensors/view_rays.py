@@ -50,7 +50,7 @@ class ViewRays:
         The scene, and a material for every index in `Scene.material`.
     nodes
         Nodes per bin along u and along v, 1 or more each. The quadrature of n nodes is exact to order 2 n for smooth
-        light in a bin, and of first order at the edge of a surface within a bin.
+        light in a bin, and of first order at the edge of a surface within a bin. Default ``(1, 1)``.
     device
         Device on which rays are traced; None: `Device.best`.
 

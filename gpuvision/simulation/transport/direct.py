@@ -47,13 +47,14 @@ class DirectLimits:
     ----------
     lobe_turn
         Turn of the half vector within a part of a line, in widths of the glossy lobe, beyond which the part is divided;
-        chosen so that the two-point rule resolves the lobe.
+        chosen so that the two-point rule resolves the lobe. Default 0.5.
     max_lobe_parts
-        Largest number of these divisions of a part; bounds the work.
+        Largest number of these divisions of a part; bounds the work. Default 256.
     tail_sigmas
-        Range of the Gaussian that is deposited [sigmas]; derived: 3e-12 of the light lies beyond.
+        Range of the Gaussian that is deposited [sigmas]; derived: 3e-12 of the light lies beyond. Default 7.0.
     same_point
         Distance below which two lit points are one, as part of the largest coordinate; rounding with a wide margin.
+        Default 1e-9.
     """
 
     lobe_turn: float = 0.5
@@ -165,7 +166,7 @@ class DirectLight:
         L
             Transport [m].
         causes
-            Whether the light for the attribution of errors is returned as well.
+            Whether the light for the attribution of errors is returned as well. Default False.
 
         Returns
         -------

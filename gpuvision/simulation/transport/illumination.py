@@ -31,10 +31,10 @@ class MergeLimits:
     ----------
     end_gap : float
         Largest distance between two ends that touch, as a fraction of their coordinates. Derived: some roundings of
-        double.
+        double. Default 1e-14.
     agreement : float
         Largest difference between the normals, and relative difference between the powers, of merged segments. Chosen:
-        far above rounding, far below the errors of a scan.
+        far above rounding, far below the errors of a scan. Default 1e-9.
     """
 
     end_gap: float = 1e-14
@@ -185,7 +185,7 @@ class LightSheet:
         L : float
             Transport [m].
         offset : float
-            Distance across the sheet, along the transport, added to L [m].
+            Distance across the sheet, along the transport, added to L [m]. Default 0.0.
         """
         return self.illuminate_all(scene, [L + offset])[0]
 

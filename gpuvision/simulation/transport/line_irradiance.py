@@ -39,7 +39,7 @@ class SegmentLimits:
     ----------
     max_normal_cosine : float
         Largest cosine of the angle between a segment and its normal; the segment must lie in its surface. Chosen: above
-        the rounding of inputs in single.
+        the rounding of inputs in single. Default 1e-5.
     """
 
     max_normal_cosine: float = 1e-5

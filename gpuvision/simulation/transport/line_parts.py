@@ -44,10 +44,10 @@ class VisibilityLimits:
     ----------
     max_intervals : int
         Number of visible intervals of a segment that one run of the kernel returns. Chosen for speed: a segment with
-        more intervals is halved.
+        more intervals is halved. Default 8.
     max_halvings : int
         Largest number of times that a segment is halved; a part that still has too many intervals counts as hidden.
-        Derived: 2^-20 is a millionth of the segment.
+        Derived: 2^-20 is a millionth of the segment. Default 20.
     """
 
     max_intervals: int = 8
@@ -135,7 +135,7 @@ class LensVisibility:
         lens
             Position of the lens [m], (3,) for all segments or (m, 3).
         with_hidden
-            Whether hidden parts are returned as well, with `Parts.visible` False.
+            Whether hidden parts are returned as well, with `Parts.visible` False. Default False.
         """
         count = len(line.power)
         lens = np.broadcast_to(lens, (count, 3))

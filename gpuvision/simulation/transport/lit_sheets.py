@@ -80,7 +80,7 @@ class SheetLighting:
         t
             (levels,): position of the level across the sheet [sigmas].
         with_hidden
-            Whether hidden parts are returned as well, with `Parts.visible` False.
+            Whether hidden parts are returned as well, with `Parts.visible` False. Default False.
         """
         lit = self.illuminate(transports[profile] + self.sheet.sigma * t, transports[profile])
         return lit, self.visible_parts(lit, with_hidden=with_hidden)

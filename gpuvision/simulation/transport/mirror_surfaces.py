@@ -29,12 +29,12 @@ class MirrorLimits:
     ----------
     flat_angle
         Sine of the angle between a corner's normal and the triangle's above which the triangle is part of a curved
-        mirror; rounding of normals with a wide margin.
+        mirror; rounding of normals with a wide margin. Default 1e-6.
     max_halvings
-        Number of times that a segment with more visible parts than the kernel returns is halved.
+        Number of times that a segment with more visible parts than the kernel returns is halved. Default 12.
     clearance
         Distance from a surface within which nothing occludes a ray, as part of the scene's reach; about one rounding in
-        single.
+        single. Default 1e-7.
     crease
         Angle between neighbouring triangles above which their edge is sharp [rad], of `smooth_normals`; chosen.
     min_height

@@ -120,7 +120,7 @@ class Mirrors:
             Sheet of light, for the lines that mirrors light on other surfaces; None: only lines seen in mirrors are
             included.
         offset
-            Distance of the sheet from the sensor's transport [m].
+            Distance of the sheet from the sensor's transport [m]. Default 0.0.
         """
         if not self.has_mirrors:
             return self.view.dark()

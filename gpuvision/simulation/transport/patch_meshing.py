@@ -28,24 +28,27 @@ class MeshingLimits:
     Attributes
     ----------
     small
-        Triangles whose longest edge is below this part of the patch size are joined.
+        Triangles whose longest edge is below this part of the patch size are joined. Default 0.5.
     max_triangles
-        More joined triangles than this are replaced by an outline.
+        More joined triangles than this are replaced by an outline. Default 8.
     thickness
-        Largest distance of the joined triangles from the outline's plane, as part of the patch size.
+        Largest distance of the joined triangles from the outline's plane, as part of the patch size. Default 0.25.
     one_way
         Least length of the vector sum of the triangles' areas, as part of their area: they face roughly one way.
+        Default 0.7.
     least_fill
-        Least area of the outline before it is scaled, as part of the triangles' area.
+        Least area of the outline before it is scaled, as part of the triangles' area. Default 0.2.
     slack
         Distance before an outline within which nothing occludes it, in units of the triangles' largest distance from
-        its plane: a grazing ray meets the surface earlier.
+        its plane: a grazing ray meets the surface earlier. Default 4.0.
     grading
         Graded meshes: longest edge of a triangle, as part of its distance from the nearest surface that faces it.
+        Default 1.0.
     least_size
-        Graded meshes: least longest edge, as part of the patch size.
+        Graded meshes: least longest edge, as part of the patch size. Default 0.25.
     max_graded
         Graded meshes: largest number of large triangles, beyond which a mesh is not graded; bounds time and memory.
+        Default 2000.
     """
 
     small: float = 0.5

@@ -36,20 +36,21 @@ class DivisionLimits:
     ----------
     edge_sigmas
         Range about the sheet's middle in which edges divide it [sigmas]; derived: 6e-5 of the light lies beyond.
+        Default 4.0.
     max_edges
-        Largest number of edges that divide a sheet, the longest ones; bounds the work.
+        Largest number of edges that divide a sheet, the longest ones; bounds the work. Default 16.
     edge_gap
-        Least distance between two divisions [sigmas].
+        Least distance between two divisions [sigmas]. Default 1e-4.
     max_divisions, max_levels
         Largest number of places per sheet at which it is divided where runs of the lit or visible line begin or end,
         and of levels that are computed to find them; they bound the work on rough surfaces, where errors of single
-        edges average out. Chosen: an edge takes 8 levels.
+        edges average out. Chosen: an edge takes 8 levels. Defaults 4 and 32.
     division_width
         Distance of two levels at which the search for such a place ends [sigmas]. Derived: half of it moves a reading
-        of half a beam by 0.0016 sigma.
+        of half a beam by 0.0016 sigma. Default 0.005.
     outer_slab
         Place across the sheet beyond which the light is a separate slab, where an end of a run moves within the sheet
-        [sigmas]; derived: 5e-4 of the light lies beyond.
+        [sigmas]; derived: 5e-4 of the light lies beyond. Default 3.5.
     """
 
     edge_sigmas: float = 4.0

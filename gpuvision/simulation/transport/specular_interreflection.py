@@ -33,13 +33,13 @@ class InterreflectionLimits:
     ----------
     sheet_decimals : int
         Number of decimals, in units of the scene's reach, to which two mirrored sheets must agree to count as one.
-        Derived: the rounding of double with a margin of some ten thousand.
+        Derived: the rounding of double with a margin of some ten thousand. Default 11.
     on_mirror : float
         Points nearer to a mirror than this fraction of the source's distance, or of the scene's reach, lie on it.
-        Derived: some thousand roundings of double.
+        Derived: some thousand roundings of double. Default 1e-12.
     max_halvings : int
         Largest number of times that a step is halved between two rays off a curved mirror that meet different
-        triangles. Chosen: 2^-12 of a step.
+        triangles. Chosen: 2^-12 of a step. Default 12.
     """
 
     sheet_decimals: int = 11

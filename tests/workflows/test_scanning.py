@@ -74,6 +74,7 @@ def test_a_tilted_line_before_a_camera(device: Device) -> None:
     assert np.all(done.intensity >= 180)
 
 
+@pytest.mark.double
 def test_double_precision_and_single_agree(device: Device) -> None:
     frames = currents(6)
     single, double = (scan(frames, Sensor.load("psd_line"), device=device, precision=p) for p in ("single", "double"))
@@ -286,10 +287,11 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_the_command_scans(tmp_path: Path, run: Any) -> None:
     np.save(tmp_path / "plane.npy", currents(12))
-    out, trace = tmp_path / "out", tmp_path / "trace.json"
+    out, trace, device = tmp_path / "out", tmp_path / "trace.json", Device.best()
+    precision = "double" if device.has_double else "single"
     ran = run(
-        "scan", tmp_path / "plane.npy", "--sensor", "psd_line", "--out", out, "--device", Device.best().label,
-        "--precision", "double", "--rate", "1000", "--policy", "block", "--trace", trace,
+        "scan", tmp_path / "plane.npy", "--sensor", "psd_line", "--out", out, "--device", device.label,
+        "--precision", precision, "--rate", "1000", "--policy", "block", "--trace", trace,
     )  # fmt: skip
     assert (ran.code, ran.err) == (0, "")
     assert {each.name for each in out.iterdir()} == FILES | {"range_image_sigma.tiff"}  # the sensor gives its noise
@@ -297,7 +299,7 @@ def test_the_command_scans(tmp_path: Path, run: Any) -> None:
     assert re.search(r"sigma of z [0-9.e+-]+ um random \(readout .* um, transport 0 um\); systematic unknown", ran.out)
     assert str(out / "picture.png") in ran.out
     report = json.loads((out / "report.json").read_text())
-    assert (report["precision"], report["rate"], report["stream"]["policy"]) == ("double", 1000.0, "block")
+    assert (report["precision"], report["rate"], report["stream"]["policy"]) == (precision, 1000.0, "block")
     assert report["recording"] == str(tmp_path / "plane.npy")
     assert json.loads(trace.read_text())["traceEvents"]
 

@@ -63,6 +63,7 @@ def test_a_slope(device: Device) -> None:
     assert report["valid_fraction"] == pytest.approx(25 / 30)
 
 
+@pytest.mark.double
 @pytest.mark.parametrize("geometry", ["stage", "lens"])
 def test_noise_scatters_the_heights_by_their_sigma(
     device: Device, geometry: str, rng: np.random.Generator, tmp_path: Path
@@ -136,8 +137,9 @@ def test_what_to_try(device: Device) -> None:
         scan(np.zeros((5, 8, 8), np.uint8), sensor(), device=device)
 
 
-def test_double_precision() -> None:
-    single, double = (scan(slope_frames()[0], sensor(), precision=each) for each in ("single", "double"))
+@pytest.mark.double
+def test_double_precision(device: Device) -> None:
+    single, double = (scan(slope_frames()[0], sensor(), device=device, precision=each) for each in ("single", "double"))
     assert (single.points.z.dtype, double.points.z.dtype) == (np.float32, np.float64)
     np.testing.assert_allclose(single.points.z, double.points.z, rtol=0, atol=1e-10)
 

@@ -38,6 +38,16 @@ def test_lengths_have_units_of_few_digits(length, name):
     assert picture.length_unit(length)[1] == name
 
 
+@pytest.mark.parametrize(
+    ("span", "text"), [(9.95, "0.00 to 9.95"), (10.05, "0.0 to 10.1"), (0.0, "0.000000 to 0.000000")]
+)
+def test_heights_are_stated_to_a_hundredth_of_their_range(span, text):
+    """And to 1e-8 of the unit where they are equal."""
+    z = np.array([[0.0, 0.5001], [1.0, np.nan]]) * span * 1e-3
+    unit = "mm" if span else "µm"
+    assert picture._subtitle(z, "2 × 2") == f"2 × 2  ·  75.0 % measured  ·  heights {text} {unit}"
+
+
 def test_light_falls_from_the_upper_left():
     x, y = np.meshgrid(np.arange(20.0), np.arange(15.0))
     shades = {

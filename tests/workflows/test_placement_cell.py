@@ -1,11 +1,16 @@
-"""Report of the scatter of a head at rest."""
+"""Report of the scatter of a head at rest, and the move that identifies its vibration."""
 
 from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from gpuvision.workflows.placement_cell import Repeatability
+from gpuvision.workflows import placement_cell
+from gpuvision.workflows.placement_cell import PlacementCell, Repeatability
 
 NAMES = ("x_m", "y_m", "theta_rad")
 
@@ -32,3 +37,48 @@ def test_one_frame_has_no_scatter_and_no_frame_no_mean() -> None:
     assert one["mean"] == dict.fromkeys(NAMES, 1.0)
     for values in (one["measured_sigma"], none["measured_sigma"], none["mean"]):
         assert np.isnan(list(values.values())).all()
+
+
+def test_vibration_is_identified_in_twelve_periods_of_the_slowest_resonance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The head waits after its response; a placement may take that much longer. A rigid axis does not count."""
+
+    def changed(old: Any, **changes: Any) -> Any:
+        return SimpleNamespace(**{**vars(old), **changes})
+
+    monkeypatch.setattr(placement_cell, "replace", changed)
+    monkeypatch.setattr(placement_cell, "Settling", SimpleNamespace)
+    monkeypatch.setattr(placement_cell, "predicted_frames", lambda machine, start: 20)
+    started: list[float] = []
+
+    def vibration(record: Any, start: float) -> Any:
+        started.append(start)
+        return np.array([[30.0, 20.0, 0.0], [0.02, 0.03, 0.0]])
+
+    monkeypatch.setattr(placement_cell, "vibration_of_loop", vibration)
+    machine: Any = SimpleNamespace(
+        axes=[SimpleNamespace(resonance=2.0 * math.pi * frequency) for frequency in (30.0, 20.0, 0.0)],
+        period=1e-3,
+        landing=0.25,
+        swing=(0.0, 0.0, 0.0),
+        tolerance=SimpleNamespace(max_time=1.0),
+        settling=SimpleNamespace(rule="vibration", frequency=None, damping=None),
+        pipette_in_camera=SimpleNamespace(pose=None),
+    )
+    cell = object.__new__(PlacementCell)
+    cell.machine = machine
+    steered: list[Any] = []
+
+    def steer(moved: Any, *_: Any) -> Any:
+        steered.append(moved)
+        return SimpleNamespace(released=True, record=None, first_pose=0.5), None
+
+    monkeypatch.setattr(cell, "_steer", steer)
+    cell.identify(np.zeros(3))
+    (moved,) = steered
+    wait = 20e-3 + 12 / 20.0
+    assert (moved.settling.rule, moved.settling.wait) == ("fixed", pytest.approx(wait))
+    assert moved.tolerance.max_time == pytest.approx(1.0 + wait + 0.25)
+    assert started == [pytest.approx(0.52)]
+    assert cell.machine.settling.rule == "vibration"
+    assert cell.machine.settling.frequency == (30.0, 20.0, 0.0)
+    assert cell.machine.settling.damping == (0.02, 0.03, 0.0)

@@ -156,6 +156,11 @@ def test_a_folder_that_others_may_write_is_not_used(board: Path, cache: Path) ->
     assert artwork_cache.load_artwork(entry.stem) is None
 
 
+def test_size_of_the_folder_is_the_documented_one() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "reference" / "environment.md").read_text()
+    assert f"The folder `artwork` has at most {artwork_cache._MAX_BYTES // 2**20} MiB" in text
+
+
 def test_oldest_entries_are_removed(board: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read_artwork(board, layers=LAYERS)
     (first,) = entries(cache)

@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpuvision.camera.orthographic import BoardView
-from gpuvision.matching.board.edge_measurement import _reason_of, move_view
+from gpuvision.matching.board import edge_measurement
+from gpuvision.matching.board.edge_measurement import BoardMeasurer, _reason_of, move_view
 from gpuvision.matching.board.measurement_result import MeasurementLimits
 from gpuvision.status import Status
 
@@ -58,3 +59,29 @@ def test_reasons_of_a_refused_pose(status: Status, inlier_fraction: float, lever
     values = {"status": np.uint8(status), "inlier_fraction": inlier_fraction, "leverage": leverage, "inliers": 5}
     fit: Any = types.SimpleNamespace(**{name: np.array(value) for name, value in values.items()})
     assert re.search(words, _reason_of(fit, 12, MeasurementLimits()))
+
+
+@pytest.mark.parametrize(
+    ("distance", "is_first", "search_px"),
+    [(3e-4, True, 17.5), (3e-3, True, 152.5), (4e-3, True, 190.0), (3e-4, False, 4)],
+)
+def test_range_in_which_fiducials_are_searched(
+    monkeypatch: pytest.MonkeyPatch, distance: float, is_first: bool, search_px: float
+) -> None:
+    """Their distance, three sigmas of the etch bias and the slack; at most 190 px, in the second pass 4 px."""
+    monkeypatch.setattr(edge_measurement, "search_distance", lambda *_: np.array([0.5, 1.0]) * distance)
+    monkeypatch.setattr(edge_measurement, "find_fiducials", lambda *_, **how: how["search_px"])
+    device: Any = None
+    features: Any = types.SimpleNamespace(fiducials=types.SimpleNamespace(point=None), placement=None, imaging=None)
+    measurer = BoardMeasurer(
+        np.zeros((2, 2), np.float32),
+        features,
+        noise=1.0,
+        threshold=10.0,
+        blur_px=1.0,
+        etch_bias_sigma=10e-6,
+        device=device,
+        limits=MeasurementLimits(),
+    )
+    view: Any = types.SimpleNamespace(scale=20e-6)
+    assert measurer._find_fiducials(view, "bright", is_first=is_first) == pytest.approx(search_px)

@@ -39,7 +39,7 @@ def test_lengths_have_units_of_few_digits(length, name):
 
 
 @pytest.mark.parametrize(
-    ("span", "text"), [(9.95, "0.00 to 9.95"), (10.05, "0.0 to 10.1"), (0.0, "0.000000 to 0.000000")]
+    ("span", "text"), [(9.95, "0.00 to 9.95"), (10.05, "0.0 to 10.1"), (0.0, "0.00000000 to 0.00000000")]
 )
 def test_heights_are_stated_to_a_hundredth_of_their_range(span, text):
     """And to 1e-8 of the unit where they are equal."""

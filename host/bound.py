@@ -13,6 +13,7 @@ import pyopencl as cl
 import pyopencl.array
 
 from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
+from gpuvision.host.constant_memory import fitting_defines
 from gpuvision.host.device import Device
 from gpuvision.host.failure import launch_failure
 from gpuvision.host.launch import Launch, Launchable, Spec, describe_launch
@@ -339,7 +340,7 @@ class Bound(Generic[R]):
             self.device,
             operation.kernel_folder,
             launch.source,
-            launch.defines,
+            fitting_defines(launch, queue.device, operation.kernel_folder, operation.include_folders),
             include_folders=operation.include_folders,
             handle=queue.device,
         )

@@ -201,7 +201,7 @@ static inline int fit_step(private const blob_edges *edges, blob_layout layout, 
 
 // Triples of rulers for start shapes: offsets of the second and third ruler in sixteenths of the contour.
 #define PATTERNS 4
-constant const int pattern[PATTERNS][2] = {{4, 8}, {5, 10}, {3, 6}, {2, 6}};
+__constant int pattern[PATTERNS][2] = {{4, 8}, {5, 10}, {3, 6}, {2, 6}};
 #define START_STEPS 3
 #define WRAPPED (PADDED_SPOKES + SPOKES + LANES)
 

@@ -73,7 +73,7 @@ def _light(scene: Scene) -> Iterator[Example]:
     for dtype in _TYPES:
         kind = np.dtype(dtype)
         yield Example(f"irradiance {kind}", LineIrradiance(segments=segments), (10_000, 6), dtype)
-        strips = OccludedIrradiance(scene=scene, segments=64)
+        strips = OccludedIrradiance(scene=scene, segments=6)
         yield Example(f"intervals {kind}", strips, (100, 64, 6), dtype)
         yield Example(f"rays {kind}", replace(strips, visibility="rays"), (100, 64, 6), dtype)
         for name, occluders in (("", None), (", occluders", scene)):
@@ -82,12 +82,12 @@ def _light(scene: Scene) -> Iterator[Example]:
             light = PatchLight(patches=patches, scene=occluders)
             yield Example(f"light {kind}{name}", light, (1000, 6), dtype)
     yield Example("single from double", LineIrradiance(segments=segments, precision="single"), (10_000, 6), np.float64)
-    chosen = OccludedIrradiance(scene=scene, segments=64, selected=1000)
+    chosen = OccludedIrradiance(scene=scene, segments=6, selected=40)
     yield Example("selected", chosen, (100, 64, 6))
     yield Example("selected, rays", replace(chosen, visibility="rays"), (100, 64, 6))
     yield Example("selected, no double", chosen, (100, 64, 6), has_double=False)
     yield Example("irradiance, no double", LineIrradiance(segments=segments), (10_000, 6), has_double=False)
-    open_light = OccludedIrradiance(scene=scene, segments=64, visibility="none")
+    open_light = OccludedIrradiance(scene=scene, segments=6, visibility="none")
     yield Example("no occlusion", open_light, (100, 64, 6))
     for occluders in (None, scene):
         for clusters in (False, True):
@@ -111,10 +111,10 @@ def _board_images() -> Iterator[Example]:
     sensor = CmosSensor(
         rows=1024, columns=1024, pitch=1e-5, quantum_efficiency=0.5, gain=0.025, dark_noise=20.0, full_well=2e4, bits=8
     )
-    clean = RenderBoard(board=board, shape=(256, 256))
+    clean = RenderBoard(board=board, shape=(24, 37))
     noisy = replace(clean, sensor=sensor, electrons=8000.0)
     worn = replace(sensor, prnu=0.01, dsnu=2.0, nonlinearity=0.01)
-    glare = np.zeros((256, 256), np.float32)
+    glare = np.zeros((24, 37), np.float32)
     more: dict[str, Any] = {"glare": glare, "mirrored": True, "model": CAMERAS["k1 k2 p k3"], "exposure": 1e-3}
     poses = (4, 8, 3)
     yield Example("reflectance", clean, poses, np.float64)

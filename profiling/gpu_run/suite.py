@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
 from gpuvision.host import Device
 
 _ROOT = Path(__file__).resolve().parents[2]
+_SUMMARY_SECONDS = 20.0  # time in which interrupted tests end the current test and print the summary (chosen)
 _OUTCOME = re.compile(r"(\d+) (passed|failed|errors?|skipped|xfailed|deselected)\b")
 
 
@@ -26,15 +29,26 @@ def run(device: Device, seconds: float, *selection: str) -> dict[str, Any]:
     command = [sys.executable, "-m", "pytest", "-q", "-rfE", "--tier", "fast"]
     command += selection or ["-k", f"[{device.label}"]
     environment = os.environ | {"GPUVISION_DEVICE": device.label, "PYTHONPATH": str(_ROOT)}
+    with (
+        tempfile.TemporaryFile("w+") as log,
+        subprocess.Popen(command, cwd=_ROOT, env=environment, stdout=log, stderr=subprocess.DEVNULL) as tests,
+    ):
+        end = _end_of(tests, seconds)
+        log.seek(0)
+        return {"end": end, **read_summary(log.read())}
+
+
+def _end_of(tests: subprocess.Popen[bytes], seconds: float) -> str:
+    """Wait for the tests and return how they ended; tests that are interrupted before the limit print a summary."""
     try:
-        ran = subprocess.run(
-            command, cwd=_ROOT, env=environment, capture_output=True, text=True, timeout=seconds, check=False
-        )
-        text, end = ran.stdout, f"exit code {ran.returncode}"
-    except subprocess.TimeoutExpired as expired:
-        text = expired.stdout.decode(errors="replace") if isinstance(expired.stdout, bytes) else expired.stdout or ""
-        end = f"no end within {seconds:.0f} s"
-    return {"end": end, **read_summary(text)}
+        return f"exit code {tests.wait(max(seconds - _SUMMARY_SECONDS, 0.5 * seconds))}"
+    except subprocess.TimeoutExpired:
+        tests.send_signal(signal.SIGINT)
+    try:
+        tests.wait(_SUMMARY_SECONDS)
+    except subprocess.TimeoutExpired:  # a kernel or the driver does not return
+        tests.kill()
+    return f"no end within {seconds:.0f} s"
 
 
 def read_summary(text: str) -> dict[str, Any]:

@@ -111,15 +111,15 @@ def _board_images() -> Iterator[Example]:
     sensor = CmosSensor(
         rows=1024, columns=1024, pitch=1e-5, quantum_efficiency=0.5, gain=0.025, dark_noise=20.0, full_well=2e4, bits=8
     )
-    clean = RenderBoard(board=board, shape=(24, 37))
+    clean = RenderBoard(board=board, shape=(5, 19))
     noisy = replace(clean, sensor=sensor, electrons=8000.0)
     worn = replace(sensor, prnu=0.01, dsnu=2.0, nonlinearity=0.01)
-    glare = np.zeros((24, 37), np.float32)
+    glare = np.zeros((5, 19), np.float32)
     more: dict[str, Any] = {"glare": glare, "mirrored": True, "model": CAMERAS["k1 k2 p k3"], "exposure": 1e-3}
-    poses = (4, 8, 3)
+    poses = (2, 8, 3)
     yield Example("reflectance", clean, poses, np.float64)
     yield Example("noise", noisy, poses, np.float64)
-    yield Example("no noise", replace(noisy, noise=False), (4, 1, 3), np.float32)
+    yield Example("no noise", replace(noisy, noise=False), (2, 1, 3), np.float32)
     yield Example("pixel differences, glare, lens", replace(noisy, sensor=worn, **more), poses, np.float64)
     twelve = replace(noisy, sensor=replace(sensor, bits=12, gain=0.2))
     yield Example("12 bits", twelve, poses, np.float64)

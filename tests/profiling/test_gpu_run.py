@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+import subprocess
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -153,6 +155,34 @@ def test_summary_of_the_suite() -> None:
     }
 
 
+class Running:
+    """Process that ends when it is interrupted, or only when it is killed."""
+
+    def __init__(self, ends: bool) -> None:
+        self.calls: list[Any] = []
+        self._ends = ends
+
+    def wait(self, seconds: float) -> int:
+        self.calls.append(seconds)
+        if signal.SIGINT in self.calls and self._ends:
+            return 2
+        raise subprocess.TimeoutExpired("pytest", seconds)
+
+    def send_signal(self, number: int) -> None:
+        self.calls.append(number)
+
+    def kill(self) -> None:
+        self.calls.append("killed")
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_suite_is_interrupted_before_its_limit(ends: bool) -> None:
+    """Interrupted tests print their summary; tests that do not react are killed."""
+    running: Any = Running(ends)
+    assert suite._end_of(running, 570.0) == "no end within 570 s"
+    assert running.calls == [550.0, signal.SIGINT, 20.0, *([] if ends else ["killed"])]
+
+
 @pytest.mark.slow
 def test_suite_runs_on_the_device(device: Device) -> None:
     result = suite.run(device, 120.0, "tests/host/test_probe.py")
@@ -169,5 +199,7 @@ def test_each_step_writes_its_part(device: Device, tmp_path: Path, monkeypatch: 
     assert steps.main([*common, "--step", "times"]) == 0
     whole = json.loads(out.read_text())
     assert (whole["build"]["examples"], whole["times"]["seconds"]) == (3, 5.0)
+    assert steps.main([*common, "--step", "times", "--begun", str(time.time() - 2.0)]) == 0
+    assert 1.0 <= json.loads(out.read_text())["times"]["seconds"] <= 3.0  # the start of the process took 2 s or more
     assert whole["machine"]["device"] == device.label
     assert [*tmp_path.iterdir()] == [out]

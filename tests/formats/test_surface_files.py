@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import hashlib
 import struct
 import zipfile
@@ -67,6 +68,40 @@ def test_a_sur_of_holes_and_zeros_can_be_read(tmp_path):
     heights = np.array([[-7e-3, 2e-3]])  # the hole's integer is below the smallest height
     write_sur(tmp_path / "low.sur", heights, pair)
     np.testing.assert_allclose(read(tmp_path / "low.sur")[0].T, heights, atol=7e-3 / 2**30)
+
+
+def test_header_of_a_sur(tmp_path, z):
+    """Every number of the header of 512 bytes, at the offsets that Gwyddion reads (surffile.c)."""
+    before = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    write_sur(tmp_path / "map.sur", z, GRID)
+    after = datetime.datetime.now(datetime.UTC)
+    header = (tmp_path / "map.sur").read_bytes()[:512]
+
+    def numbers(kind, offset, count):
+        return list(struct.unpack_from(f"<{count}{kind}", header, offset))
+
+    assert header[:12] == b"DIGITAL SURF"
+    assert numbers("H", 12, 4) == [0, 1, 1, 2]  # format of a PC, objects, version, kind: surface
+    assert numbers("H", 80, 5) == [0, 0, 1, 1, 1]  # material, acquisition, range, holes, absolute heights
+    assert numbers("f", 90, 2) == [0.0, 0.0]  # resolution and slope of the gauge
+    assert numbers("H", 98, 1) == [32]  # bits
+    heights = np.frombuffer((tmp_path / "map.sur").read_bytes()[512:], "<i4")
+    stored = heights[heights != heights.min()]
+    assert numbers("i", 100, 2) == [min(stored.min(), 0), max(stored.max(), 0)]
+    assert heights.min() == min(stored.min(), 0) - 2  # holes
+    assert numbers("I", 108, 3) == [7, 5, 35]
+    assert numbers("f", 120, 3) == pytest.approx([0.02, 0.03, np.nanmax(z) * 1e6 / 2**30], rel=1e-6)
+    texts = [header[place : place + 16].decode("latin-1").rstrip() for place in range(132, 276, 16)]
+    assert texts == ["X", "Y", "Z", "mm", "mm", "µm", "mm", "mm", "µm"]
+    assert numbers("f", 276, 3) == [1.0, 1.0, 1.0]  # ratios of the units of steps and lengths
+    assert numbers("H", 288, 3) == [0, 0, 0]  # imprint, inversion, levelling
+    second, minute, hour, day, month, year, weekday = numbers("H", 306, 7)
+    written = datetime.datetime(year, month, day, hour, minute, second, tzinfo=datetime.UTC)
+    assert before <= written <= after
+    assert weekday == int(written.strftime("%w"))
+    assert numbers("f", 320, 1) == [0.0]  # duration
+    assert numbers("H", 334, 2) == [0, 0]  # sizes of a comment and of a private zone
+    assert numbers("f", 466, 3) == pytest.approx([-2.0, 5.0 - 4 * 0.03, 0.0], abs=1e-6)  # offsets
 
 
 def test_units_of_steps_and_lengths_of_a_sur_are_the_same(tmp_path, z):

@@ -7,7 +7,7 @@ from gpuvision.host.arrays import Array, DeviceArray, FloatArray, HostArray, Int
 from gpuvision.host.batch import Batch
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
-from gpuvision.host.device_choice import DeviceChoice, fastest_device
+from gpuvision.host.device_choice import DeviceChoice, StepDevices, fastest_device
 from gpuvision.host.errors import (
     BuildError,
     DeviceLimitError,
@@ -99,6 +99,7 @@ __all__ = [
     "Stall",
     "StatusArray",
     "Step",
+    "StepDevices",
     "StreamError",
     "StreamReport",
     "Trace",

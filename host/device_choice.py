@@ -6,19 +6,25 @@ this time.
 
 from __future__ import annotations
 
+import functools
+import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from typing import Any
 
 from gpuvision.host.arrays import HostArray
 from gpuvision.host.device import Device, requested_device
 from gpuvision.host.errors import GpuVisionError
+from gpuvision.host.kept_numbers import driver_key, kept_number
 from gpuvision.host.operation import Operation
 
 # Calls that bind the operation and fill the caches, and timed calls, of which the median counts. Chosen: pauses of a
 # shared machine hit a few calls.
 _WARM_UP, _CALLS = 3, 15
+# The same of a step of a job, and the time after which no more runs start [s] (chosen): a step takes up to a second.
+_STEP_WARM_UP, _STEP_CALLS, _STEP_SECONDS = 1, 5, 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,11 +34,11 @@ class DeviceChoice:
     Attributes
     ----------
     operation : str
-        Class of the operation.
+        Class of the operation, or name of the step of a job.
     device : Device
         Fastest device.
     seconds : mapping of str to float
-        Median time of a call on NumPy arrays [s], by the label of each measured device.
+        Median time of a call on NumPy arrays [s], by the label of each measured device; empty without a choice.
     unusable : mapping of str to str
         First line of the error of each device that cannot run the operation, by its label.
     """
@@ -43,6 +49,8 @@ class DeviceChoice:
     unusable: Mapping[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
+        if not self.seconds:
+            return f"{self.operation} on {self.device.label}"
         others = [f"{label} {1e6 * s:.3g} us" for label, s in self.seconds.items() if label != self.device.label]
         others += [f"{label} is not usable: {reason}" for label, reason in self.unusable.items()]
         against = f" ({', '.join(others)})" if others else ""
@@ -101,28 +109,110 @@ def fastest_device(operation: Operation[Any], *inputs: HostArray, devices: Seque
     >>> choice = gv.fastest_device(gv.PsdReadout(strip_length=6e-3), np.ones((1000, 2), np.float32))
     >>> reading = gv.PsdReadout(strip_length=6e-3)(np.ones((1000, 2), np.float32), device=choice.device)
     """
+
+    def seconds(device: Device) -> float:
+        return _median_seconds(lambda: operation(*inputs, device=device), _WARM_UP, _CALLS)
+
+    return _choose(type(operation).__name__, devices or candidate_devices(), seconds)
+
+
+class StepDevices:
+    """Devices of the steps of a job, such as the location of a board: each step runs where it is fastest.
+
+    Parameters
+    ----------
+    device : Device or None
+        Device of all steps. ``None``: of the best GPU and the best CPU device the faster one for each step, where both
+        exist and ``GPUVISION_DEVICE`` is not set; otherwise `Device.best`.
+
+    Attributes
+    ----------
+    choices : dict of str to DeviceChoice
+        Device and measured times of each step so far, by name.
+
+    Raises
+    ------
+    NoDeviceError
+        There is no healthy device.
+    """
+
+    def __init__(self, device: Device | None) -> None:
+        self._candidates = candidate_devices() if device is None else (device,)
+        self.choices: dict[str, DeviceChoice] = {}
+
+    @property
+    def first(self) -> Device:
+        """Given device, or the best one."""
+        return self._candidates[0]
+
+    def choose(self, step: str, run: Callable[[Device], object], *size: object) -> Device:
+        """Return the device of a step.
+
+        Parameters
+        ----------
+        step : str
+            Name of the step.
+        run : function
+            Runs the step on a device. It is called only to measure: where there are two devices to choose from, and
+            their times for this step and size are not kept from an earlier measurement.
+        *size : object
+            What determines the cost of the step, such as shape and dtype of an image.
+
+        Notes
+        -----
+        Times are kept in the cache folder for the version of gpuvision and of the driver. A measurement takes some
+        runs of the step, or about 0.2 s.
+        """
+        if len(self._candidates) == 1:
+            self.choices[step] = DeviceChoice(operation=step, device=self.first, seconds={})
+        else:
+            self.choices[step] = _choose(step, self._candidates, lambda device: _kept_seconds(step, run, size, device))
+        return self.choices[step].device
+
+    def report(self) -> dict[str, Any]:
+        """Return device and measured times [s] of each step for JSON."""
+        return {
+            name: {"device": each.device.label, "seconds": dict(each.seconds), "unusable": dict(each.unusable)}
+            for name, each in self.choices.items()
+        }
+
+
+def _kept_seconds(step: str, run: Callable[[Device], object], size: tuple[object, ...], device: Device) -> float:
+    """Return the median time of a step on a device [s], measured now or before."""
+    key = (version("gpuvision"), device.label, *driver_key(device.handle), step, *size)
+    measure = functools.partial(_median_seconds, lambda: run(device), _STEP_WARM_UP, _STEP_CALLS, _STEP_SECONDS)
+    return kept_number("step_seconds.json", key, measure)
+
+
+def _choose(name: str, devices: Sequence[Device], seconds: Callable[[Device], float]) -> DeviceChoice:
+    """Return the device with the least time; leave out the devices that cannot run the operation."""
     measured: dict[Device, float] = {}
     failures: dict[str, Exception] = {}
-    for each in devices or candidate_devices():
+    for each in devices:
         try:
-            measured[each] = _seconds(operation, inputs, each)
+            measured[each] = seconds(each)
         except (GpuVisionError, ValueError) as error:
             failures[each.label] = error
     if not measured:
         raise next(iter(failures.values()))
     return DeviceChoice(
-        operation=type(operation).__name__,
+        operation=name,
         device=min(measured, key=measured.__getitem__),
         seconds={each.label: s for each, s in measured.items()},
         unusable={label: str(error).partition("\n")[0] for label, error in failures.items()},
     )
 
 
-def _seconds(operation: Operation[Any], inputs: Sequence[HostArray], device: Device) -> float:
-    """Return the median time of a call [s]."""
-    times = []
-    for _ in range(_WARM_UP + _CALLS):
+def _median_seconds(call: Callable[[], object], warm_up: int, calls: int, limit: float = math.inf) -> float:
+    """Return the median time of a call [s], of fewer calls where they take longer than a limit together [s]."""
+    times: list[float] = []
+    begun = time.perf_counter()
+    while len(times) < warm_up + calls:
         start = time.perf_counter()
-        operation(*inputs, device=device)
-        times.append(time.perf_counter() - start)
-    return sorted(times[_WARM_UP:])[_CALLS // 2]
+        call()
+        end = time.perf_counter()
+        times.append(end - start)
+        if len(times) > warm_up and end - begun > limit:
+            break
+    timed = sorted(times[warm_up:])
+    return timed[len(timed) // 2]

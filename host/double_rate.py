@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import json
 import math
 import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
-from gpuvision.host.cache import cache_folder, read_private, write_private
+from gpuvision.host.kept_numbers import driver_key, kept_number
 
 # Doubles are slow where a multiply-add takes longer than this many multiply-adds of floats. Derived: a sum or a product
 # of two floats (kernels/common/two_float.h) takes 8 to 20 operations. GPUs have doubles at 1/2 to 1/16 or at 1/32 to
@@ -64,15 +60,11 @@ def double_ratio(handle: Any) -> float:
         return math.inf
     if handle.type & cl.device_type.CPU:
         return 2.0
-    key = _key(handle)
-    kept = _read()
-    if key not in kept:
-        ratio = _seconds(handle, np.float64) / _seconds(handle, np.float32)
-        kept = _read() | {key: ratio}
-        # Without a writable cache each process measures again.
-        with contextlib.suppress(OSError):
-            write_private(_file(), json.dumps(kept, indent=1))
-    return kept[key]
+    return kept_number(
+        "double_rates.json",
+        (*driver_key(handle), _SOURCE),
+        lambda: _seconds(handle, np.float64) / _seconds(handle, np.float32),
+    )
 
 
 def _seconds(handle: Any, real: type[np.floating[Any]]) -> float:
@@ -88,22 +80,3 @@ def _seconds(handle: Any, real: type[np.floating[Any]]) -> float:
     events = [cl.enqueue_nd_range_kernel(queue, kernel, (_ITEMS,), None) for _ in range(1 + _LAUNCHES)]
     queue.finish()
     return min(1e-9 * max(event.profile.end - event.profile.start, 1) for event in events[1:])
-
-
-def _key(handle: Any) -> str:
-    parts = (handle.platform.name, handle.platform.version, handle.name, handle.driver_version)
-    return hashlib.sha256(repr(parts).encode() + _SOURCE.encode()).hexdigest()[:24]
-
-
-def _file() -> Path:
-    return cache_folder() / "double_rates.json"
-
-
-def _read() -> dict[str, float]:
-    """Return the kept ratios by key, without damaged entries."""
-    try:
-        read = json.loads(read_private(_file()) or "{}")
-    except (ValueError, RecursionError):
-        return {}
-    entries = read.items() if isinstance(read, dict) else ()
-    return {key: float(ratio) for key, ratio in entries if isinstance(ratio, int | float) and ratio > 0}

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import pyopencl as cl
+import pytest
+
+from gpuvision.host import Device, device_choice
 
 
 @dataclass(eq=False)
@@ -35,3 +40,17 @@ class FakePlatform:
         if not self.devices:
             raise cl.LogicError("clGetDeviceIDs", -1, "DEVICE_NOT_FOUND")
         return self.devices
+
+
+def list_gpu(device: Device, costs: Mapping[tuple[str, str], float], monkeypatch: pytest.MonkeyPatch) -> Device:
+    """List a device named "gpu" before a CPU device, with the costs of steps by step and label; return it."""
+    gpu = copy.copy(device)
+    gpu.label, gpu.is_cpu = "gpu", False
+
+    def seconds(step: str, run: Callable[[Device], object], size: tuple[object, ...], on: Device) -> float:
+        run(on)
+        return costs[step, on.label]
+
+    monkeypatch.setattr(device_choice, "candidate_devices", lambda: (gpu, device))
+    monkeypatch.setattr(device_choice, "_kept_seconds", seconds)
+    return gpu

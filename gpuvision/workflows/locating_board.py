@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ from gpuvision.camera.image import estimate_pixel_noise, grey_image
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.camera.undistort_image import UndistortImage
-from gpuvision.host import Device, to_numpy
+from gpuvision.host import Device, StepDevices, to_numpy
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.board.copper_support import find_other_pose
 from gpuvision.matching.board.edge_measurement import BoardMeasurer, move_view
@@ -139,7 +140,7 @@ def locate_board(
         Whether copper is "bright" or "dark" relative to its surroundings; "auto": the polarity with more agreeing
         rulers.
     device
-        Where to run; None: `Device.best`.
+        Where to run; None: `Device.best`, and beside a GPU the faster device for each step (`StepDevices`).
     limits
         Thresholds of the decisions.
 
@@ -160,8 +161,7 @@ def locate_board(
     if copper not in COPPER:
         raise ValueError(f"copper is {copper!r}, expected one of {', '.join(COPPER)}")
     levels = _levels(grey, noise, threshold)
-    device = Device.best() if device is None else device
-    job = _Job(grey, artwork, *levels, blur_px, etch_bias_sigma, device, limits)
+    job = _Job(grey, artwork, *levels, blur_px, etch_bias_sigma, StepDevices(device), limits)
     view = _initial_view(initial_pose, artwork, scale, grey.shape, model)
     expected = job.register(view, _search_range(search_range, initial_pose is not None, scale, features, limits))
     return job.locate(expected, job.select_features(expected, budget) if features is None else features, copper)
@@ -242,7 +242,7 @@ class _Job:
     threshold: float
     blur_px: float
     etch_bias_sigma: float
-    device: Device
+    devices: StepDevices
     limits: LocalizationLimits
     clock: _Clock = field(default_factory=_Clock)
 
@@ -262,7 +262,9 @@ class _Job:
             threshold=self.threshold,
         )
         self.clock.record("prepare registration")
-        found = search(self._undistorted(view.model), device=self.device)
+        image = self._undistorted(view.model)
+        device = self._device_of("registration", lambda device: search(image, device=device), *reach)
+        found = search(image, device=device)
         self.clock.record("registration")
         shift = max(limits.registered_range[0], limits.registered_range_px * view.scale)
         left = (shift, limits.registered_range[1])
@@ -283,7 +285,12 @@ class _Job:
         if model is None:
             return self.grey
         undistort = UndistortImage(model=model, border="replicate")
-        return np.asarray(to_numpy(undistort(self.grey, device=self.device).image))
+        device = self._device_of("undistort", lambda device: undistort(self.grey, device=device))
+        return np.asarray(to_numpy(undistort(self.grey, device=device).image))
+
+    def _device_of(self, step: str, run: Callable[[Device], object], *size: object) -> Device:
+        """Return the device of a step on this image; `size`: what else determines its cost."""
+        return self.devices.choose(step, run, self.grey.shape, self.grey.dtype.str, *size)
 
     def select_features(self, expected: _ExpectedPose, budget: int) -> FeatureSet:
         """Select the features of the view at the expected pose."""
@@ -301,10 +308,17 @@ class _Job:
 
     def locate(self, expected: _ExpectedPose, features: FeatureSet, copper: Copper) -> LocatedBoard:
         """Measure the features; where it is not known whether copper is bright or dark, try both."""
-        measurer = BoardMeasurer(
-            self.grey, features, self.noise, self.threshold, self.blur_px, self.etch_bias_sigma, self.device
-        )
         kinds: tuple[Copper, ...] = ("bright", "dark") if copper == "auto" else (copper,)
+
+        def measurer_on(device: Device) -> BoardMeasurer:
+            return BoardMeasurer(
+                self.grey, features, self.noise, self.threshold, self.blur_px, self.etch_bias_sigma, device
+            )
+
+        def measure_on(device: Device) -> BoardMeasurement:
+            return measurer_on(device).measure(expected.view, kinds[0])
+
+        measurer = measurer_on(self._device_of("rulers", measure_on, len(features.length)))
         measurements = [(kind, measurer.measure(expected.view, kind)) for kind in kinds]
         kind, measurement = max(measurements, key=lambda each: (not each[1].reason, each[1].agreeing))
         reason = expected.reason or measurement.reason
@@ -377,7 +391,8 @@ class _Job:
             threshold=self.threshold,
             reason=reason,
             coarse_registration=coarse_registration,
-            device=self.device,
+            device=self.devices.choices["rulers"].device,
+            steps=self.devices.report(),
             seconds=self.clock.seconds,
             warnings=(*self.artwork.warnings, *solution.warnings),
             scale_error=solution.scale_error,

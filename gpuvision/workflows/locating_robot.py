@@ -25,7 +25,7 @@ from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.camera.image import grey_image
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
-from gpuvision.host import Device
+from gpuvision.host import Device, StepDevices
 from gpuvision.host.array_files import read_array
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.image_files import read_image
@@ -113,7 +113,7 @@ def locate_robot(
     margin
         Width of the border around the field in which the robot may be [m]; None: a twentieth of the field's length.
     device
-        Where to run; None: `Device.best`.
+        Where to run; None: `Device.best`, and beside a GPU the faster device for the search (`StepDevices`).
     limits
         Thresholds of the decisions.
 
@@ -135,23 +135,24 @@ def locate_robot(
     both. Clutter that replaces points on lines also does both, but it thins out all lines alike: such a pose is
     accepted where no whole line is missing (`RobotLimits.min_least_seen`).
     """
-    device = Device.best() if device is None else device
+    devices = StepDevices(device)
     start = time.perf_counter()
     scan = points if isinstance(points, FloorScan) else None
     used = _usable(points.points if isinstance(points, FloorScan) else points)
-    kept: dict[str, Any] = {"points": used, "field": field, "scale": scale, "device": device}
+    kept: dict[str, Any] = {"points": used, "field": field, "scale": scale, "device": devices.first}
     if len(used) < limits.min_points:
         reason = f"{len(used)} points on lines, expected {limits.min_points} or more"
         return LocatedRobot(candidates=(), doubtful=(), evidence=None, reason=reason, seconds={}, **kept)
-    field_map = _search_map(field, used, margin, device)
+    field_map = _search_map(field, used, margin, devices.first)
     mapped = time.perf_counter()
-    found = find_pose_candidates(
-        field_map,
-        used,
-        initial_pose=initial_pose,
-        max_candidates=max(max_candidates, limits.min_refined),
-        device=device,
-    )
+    most = max(max_candidates, limits.min_refined)
+
+    def search(device: Device) -> tuple[PoseCandidate, ...]:
+        return find_pose_candidates(field_map, used, initial_pose=initial_pose, max_candidates=most, device=device)
+
+    size = (field_map.cells.level.shape, len(used), initial_pose is None, most)
+    kept["device"] = devices.choose("search", search, *size)
+    found = search(kept["device"])
     paths, wide = (None, default_line_width(field)) if scan is None else (scan.paths, scan.line_width)
     how: dict[str, Any] = {
         "scale": field_map.scale,
@@ -166,6 +167,7 @@ def locate_robot(
         doubtful=ordered[:1] if reason else (),
         evidence=weights[0] if weights else None,
         reason=reason,
+        steps=devices.report(),
         seconds={"map": mapped - start, "search": time.perf_counter() - mapped},
         **kept,
     )

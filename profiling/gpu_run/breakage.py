@@ -29,7 +29,7 @@ def run(device: Device, seconds: float) -> dict[str, Any]:
             if time.monotonic() > end:
                 results[case.__name__] = "not reached"
                 continue
-            answer = worker.call(case, device.label, seconds=_SECONDS)
+            answer = worker.call(case, device.label, seconds=min(_SECONDS, max(end - time.monotonic(), 1.0)))
             results[case.__name__] = f"FAILED: {answer.failure}" if answer.failure else answer.value
     failed = [name for name, result in results.items() if result.startswith("FAILED")]
     return {"failed": failed, "results": results}

@@ -39,7 +39,9 @@ def run(device: Device, seconds: float) -> dict[str, Any]:
         for number in range(count):
             if time.monotonic() > end:
                 break
-            answer = worker.call(build_example, device.label, number, seconds=_SECONDS)
+            answer = worker.call(
+                build_example, device.label, number, seconds=min(_SECONDS, max(end - time.monotonic(), 1.0))
+            )
             rows.append(answer.value or {"case": f"example {number}", "failure": answer.failure})
     outcomes = Counter("refused" if "refused" in row else "failed" if row.get("failure") else "built" for row in rows)
     return {"examples": count, **outcomes, "not_reached": count - len(rows), "rows": rows}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import time
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,9 +18,11 @@ from gpuvision.host import (
     DeviceLostError,
     DeviceMemoryError,
     PlanLimits,
+    StepDevices,
     StreamError,
     device_choice,
     fastest_device,
+    kept_numbers,
     plan_stream,
     planning,
 )
@@ -54,7 +57,7 @@ def test_small_work_runs_on_the_cpu_beside_a_gpu(gpu: Device, device: Device) ->
     assert set(found.seconds) == {"gpu", device.label}
     assert found.seconds["gpu"] > 3e-2 > found.seconds[device.label]
     assert str(found).startswith(f"SlowCalls on {device.label}, ")
-    assert "(gpu 3" in str(found)
+    assert str(found).endswith(f" us (gpu {1e6 * found.seconds['gpu']:.3g} us)")
 
 
 def test_named_device_is_the_only_one(gpu: Device, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,3 +163,61 @@ def test_plan_takes_the_device_that_keeps_up(gpu: Device, device: Device, measur
     measured["gpu"] = Cost(60.0, 1e-2, 1e-5)
     with pytest.raises(StreamError, match="the fastest, 1 frames, does 60 frames/s"):
         plan()
+
+
+@pytest.fixture
+def kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """File of the kept times of steps."""
+    monkeypatch.setattr(kept_numbers, "cache_folder", lambda: tmp_path)
+    return tmp_path / "step_seconds.json"
+
+
+def test_each_step_runs_where_it_is_fastest(gpu: Device, device: Device, kept: Path) -> None:
+    """Two steps on a device that pretends to be a GPU: one is slow there, the other one on the CPU."""
+    runs: list[tuple[str, str]] = []
+
+    def slow_on(label: str, step: str) -> Any:
+        def run(on: Device) -> None:
+            runs.append((step, on.label))
+            time.sleep(3e-2 if on.label == label else 0.0)
+
+        return run
+
+    for _ in range(2):  # the second job takes the kept times
+        devices = StepDevices(None)
+        assert devices.choose("rulers", slow_on("gpu", "rulers"), (480, 640), "u1") is device
+        assert devices.choose("undistort", slow_on(device.label, "undistort"), (480, 640), "u1") is gpu
+        assert set(runs) == {(step, on) for step in ("rulers", "undistort") for on in ("gpu", device.label)}
+        counted = len(runs)
+        assert json.loads(json.dumps(devices.report()))["rulers"]["device"] == device.label
+        assert devices.choices["rulers"].seconds["gpu"] > 3e-2 > devices.choices["rulers"].seconds[device.label]
+    assert len(runs) == counted
+    assert len(json.loads(kept.read_text())) == 4
+    StepDevices(None).choose("rulers", slow_on("gpu", "rulers"), (48, 64), "u1")
+    assert len(runs) > counted
+
+
+def test_steps_on_a_given_device_are_not_measured(gpu: Device, device: Device, kept: Path) -> None:
+    devices = StepDevices(device)
+    assert (devices.first, devices.choose("rulers", pytest.fail, 3)) == (device, device)
+    assert str(devices.choices["rulers"]) == f"rulers on {device.label}"
+    assert devices.report() == {"rulers": {"device": device.label, "seconds": {}, "unusable": {}}}
+    assert not kept.exists()
+
+
+def test_a_step_leaves_out_a_device_that_cannot_run_it(gpu: Device, device: Device, kept: Path) -> None:
+    def run(on: Device) -> None:
+        if on is gpu:
+            raise BuildError("no\nlog")
+
+    devices = StepDevices(None)
+    assert devices.choose("rulers", run) is device
+    assert devices.report()["rulers"]["unusable"] == {"gpu": "no"}
+
+
+def test_a_damaged_file_of_kept_times_is_replaced(gpu: Device, device: Device, kept: Path) -> None:
+    for damage in ("", "[]", "{", '{"k": "fast", "l": -1, "m": 1e999}'):
+        kept.write_text(damage)
+        kept.chmod(0o600)
+        assert StepDevices(None).choose("rulers", lambda on: time.sleep(1e-2 * (on is gpu))) is device
+        assert len(json.loads(kept.read_text())) == 2

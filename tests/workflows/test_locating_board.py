@@ -18,6 +18,7 @@ import pytest
 
 from board_images import BoardPicture, View
 from boards import BOARD_MIDDLE, LAYERS, board_folder
+from fakes import list_gpu
 from floors import floor_image
 from gpuvision.camera.image import estimate_pixel_noise, grey_image
 from gpuvision.camera.lens import Lens
@@ -304,6 +305,31 @@ def test_a_board_is_searched_where_it_is_not_known(artwork: Artwork, device: Dev
     assert np.abs(errors_in_sigmas(located, pose)).max() < SIGMAS
 
 
+def test_each_step_runs_on_its_fastest_device(
+    artwork: Artwork, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The report names device and costs of each step; the result does not depend on the choice."""
+    costs = {("registration", "gpu"): 1e-3, ("registration", device.label): 2e-3}
+    costs |= {("rulers", "gpu"): 3e-3, ("rulers", device.label): 1e-4}
+    image = camera_image(artwork, (BOARD_MIDDLE[0] + 1.3e-3, BOARD_MIDDLE[1] - 0.9e-3, 0.05))
+    how: dict[str, Any] = {"scale": PIXEL, "initial_pose": (*BOARD_MIDDLE, 0.0), "search_range": (2e-3, 0.09)}
+    alone = locate_board(image, artwork, **how, device=device)
+    assert alone.report()["steps"]["rulers"] == {"device": device.label, "seconds": {}, "unusable": {}}
+    list_gpu(device, costs, monkeypatch)
+    located = locate_board(image, artwork, **how)
+    assert located.device is device
+    assert (located.reason, located.pose) == ("", alone.pose)
+    chosen = {"registration": "gpu", "rulers": device.label}
+    assert located.report()["steps"] == {
+        step: {
+            "device": label,
+            "seconds": {"gpu": costs[step, "gpu"], device.label: costs[step, device.label]},
+            "unusable": {},
+        }
+        for step, label in chosen.items()
+    }
+
+
 @pytest.mark.parametrize(
     ("image", "words"),
     [
@@ -375,7 +401,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> L
 POSE_KEYS = {
     "gpuvision", "status", "reason", "warnings", "side", "pose", "sigmas", "covariance", "placement",
     "predicted_covariance", "etch_bias", "residual_scale", "condition", "scale", "scale_error", "copper", "noise",
-    "threshold", "coarse_registration", "counts", "rulers", "fiducials", "device", "seconds",
+    "threshold", "coarse_registration", "counts", "rulers", "fiducials", "device", "steps", "seconds",
 }  # fmt: skip
 COUNT_KEYS = {"in_image", "found", "used", "fiducials_in_image", "fiducials_found", "fiducials_used"}
 RULER_KEYS = {"point", "image_px", "found", "weight", "residual", "sigma", "status"}

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fakes import list_gpu
 from floors import GREEN, WHITE, floor_image
 from gpuvision.camera.lens import Lens
 from gpuvision.cli import main as cli
@@ -153,6 +154,18 @@ def test_fields_are_found(spots: int, share: float, device: Device, rng: np.rand
         evidence = located.report()["evidence"]
         assert evidence["log10_nfa"] < -3.0
         assert evidence["expected"] > 20
+
+
+def test_the_search_runs_on_its_fastest_device(
+    device: Device, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field = read_field("robocup_msl")
+    scan = scan_floor(seen_from(field, (-6.0, 2.0, 0.7), rng), scale=SCALE, line_width=WIDE, device=device)
+    gpu = list_gpu(device, {("search", "gpu"): 1e-3, ("search", device.label): 2e-3}, monkeypatch)
+    located = locate_robot(scan, field)
+    assert located.device is gpu
+    seconds = {"gpu": 1e-3, device.label: 2e-3}
+    assert located.report()["steps"] == {"search": {"device": "gpu", "seconds": seconds, "unusable": {}}}
 
 
 def replaced(scan: FloorScan, share: float, rng: np.random.Generator) -> FloorScan:

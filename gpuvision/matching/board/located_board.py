@@ -60,7 +60,10 @@ class LocatedBoard:
         Error of the scale with its standard deviation: size of the board in the image over its size in the artwork,
         less 1; NaN where the features do not determine it.
     device
-        Device of the computation.
+        Device of the rulers, the fiducials and the pose.
+    steps
+        Device of each step, and the measured times of the devices that it was chosen from, by name; see
+        `StepDevices.report`.
     seconds
         Duration of each step, by name [s].
     warnings
@@ -85,6 +88,7 @@ class LocatedBoard:
     coarse_registration: Registration | None
     scale_error: ScaleError
     device: Device
+    steps: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
@@ -150,6 +154,7 @@ class LocatedBoard:
             "rulers": self._ruler_reports(),
             "fiducials": self._fiducial_reports(),
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
+            "steps": self.steps,
             "seconds": self.seconds,
         }
 

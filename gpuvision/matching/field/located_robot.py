@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -40,9 +41,12 @@ class LocatedRobot:
     reason
         Why the pose is refused; ``""`` where it is accepted.
     device
-        Where it ran.
+        Device of the search.
     seconds
         Duration of each step, by name [s].
+    steps
+        Device of each step, and the measured times of the devices that it was chosen from, by name; see
+        `StepDevices.report`.
     """
 
     candidates: tuple[PoseCandidate, ...]
@@ -54,6 +58,7 @@ class LocatedRobot:
     reason: str
     device: Device
     seconds: dict[str, float]
+    steps: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def summary(self) -> str:
         """Return one line for each candidate, or the reason of the refusal."""
@@ -91,6 +96,7 @@ class LocatedRobot:
             "scale": self.scale,
             "points": self.points.tolist(),
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
+            "steps": self.steps,
             "seconds": self.seconds,
         }
 

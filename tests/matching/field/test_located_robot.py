@@ -34,6 +34,7 @@ def located(device: Device, **changes: Any) -> LocatedRobot:
         "scale": 0.04,
         "reason": "",
         "device": device,
+        "steps": {"search": {"device": device.label, "seconds": {}, "unusable": {}}},
         "seconds": {"lines": 0.5},
     }
     return LocatedRobot(**{**values, **changes})
@@ -64,6 +65,7 @@ def test_report(device: Device) -> None:
         "scale": 0.04,
         "points": [[1.0, 2.0], [3.0, 4.0]],
         "device": {"label": device.label, "name": device.name, "driver": device.driver},
+        "steps": {"search": {"device": device.label, "seconds": {}, "unusable": {}}},
         "seconds": {"lines": 0.5},
     }
     refused = located(device, candidates=(), evidence=None, reason="no lines").report()

@@ -142,6 +142,22 @@ def test_covariance_is_what_is_measured(
     np.testing.assert_allclose(np.mean(result.residual_scale[good]), 1.0, atol=0.1)
 
 
+def test_a_given_scale_is_a_factor_on_the_sigmas(device: Device, rng: np.random.Generator) -> None:
+    """A power of two, so that all numbers are equal bit by bit."""
+    _, rows = scene(rng, 3, 16)
+    rows = rows.astype(np.float32)
+    wide = rows.copy()
+    wide[..., 6] *= 2.0
+    one, other = (
+        SolvePose(loss="least_squares", scale=scale, placement=PLACE, max_leverage=1.0)(each, device=device)
+        for scale, each in ((1.0, wide), (2.0, rows))
+    )
+    assert not one.status.any()
+    for name in ("pose", "covariance", "leverage", "condition", "weights", "status"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    np.testing.assert_array_equal(other.residual_scale, 2.0 * one.residual_scale)
+
+
 def information(rows: np.ndarray) -> np.ndarray:
     """Return the information of the rigid motion about PLACE of each set of rows, at no motion."""
     nx, ny, px, py, _, _, sigma = np.moveaxis(rows.astype(np.float64), -1, 0)

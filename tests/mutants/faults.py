@@ -48,6 +48,9 @@ _KERNEL_CHANGES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = 
 _APPEARANCE = re.compile(
     "figsize|height_ratios|width_ratios|fontsize|labelsize|labelpad|linewidths?|markersize|markeredgewidth|alpha"
 )
+# Lines of kernels that only choose which memory is loaded into the caches early: no result depends on them, and no
+# address is invalid ("Data prefetch does not generate faults if addr is invalid": GCC, `__builtin_prefetch`).
+_PREFETCH = re.compile(r"\bprefetch_\w+\(|__builtin_prefetch\(")
 _NO_CODE = re.compile(r"//[^\n]*|/\*.*?\*/|^[ \t]*#(?:[^\n]*\\\n)*[^\n]*", re.DOTALL | re.MULTILINE)
 
 
@@ -183,9 +186,10 @@ def _behaviour(text: str) -> str | None:
 
 
 def _kernel_fault(path: Path, rng: random.Random) -> Fault | None:
-    """Return a change of the code of a kernel file; comments and directives of the preprocessor stay."""
+    """Return a change of the code of a kernel file; comments, directives of the preprocessor and prefetches stay."""
     text = path.read_text()
     code = _NO_CODE.sub(lambda found: " " * len(found[0]), text)
+    code = "\n".join(" " * len(line) if _PREFETCH.search(line) else line for line in code.split("\n"))
     places = [(found, change) for pattern, change in _KERNEL_CHANGES for found in re.finditer(pattern, code)]
     if not places:
         return None

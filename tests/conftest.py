@@ -1,8 +1,8 @@
 """Devices, tiers and caches of the tests. Without an OpenCL device, tests that need one fail.
 
 The option ``--tier`` selects the tests. ``fast`` runs all tests without the mark ``slow`` on the best device, and a
-smoke set on every other device: one test for each kernel. Of kernel tests with several parameters it runs a covering
-design, of both variants of a kernel a few tests for each file, and of hypothesis tests fewer examples, see `tiers`.
+smoke set on every other device: one test for each kernel. Of tests with several parameters it runs a covering design,
+of both variants of a kernel a few tests for each file, and of hypothesis tests fewer examples, see `tiers`.
 ``full`` runs all tests on the best device; on every other device it runs no slow tests, and a covering design of
 products of three or more parameters. ``nightly`` runs all tests on every device, with more hypothesis examples.
 ``GPUVISION_DEVICE`` selects the best device, see `Device.best`.
@@ -59,6 +59,9 @@ LEAST_EXAMPLES = 10
 # New draws in every run; a failure prints how to repeat it. No deadline: a busy machine must not fail a test.
 hypothesis.settings.register_profile("unhurried", deadline=None, print_blob=True)
 hypothesis.settings.load_profile("unhurried")
+
+# Folders of tests that run whole commands, which draw pictures.
+_FOLDERS_OF_COMMANDS = ("cli", "docs", "workflows")
 
 DATA = ROOT.parent / "shared" / "data"
 # Reasons of skips that are expected with all extras and both CPU runtimes; ``--strict-skips`` fails on other reasons.
@@ -224,13 +227,14 @@ def draws(request: pytest.FixtureRequest) -> Draws:
     return lambda *counts: counts[min(place, len(counts) - 1)]
 
 
-@pytest.fixture
-def unrendered_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw figures without rendering them in the fast tier: for commands whose pictures other tests look at.
+@pytest.fixture(autouse=True)
+def _unrendered_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw the figures of commands without rendering them in the fast tier, if no mark ``rendered`` asks for pixels.
 
     Rendering and compressing a page takes 0.3 s of processor time, up to half of such a test.
     """
-    if request.config.getoption("tier") == "fast":
+    has_commands = request.path.parent.name in _FOLDERS_OF_COMMANDS
+    if has_commands and request.config.getoption("tier") == "fast" and not request.node.get_closest_marker("rendered"):
         blank = cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes()
         monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda _figure, file, **_options: file.write(blank))
 

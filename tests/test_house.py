@@ -20,6 +20,7 @@ import pytest
 
 import gpuvision
 from gpuvision.status import Status
+from source_trees import tree_of
 
 ROOT = Path(__file__).resolve().parents[1]
 # Installed package of each folder of the tree.
@@ -81,6 +82,7 @@ def test_wheel_holds_everything(wheel: zipfile.ZipFile) -> None:
     assert any(name.endswith(".cl") for name in expected)
 
 
+@pytest.mark.slow
 def test_installed_wheel_runs_outside_the_tree(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
     """The installed package finds its kernels, presets and version; the tree is not on the path."""
     target = tmp_path / "site"
@@ -103,6 +105,7 @@ def test_installed_wheel_runs_outside_the_tree(wheel: zipfile.ZipFile, tmp_path:
     assert f"\nVersion: {gpuvision.__version__}\n" in metadata.read_text()
 
 
+@pytest.mark.slow
 def test_source_distribution_holds_what_a_build_needs(tmp_path: Path) -> None:
     """Packages, kernels, presets, README and licence; tests and documentation stay in the repository."""
     source = _copy_of_the_sources(tmp_path / "source")
@@ -206,7 +209,7 @@ FLOOR = {package: number for number, packages in enumerate(FLOORS) for package i
 def _imported(path: Path) -> tuple[str, ...]:
     """Return the modules and names that a file imports."""
     names = []
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -278,7 +281,7 @@ def test_functions_without_types_are_compiled_by_numba() -> None:
         (path.name, node.name, any(ast.unparse(each).startswith("numba.njit(") for each in node.decorator_list))
         for path in _files("profiling")
         if path.suffix == ".py"
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(tree_of(path))
         if isinstance(node, ast.FunctionDef) and node.returns is None
     ]
     assert len(bare) > 20
@@ -304,7 +307,7 @@ def test_dataclasses_are_frozen() -> None:
     for _, path in _modules():
         # Most files need no parsing: each of their decorators has the flag in its line.
         is_suspect = re.search(r"^\s*@dataclass(?!.*frozen=True)", path.read_text(), re.M)
-        for node in ast.walk(ast.parse(path.read_text())) if is_suspect else ():
+        for node in ast.walk(tree_of(path)) if is_suspect else ():
             for each in node.decorator_list if isinstance(node, ast.ClassDef) else ():
                 if ast.unparse(each).startswith("dataclass") and "frozen=True" not in ast.unparse(each):
                     mutable.add(node.name)

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TypeVar
 
+from source_trees import tree_of
+
 ROOT = Path(__file__).resolve().parents[1]
 Node = TypeVar("Node", bound=ast.AST)
 _KINDS = (ast.ClassDef, ast.Call, ast.arguments, ast.JoinedStr)
@@ -52,7 +54,7 @@ def _all_nodes() -> dict[type[ast.AST], list[tuple[str, ast.AST]]]:
     found: dict[type[ast.AST], list[tuple[str, ast.AST]]] = {}
     for path in (each for folder in ("gpuvision", "host") for each in sorted((ROOT / folder).rglob("*.py"))):
         file = path.relative_to(ROOT).as_posix()
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, _KINDS):
                 found.setdefault(type(node), []).append((file, node))
     return found

@@ -189,26 +189,28 @@ def _has_usual_variant(item: pytest.Item) -> bool:
 
 
 def _designed(items: Sequence[pytest.Item], *, pairs: bool = False) -> Iterator[pytest.Item]:
-    """Yield a covering design of each kernel test, and all cases of other tests.
+    """Yield a covering design of the cases of each test.
 
     Most of a kernel test's time is compilation, once for each kernel variant, dtype and option. Of a test with two
     parameters the design holds each value, of a test with more each pair of values; the device is not a parameter.
-    Parameters that one mark lists together count as one, if the design is smaller then. With `pairs`, and in
-    ``tests/host``, which compiles little, it holds each pair of values in all cases.
+    Parameters that one mark lists together count as one: always in tests without a device, whose lists are chosen
+    examples, and in kernel tests if the design is smaller then. With `pairs`, and in ``tests/host``, which compiles
+    little, it holds each pair of values in all cases.
     """
     functions: dict[Any, list[pytest.Item]] = {}
     for item in items:
         functions.setdefault((item.parent, function_of(item), device_of(item)), []).append(item)
     for (_, _, device), cases in functions.items():
         single = [{name: value for name, value in _parameters_of(item).items() if name != "device"} for item in cases]
-        if device is None or _varying(single) < 2:
+        joined = _joined(cases) if single[0] else single
+        parameters = joined if device is None else single
+        if _varying(parameters) < 2:
             yield from cases
             continue
-        design = covering(single, 2)
+        design = covering(parameters, 2)
         if not (pairs or _is_of_host(cases[0])):
-            design = min(
-                (design, *(covering(each, 1) for each in (single, _joined(cases)) if _varying(each) == 2)), key=len
-            )
+            others = (joined,) if device is None else (single, joined)
+            design = min((design, *(covering(each, 1) for each in others if _varying(each) == 2)), key=len)
         yield from (cases[k] for k in design)
 
 

@@ -30,6 +30,7 @@ def correction_errors(found: Any, true: Any, points: np.ndarray, measured: np.nd
     return np.asarray(moved - true.undistort(points))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lines", "views"])
 def test_it_is_the_scatter_of_corrections(rng: np.random.Generator, kind: str) -> None:
     """The errors of the fits have the predicted covariance, inside and outside the measured points."""

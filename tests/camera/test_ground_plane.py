@@ -170,6 +170,7 @@ def test_files_say_how_it_is_mounted(tmp_path: Path) -> None:
             read_mounted(file, SHAPE)
 
 
+@pytest.mark.slow
 def test_the_command_takes_a_mounted_camera(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], rng: np.random.Generator
 ) -> None:

@@ -82,7 +82,8 @@ def test_fit_to_eight_points() -> None:
         fitted.covariance_at(sensor)
 
 
-@pytest.mark.parametrize("sigma", [pytest.param(None, marks=pytest.mark.slow), 20e-6])
+@pytest.mark.slow
+@pytest.mark.parametrize("sigma", [None, 20e-6])
 def test_covariance_covers_the_truth(sigma: float | None, rng: np.random.Generator) -> None:
     plane = reference.to_plane(grid(), P, Q).astype(np.float64)
     places = np.array([[640.0, 500.0], [30.0, 1000.0], [1279.0, 0.0]])

@@ -400,7 +400,8 @@ def test_device_arrays_bound_and_no_frames(device: Device, rng: np.random.Genera
     assert op(image[:0], device=device).image.shape == (0, 41, 61)
 
 
-@pytest.mark.parametrize("columns", [pytest.param(1008, marks=pytest.mark.slow), 1003])
+@pytest.mark.slow
+@pytest.mark.parametrize("columns", [1008, 1003])
 def test_batches_beyond_the_caches_are_the_same(device: Device, columns: int, rng: np.random.Generator) -> None:
     image = pixels(rng, (5, 1000, columns), np.float32)
     assert 2 * image.nbytes > device.cache_bytes

@@ -42,6 +42,7 @@ def quick_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(analysing_delay, "draw_delay", lambda path, _: Path(path).write_bytes(b"a picture"))
 
 
+@pytest.mark.rendered
 def test_parts_and_a_recording(tmp_path: Path) -> None:
     """The recording measures 0.4 ms more than the parts sum up to."""
     write_recording(tmp_path / "loop.csv", 2.4e-3)

@@ -57,7 +57,9 @@ def test_an_interrupt_while_it_loads_is_an_exit_code(module: str, number: int, c
 
 
 @posix
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143)]
+)
 def test_a_command_that_is_ended_leaves_nothing(number: int, code: int, tmp_path: Path) -> None:
     slow = "import gpuvision.workflows.scan_result, time\n"
     slow += "def still(*a, **k):\n    print('writing', flush=True)\n    time.sleep(60)\n"

@@ -95,6 +95,7 @@ def test_two_rulers_are_too_few(features: FeatureSet, tmp_path: Path) -> None:
         read_features(tmp_path / "features.toml")
 
 
+@pytest.mark.slow
 def test_budgets_are_kept(artwork: Artwork, device: Device) -> None:
     assert len(choose_features(artwork, REGION, IMAGING, budget=17).length) == 17
     in_pixels = choose_features(artwork, REGION, IMAGING, budget=5000, unit="px")
@@ -173,6 +174,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], fold
     return call
 
 
+@pytest.mark.rendered
 def test_the_command_writes_features_and_a_picture(tmp_path: Path, run: Select) -> None:
     arguments = ("--region", ROI, "--scale", "25um", "--budget", "25rulers", "--placement", "9mm,8mm")
     code, out, _ = run(*arguments, "--out", tmp_path / "chosen")

@@ -10,6 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from source_trees import tree_of
+
 ROOT = Path(__file__).resolve().parents[2]
 FILES = [path for folder in ("gpuvision", "host") for path in sorted((ROOT / folder).rglob("*.py"))]
 # ``name : type`` or ``name`` and the indented lines below it, in a section of numpydoc.
@@ -29,7 +31,7 @@ _SHARED = re.compile(r"\bDefaults\s(?P<values>[^ ]+(?:,\s[^ ]+)*\sand\s[^ ]+)\.$
 
 def _functions(path: Path) -> Iterator[tuple[str, str, dict[str, ast.expr]]]:
     """Yield name, docstring and defaults of each function and class of a module."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.FunctionDef):
             spec = node.args
             places = [*spec.posonlyargs, *spec.args]

@@ -202,6 +202,7 @@ def test_a_failed_comparison_leaves_its_arrays(folder: Path) -> None:
         np.testing.assert_array_equal(stored["expected"], expected)
 
 
+@pytest.mark.slow
 def test_a_failed_test_leaves_its_arrays(folder: Path, tmp_path: Path) -> None:
     """The hook of the tests' conftest dumps the arrays of the test function when a comparison fails."""
     (tmp_path / "conftest.py").write_text((Path(__file__).parents[1] / "conftest.py").read_text())

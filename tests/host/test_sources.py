@@ -326,6 +326,7 @@ def test_a_truncated_video_names_the_frame(video: Path) -> None:
         read_all(open_recording(video))
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_the_real_video(data: Path) -> None:
     source = open_recording(data / "laser" / "corner_scene_sweep.mp4", channel="red")

@@ -409,6 +409,7 @@ def test_bad_files_are_refused_in_one_line(kind: str, tmp_path: Path) -> None:
     assert peak < _MEMORY / 4  # nothing large was held
 
 
+@pytest.mark.slow
 def test_a_recording_is_unpacked_frame_by_frame(tmp_path: Path) -> None:
     """An archive of a gigabyte of zeros is a good recording, and needs memory for one frame of 10 MB."""
     outcomes, peak = run(_READ_RECORDING, zeros_npz(tmp_path))

@@ -82,6 +82,7 @@ def test_a_map_without_paste_is_refused(rng):
         align_apertures(np.full(grid.shape, np.nan), grid, apertures, SETTINGS, initial=here, search_range=(1e-4, 0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [4, 12])
 def test_the_covariance_of_few_deposits_is_their_variance(rng, count):
     """Mean covariance of 250 draws over the variance of the fitted motions: three parameters shrink the residuals."""

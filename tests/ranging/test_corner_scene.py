@@ -16,7 +16,7 @@ from gpuvision.ranging.range_image import RangeImage, RangePoints
 from gpuvision.ranging.regrid import Grid, Regrid
 from gpuvision.ranging.sheet_motion import RotatingSheet
 
-pytestmark = pytest.mark.realdata
+pytestmark = [pytest.mark.realdata, pytest.mark.slow]
 
 # x right, y up from the floor, z from the back wall towards the camera, which is 0.1 m beside the sheet's axis.
 GEOMETRY = RotatingSheet(

@@ -247,7 +247,9 @@ def electrons_as_currents(rng, draws, signal, background, place, spot, bandwidth
     return counts @ np.stack([0.5 - y, 0.5 + y], axis=-1) * reference.ELECTRON / window
 
 
-@pytest.mark.parametrize("ambient", [0.0, 2e-6, 20e-6, 200e-6])
+@pytest.mark.parametrize(
+    "ambient", [0.0, *(pytest.param(each, marks=pytest.mark.slow) for each in (2e-6, 20e-6)), 200e-6]
+)
 def test_sigma_with_background_light(device, rng, ambient):
     """The predicted sigma is the scatter of drawn electrons, also under ambient light of 100 times the signal."""
     draws, spot, bandwidth, amplifier, responsivity = 10_000, 50e-6, 1e6, 0.2e-9, 0.4

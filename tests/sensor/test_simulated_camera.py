@@ -97,6 +97,7 @@ def test_etendue_is_the_solid_angle_of_a_pixel(which: str, rng: np.random.Genera
     np.testing.assert_allclose(view.project(point), np.stack([u, v], axis=-1), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_scan_of_the_simulation_finds_the_part(device: Device, tmp_path: Any) -> None:
     """The readings of the simulated frames, triangulated with the camera, are the surface within the noise."""
     path = tmp_path / "part.stl"

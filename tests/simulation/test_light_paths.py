@@ -161,6 +161,7 @@ def test_bounces_are_left_out_where_they_cannot_matter(device):
     assert 0.0 < profile.statistics["bound of multi-bounce left out [m]"] <= 0.5e-3
 
 
+@pytest.mark.slow
 def test_the_error_of_the_patches_is_estimated(device):
     """The estimate contains the change of the readings when the patches become half as large."""
     made = {}

@@ -70,6 +70,7 @@ def test_lens_is_found_within_its_uncertainty(done: Calibration, seen: View) -> 
     assert after < 0.02 < 0.15 < before
 
 
+@pytest.mark.rendered
 def test_report_says_what_the_fit_says(done: Calibration, tmp_path: Path) -> None:
     write_calibration(done, tmp_path / "lens.toml")
     report = json.loads((tmp_path / "lens.json").read_text())
@@ -327,13 +328,18 @@ def test_wrong_region(image: Path, tmp_path: Path) -> None:
 @pytest.mark.realdata
 @pytest.mark.parametrize(
     ("name", "pattern", "best"),
-    [("dot_pattern_01", "dots", 0.079), ("dot_pattern_02", "dots", 0.691), ("line_pattern_01", "lines", 0.117)],
+    [
+        pytest.param("dot_pattern_01", "dots", 0.079, marks=pytest.mark.slow),
+        ("dot_pattern_02", "dots", 0.691),
+        pytest.param("line_pattern_01", "lines", 0.117, marks=pytest.mark.slow),
+    ],
 )
 def test_real_patterns_are_straighter_than_known(name: str, pattern: str, best: float, data: Path) -> None:
     done = calibrate([data / "calibration" / f"{name}.jpg"], pattern=pattern)
     assert done.straightness_px[1] <= best
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_real_chessboards(data: Path) -> None:
     files = sorted((data / "calibration" / "chessboard").glob("left*.jpg"))

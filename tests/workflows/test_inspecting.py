@@ -63,6 +63,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.rendered
 def test_the_paste_of_a_board(gerbers: Path, paste: Path, tmp_path: Path, run: Any) -> None:
     out = tmp_path / "out"
     ran = run(paste, "--board", gerbers, "--stencil=120um", *LAYERS, "--out", out, "--scale-sigma=0.01,0.002")

@@ -221,6 +221,7 @@ def test_the_search_range_decides_where_no_end_of_the_copper_is_in_view(tmp_path
     assert "the copper in the image fits as well 0.38 mm away" in far.reason
 
 
+@pytest.mark.slow
 def test_a_dense_board_names_a_pixel_that_would_do(tmp_path: Path) -> None:
     """Traces 0.2 mm wide and apart: at 60 um per pixel no edge has room, at the proposed pixel rulers have."""
     dense = dense_board(tmp_path, 10)
@@ -426,6 +427,7 @@ def test_the_threshold_is_given_or_from_noise_and_range(artwork: Artwork) -> Non
     assert (flat.threshold, flat.noise) == (1e-6, 0.0)
 
 
+@pytest.mark.rendered
 def test_the_command_writes_pose_and_picture(folder: Path, artwork: Artwork, tmp_path: Path, run: Locate) -> None:
     pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 2e-3)
     cv2.imwrite(str(tmp_path / "board.png"), camera_image(artwork, pose))

@@ -79,7 +79,8 @@ def is_consistent(total: float, numbers: int) -> bool:
     return bool(0.9**2 * low <= total <= 1.1**2 * high)
 
 
-@pytest.mark.parametrize("board", [pytest.param("rounds", marks=pytest.mark.slow), "mixed"])
+@pytest.mark.slow
+@pytest.mark.parametrize("board", ["rounds", "mixed"])
 def test_errors_are_as_promised(board: str, device: Device, request: pytest.FixtureRequest) -> None:
     """Errors agree with the predictions of the selection and with the covariance of each pose."""
     artwork, rng = request.getfixturevalue(board), np.random.default_rng(5)

@@ -17,8 +17,6 @@ from gpuvision.status import Status
 from mesh_heights import mesh_heights
 from scanning import Ran
 
-pytestmark = pytest.mark.usefixtures("unrendered_pictures")
-
 # A wall from y = 0 to 1.5 mm, 3 mm high: the first sensor (at y < 0) does not see the plate behind it, the second one
 # (at y > 0) not the plate before it.
 WALL = (0.0, 1.5e-3, 3e-3)

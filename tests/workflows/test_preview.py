@@ -61,6 +61,7 @@ def test_a_short_recording_is_shown_as_a_whole() -> None:
     assert [frame.number for frame in found.frames] == [0, 1, 2]
 
 
+@pytest.mark.rendered
 def test_the_picture_shows_line_and_flags(tmp_path: Path) -> None:
     found = preview_scan(recording(), daylight())
     found.write(tmp_path)

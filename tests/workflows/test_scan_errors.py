@@ -34,8 +34,6 @@ from gpuvision.workflows.scan_errors import (
 from gpuvision.workflows.scan_result import Scan
 from gpuvision.workflows.scanning import scan
 
-pytestmark = pytest.mark.usefixtures("unrendered_pictures")
-
 READ_NOISE, GAIN, JITTER = 1.5, 0.1, 20e-6
 PRESETS = Path(__file__).parents[2] / "gpuvision" / "presets" / "sensors"
 

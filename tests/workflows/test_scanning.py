@@ -230,6 +230,7 @@ def test_a_scan_ends_at_a_stall_where_no_frame_may_be_lost(sensor_clock: SensorC
         scan(endless, Sensor.load("psd_line"), rate=400.0, policy="raise", progress=stall)
 
 
+@pytest.mark.rendered
 def test_files_hold_what_was_scanned(tmp_path: Path) -> None:
     done = scan(two_lines(), Sensor.load("camera_line"))
     out = tmp_path / "a" / "b"

@@ -19,8 +19,6 @@ from gpuvision.workflows.preview import preview_scan
 from gpuvision.workflows.scanning import scan
 from scanning import line_frames
 
-pytestmark = pytest.mark.usefixtures("unrendered_pictures")
-
 ROWS = 20.0 + 0.5 * np.arange(8)[:, None] + np.linspace(0.0, 3.0, 480)
 
 

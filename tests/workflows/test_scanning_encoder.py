@@ -20,8 +20,6 @@ from gpuvision.status import Status
 from gpuvision.workflows.scanning import scan
 from scanning import Ran, check_refused, currents
 
-pytestmark = pytest.mark.usefixtures("unrendered_pictures")
-
 PSD: dict[str, Any] = tomllib.loads(
     resources.files("gpuvision").joinpath("presets", "sensors", "psd_line.toml").read_text(encoding="utf-8")
 )

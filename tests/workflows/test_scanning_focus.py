@@ -21,8 +21,6 @@ from gpuvision.workflows.scan_result import SCAN_FILES
 from gpuvision.workflows.scanning import scan
 from scanning import Ran, check_refused
 
-pytestmark = pytest.mark.usefixtures("unrendered_pictures")
-
 STAGE = {"stage_start": 0.0, "stage_step": 50e-6, "pixel_size": 10e-6, "measure": "intensity"}
 
 

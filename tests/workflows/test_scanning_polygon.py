@@ -15,8 +15,6 @@ from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.simulated import require_light
 from gpuvision.workflows.scanning import scan
 
-pytestmark = pytest.mark.usefixtures("unrendered_pictures")
-
 SAMPLES, PROFILES, LENGTH = 61, 8, 6e-3
 C1, C2, C3 = 12.0, 0.05, -20.0  # h = (C1 u + C2)/(C3 u + 1)
 

@@ -24,8 +24,6 @@ from gpuvision.workflows.simulating import load_part, prepare_simulation
 from mesh_heights import mesh_heights
 from scanning import Ran, check_refused
 
-pytestmark = pytest.mark.usefixtures("unrendered_pictures")
-
 Float64 = npt.NDArray[np.float64]
 
 

@@ -88,6 +88,7 @@ def test_a_bent_sheet_scans_the_whole_part(bend: float) -> None:
     np.testing.assert_allclose(task.transports[[0, -1]], expected, atol=1e-12)
 
 
+@pytest.mark.rendered
 def test_what_is_read_is_told_apart_by_cause(part_file: Path, light: Path, tmp_path: Path) -> None:
     done = simulate(task_of(part_file), light, seed=None)
     attribution = done.attribution

@@ -64,6 +64,7 @@ def test_a_track_from_a_known_pose_is_certain(drive: tuple[np.ndarray, np.ndarra
     assert [state.time for state in track.states] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
 
 
+@pytest.mark.rendered
 def test_the_command_writes_the_track(
     drive: tuple[np.ndarray, np.ndarray],
     tmp_path: Path,

@@ -84,6 +84,7 @@ def test_a_wide_angle_lens_of_two_coefficients_is_said_to_be_too_small(rng: np.r
     assert fit_lens(points).lens.k3 != 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rms", [0.03, 0.2])
 def test_uncertainties_cover_correlated_errors(rms: float) -> None:
     """Monte Carlo: random smooth fields on the target. Independent errors would claim several times too little."""
@@ -115,6 +116,7 @@ def halves(families: Families) -> list[tuple[str, list[Families]]]:
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", ["dot_pattern_01", "dot_pattern_02", "line_pattern_01"])
 def test_halves_of_real_targets_agree(data: Path, name: str) -> None:

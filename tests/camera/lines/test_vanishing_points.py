@@ -76,14 +76,15 @@ def coverage(rng: np.random.Generator, draws: int, cases: list[tuple[float, floa
     return np.array(found)
 
 
-def test_errors_are_as_predicted(rng: np.random.Generator, draws: Callable[[int, int], int]) -> None:
+@pytest.mark.slow
+def test_errors_are_as_predicted(rng: np.random.Generator) -> None:
     """No cold start fails: every error is within six standard deviations, and the mean square is 1."""
     cases = [
         (tilt, border, sigma) for tilt in (0.0, 20.0, 45.0) for border, sigma in ((0.3, 0.02), (3.0, 0.2), (20.0, 0.2))
     ]
-    found = coverage(rng, draws(108, 180), cases)
+    found = coverage(rng, 180, cases)
     assert np.all(np.abs(found) < 6.0)
-    # 432 errors: the mean of their squares has a standard deviation of sqrt(2/432) = 0.068 if they were independent,
+    # 720 errors: the mean of their squares has a standard deviation of sqrt(2/720) = 0.053 if they were independent,
     # and about twice that because the four errors of a fit are correlated.
     assert abs(np.mean(found**2) - 1.0) < 0.4
 
@@ -99,12 +100,13 @@ def test_uncertainties_cover_the_truth(rng: np.random.Generator) -> None:
     assert np.all(np.abs(found) < 6.0)
 
 
-def test_vanishing_points_have_errors_as_predicted(rng: np.random.Generator, draws: Callable[[int, int], int]) -> None:
+@pytest.mark.slow
+def test_vanishing_points_have_errors_as_predicted(rng: np.random.Generator) -> None:
     """The three components have a singular covariance, so a draw has two degrees of freedom per point."""
     ideal, lens = plane_grid(rng, 30.0), radial_lens(10.0)
     exact = fit_lens(grid_lines(lens.distort(ideal)), model="k1,k2", lines="vanishing").values
     squares = []
-    for _ in range(draws(60, 100)):
+    for _ in range(100):
         points = lens.distort(ideal) + rng.normal(0.0, 0.1, ideal.shape)
         fit = fit_lens(grid_lines(points), model="k1,k2", lines="vanishing")
         for first in (4, 7):
@@ -442,6 +444,7 @@ def test_a_family_of_one_line_is_free(rng: np.random.Generator) -> None:
     assert any("families [1, 2] have fewer than two lines" in each for each in fit.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize(
     ("name", "raw", "best", "centre"),

@@ -66,6 +66,7 @@ def test_types_and_colours(dtype: type, rng: np.random.Generator) -> None:
         assert _rms(_errors(find_chessboard(each).points, VIEWS["plain"].nodes(6, 9))) < 0.015
 
 
+@pytest.mark.slow
 def test_not_worse_than_opencv(rng: np.random.Generator) -> None:
     """On the same images as OpenCV, with cornerSubPix in windows of 11 pixels and with the sector-based detector."""
     ours, theirs = [], {"classic": [], "sector": []}
@@ -119,6 +120,7 @@ def test_a_board_larger_than_the_image(rng: np.random.Generator) -> None:
     assert np.abs(errors).max() < 0.1
 
 
+@pytest.mark.slow
 def test_many_small_squares(rng: np.random.Generator) -> None:
     camera = view((1000, 900), 60, 70, 12.0, turn=3.0, tilt=10.0)
     errors = _errors(find_chessboard(photo(chessboard(camera, (70, 60)), rng)).points, camera.nodes(60, 70))

@@ -179,6 +179,7 @@ def test_twelve_thousand_dots(rng: np.random.Generator) -> None:
     assert np.abs(errors).max() < 0.15
 
 
+@pytest.mark.slow
 def test_eight_thousand_pixels(rng: np.random.Generator) -> None:
     """The same dots, enlarged: coordinates up to 8000 px keep an accuracy of 0.01 px in single-precision images."""
     camera = view((8000, 300), 4, 130, 60.0)

@@ -19,6 +19,7 @@ def test_noise_alone_is_not_correlated(rng: np.random.Generator) -> None:
     assert np.mean([fit.lack_of_fit.noise_px for fit in fits]) == pytest.approx(0.1, rel=0.03)
 
 
+@pytest.mark.slow
 def test_uncertainties_cover_views_that_differ(rng: np.random.Generator) -> None:
     """Independent errors would claim two to three times too little."""
     true = np.array([900.0, 650.0, 470.0, *RADIAL])

@@ -40,6 +40,7 @@ def _axis(alpha, direction):
     return [math.sin(alpha) * math.cos(direction), math.sin(alpha) * math.sin(direction), math.cos(alpha)]
 
 
+@pytest.mark.slow
 def test_deviations_cover_the_truth(rng):
     """60 draws: the mean squared normalised error is 1 within 4 of its standard deviations."""
     errors = []

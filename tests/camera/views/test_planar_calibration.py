@@ -290,6 +290,7 @@ def test_it_says_when_tilt_and_centre_cannot_be_told_apart(rng):
     assert any("fits as well" in each for each in chosen.warnings)
 
 
+@pytest.mark.slow
 def test_targets_square_to_an_untilted_sensor_fix_no_focal_length(rng):
     made = scene(rng, "grid", 0, steepest=0.0)
     for sigma in (0.0, 0.1):
@@ -408,6 +409,7 @@ def _chessboards(data):
     return views, image.shape[::-1]
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_chessboards_as_well_as_opencv(data):
     views, size = _chessboards(data)

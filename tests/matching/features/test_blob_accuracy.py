@@ -53,6 +53,7 @@ def errors(
     return np.concatenate(found), np.concatenate(covariances)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr", [6.0, pytest.param(12.0, marks=SLOW), pytest.param(50.0, marks=SLOW), 200.0])
 @pytest.mark.parametrize(("radius", "blur"), DISCS)
 def test_close_to_the_bound(device: Device, radius: float, blur: float, snr: float, rng: np.random.Generator) -> None:

@@ -77,6 +77,7 @@ def only(rulers: FeatureCandidates, which: np.ndarray) -> FeatureCandidates:
     return FeatureCandidates(*(each[which] for each in rulers[:-1]), rulers.placement)
 
 
+@pytest.mark.slow
 def test_measured_poses_scatter_as_promised(tmp_path: Path, rng: np.random.Generator) -> None:
     rulers = rulers_of(board(tmp_path, *CROSS, flashes=((5, 15), (15, 5))))
     found = select_rulers(rulers, IMAGING, 20)

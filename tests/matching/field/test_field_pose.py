@@ -293,6 +293,7 @@ def test_every_field_of_a_pose_is_that_of_the_reference(device: Device, count: i
         np.testing.assert_allclose(getattr(fit, name)[0] / size, value / size, atol=1e-3, err_msg=name)
 
 
+@pytest.mark.slow
 def test_covariance_is_the_scatter(device: Device, rng: np.random.Generator) -> None:
     """Normalised errors of 200 views: a chi squared of three degrees, mean 3 within 4 standard errors of 0.17."""
     field_map = large(device)
@@ -307,6 +308,7 @@ def test_covariance_is_the_scatter(device: Device, rng: np.random.Generator) -> 
     assert 2.3 < np.mean(distances) < 3.7
 
 
+@pytest.mark.slow
 def test_sigmas_hold_for_noise_that_grows_with_the_distance(device: Device, rng: np.random.Generator) -> None:
     """Far points err more and have more weight in the heading: 400 views, each ratio known to 3.5 %."""
     field_map = large(device)

@@ -113,6 +113,7 @@ def test_motions_without_views_are_kept_for_the_longest_delay_of_a_view(monkeypa
         RobotFilter(FIELD, START, limits=RobotFilterLimits(view_delay=0.0))
 
 
+@pytest.mark.slow
 def test_errors_are_as_predicted(rng: np.random.Generator) -> None:
     """Squared Mahalanobis distances of 150 independent runs: chi square of 450 degrees of freedom, 5 sigma."""
     total = 0.0

@@ -142,6 +142,7 @@ def test_forty_lines_of_one_ruler(device: Device, variant: Any, rng: np.random.G
     assert (np.abs(error(result)) < 5.0 * np.sqrt(np.diag(result.covariance))).all()
 
 
+@pytest.mark.slow
 @VARIANTS
 def test_covariance_is_what_is_measured(device: Device, variant: Any, rng: np.random.Generator) -> None:
     fix, (rulers, lines) = operation(variant), board_rulers()

@@ -97,7 +97,9 @@ def bind(features: FeatureSet, device: Device, **more: Any) -> BoundFeatures:
     return features.bind(device, shape, np.uint8, **{"copper": "bright", "threshold": 20.0, "noise": NOISE} | more)
 
 
-@pytest.mark.parametrize("model", [CAMERA, LENS], ids=["camera", "lens"])
+@pytest.mark.parametrize(
+    "model", [pytest.param(CAMERA, id="camera"), pytest.param(LENS, id="lens", marks=pytest.mark.slow)]
+)
 def test_errors_are_as_predicted_behind_a_strong_lens(
     model: Camera | Lens, features: FeatureSet, device: Device, rng: np.random.Generator, draws: Callable[..., int]
 ) -> None:

@@ -144,6 +144,7 @@ def test_turns_that_follow_the_moves_are_refused_with_names() -> None:
         fit_motion_frame(commands, _seen(commands), COVARIANCE)
 
 
+@pytest.mark.slow
 def test_proposed_move_beats_a_random_one_by_the_predicted_factor() -> None:
     start = np.array([[0, 0, 0], [5e-3, 0, 0], [0, 5e-3, 0], [5e-3, 5e-3, 0.3], [2e-3, 1e-3, -0.3]], np.float64)
     grid = np.array([[x, y, a] for x in (0, 20e-3, 40e-3) for y in (0, 15e-3, 30e-3) for a in (0.0, 1.5)])

@@ -93,6 +93,7 @@ def test_error_of_each_frame_is_that_of_theory(control: Control) -> None:
     assert machine.frames_to(0.02) == within
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("control", [CONTROLS[3], CONTROLS[5]], ids=["smith-pi", "kalman-p"])
 def test_noise_at_the_release_is_that_of_theory(control: Control) -> None:
     machine = dataclasses.replace(PRESET, control=control)
@@ -193,6 +194,7 @@ def _largest_later(plant: SimulatedPlant, time: float) -> float:
     return float(np.abs(plant.pose(time + np.linspace(0.0, 0.007, 15))[:, 0]).max())
 
 
+@pytest.mark.slow
 def test_waiting_by_vibration_saves_30_percent_of_a_fixed_wait_with_as_many_misplacements() -> None:
     """Ten parts with tolerances of 5 and 15 um; the head comes out of the long move with a swing of up to 40 um."""
     rng, count = np.random.default_rng(4), 10
@@ -225,7 +227,9 @@ def test_waiting_by_vibration_saves_30_percent_of_a_fixed_wait_with_as_many_misp
     assert np.mean(waits) <= 0.7 * times[np.flatnonzero(missed)[-1] + 1]
 
 
-@pytest.mark.parametrize(("frequency", "control"), [(80.0, Control(gain=0.1)), (120.0, CONTROLS[2])])
+@pytest.mark.parametrize(
+    ("frequency", "control"), [pytest.param(80.0, Control(gain=0.1), marks=pytest.mark.slow), (120.0, CONTROLS[2])]
+)
 def test_a_loop_that_makes_a_resonance_swing_up_is_refused_with_a_gain_that_settles(
     frequency: float, control: Control
 ) -> None:
@@ -370,7 +374,13 @@ OVERSHOOTING = [
 ]
 
 
-@pytest.mark.parametrize("control", OVERSHOOTING, ids=["pi", "p", "smith-pi", "smith-p"])
+@pytest.mark.parametrize(
+    "control",
+    [
+        pytest.param(each, id=name, marks=() if name.endswith("pi") else pytest.mark.slow)
+        for each, name in zip(OVERSHOOTING, ("pi", "p", "smith-pi", "smith-p"), strict=True)
+    ],
+)
 def test_missing_poses_stop_a_head_at_the_error_of_the_last_pose(control: Control) -> None:
     """The camera is blind from each of the frames of the step response on.
 

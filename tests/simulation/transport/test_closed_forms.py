@@ -272,7 +272,8 @@ def test_any_two_places_in_a_sphere(device: Device) -> None:
     assert errors[0] > 2.0 * errors[1]
 
 
-@pytest.mark.parametrize("height", [pytest.param(1.0, marks=pytest.mark.slow), 0.6])
+@pytest.mark.slow
+@pytest.mark.parametrize("height", [1.0, 0.6])
 def test_integrating_sphere(device: Device, height: float) -> None:
     """One bounce: albedo * power / (4 pi R^2) everywhere; all bounces: divided by 1 - albedo (1 - open part)."""
     albedo, errors = 0.9, []

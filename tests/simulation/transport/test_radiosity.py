@@ -186,6 +186,7 @@ def test_patches_in_corners_are_graded(device: Device) -> None:
     assert from_edge[small].mean() < 0.6 * from_edge[~small].mean()
 
 
+@pytest.mark.slow
 @pytest.mark.double
 def test_graded_patches_in_a_groove(device: Device) -> None:
     """Line across a groove of 90 degrees: the light of all further bounces, integrated along the groove.

@@ -14,7 +14,7 @@ from gpuvision.matching.features.line_fit import FitLines
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.field.distance_map import DistanceMap, DistanceMapBuilder
 from gpuvision.matching.field.field_pose import FieldPoseRefinement, FieldPoseSearch
-from gpuvision.matching.pose.board_pose import BoardPoseEstimator
+from gpuvision.matching.pose.board_pose import FitBoardLines, MeasureBoardEdges
 from gpuvision.matching.pose.edge_search import CellMeans, EdgeCostMap, EdgeSearch
 from gpuvision.matching.pose.feature_pose import CameraFeatures, PlaceFeatures, SolveFeatures
 from gpuvision.matching.pose.pose import SolvePose
@@ -99,12 +99,13 @@ def _poses() -> Iterator[Example]:
 
 def _board_poses() -> Iterator[Example]:
     ruler = RulerEdges(threshold=20.0)
-    estimator = BoardPoseEstimator(ruler=ruler, lines=12, rulers_per_line=6)
-    yield Example("12 lines x 6", estimator, _IMAGE, np.uint8)
-    yield Example("40 lines x 1", replace(estimator, lines=40, rulers_per_line=1), _IMAGE, np.uint8)
-    yield Example("lens", replace(estimator, ruler=replace(ruler, model=LENSES["lens k1"])), _IMAGE, np.uint8)
-    biased = replace(estimator, solver=SolvePose(loss="huber", etch_bias_sigma=1e-5, scale=None))
-    yield Example("etch bias, free scale", biased, _IMAGE, np.float32)
+    edges = MeasureBoardEdges(ruler=ruler, lines=12, rulers_per_line=6)
+    yield Example("edges, 12 lines x 6", edges, _IMAGE, np.uint8)
+    yield Example("edges, lens", replace(edges, ruler=replace(ruler, model=LENSES["lens k1"])), _IMAGE, np.uint8)
+    for lines, rulers in ((12, 6), (40, 1), (300, 4), (8, 256)):
+        yield Example(f"fits, {lines} lines x {rulers}", FitBoardLines(solver=SolvePose()), (3, lines, rulers))
+    biased = FitBoardLines(solver=SolvePose(loss="huber", etch_bias_sigma=1e-5, scale=None))
+    yield Example("fits, etch bias, free scale", biased, (3, 12, 6))
 
 
 def _feature_poses() -> Iterator[Example]:

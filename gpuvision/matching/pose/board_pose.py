@@ -1,7 +1,7 @@
-"""Fused board pose: from an image to a board's pose in one launch.
+"""Fused board pose: from an image to a board's pose without work of the host in between.
 
-The kernel finds edges along calipers (rulers) placed across lines of the artwork, fits a robust line to the edges of
-each line, and solves a robust pose from the lines, with its covariance at the placement point.
+The kernels find edges along calipers (rulers) placed across lines of the artwork, fit a robust line to the edges of
+each line, and solve a robust pose from the lines, with its covariance at the placement point.
 
 References
 ----------
@@ -10,24 +10,47 @@ References
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Define, Device, FloatArray, IntArray, Launch, LaunchBuilder, StatusArray, capacity
+from gpuvision.host import (
+    Bound,
+    Define,
+    Device,
+    DeviceArray,
+    FloatArray,
+    IntArray,
+    Launch,
+    LaunchBuilder,
+    Layout,
+    Operation,
+    OperationSequence,
+    Specs,
+    Stage,
+    StatusArray,
+    capacity,
+    uses_vectors,
+)
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.pose.motion import apply_homography
-from gpuvision.matching.pose.pose import SolvePose
+from gpuvision.matching.pose.pose import BoardPose, SolvePose
 from gpuvision.matching.robust import sample_subsets
-from gpuvision.operation import VisionOperation
+from gpuvision.operation import KERNEL_FOLDER, VisionOperation
 
 Float64 = npt.NDArray[np.float64]
 RULER = ("x_px", "y_px", "cosine", "sine", "u", "v", "u_per_px", "v_per_px", "projective")
 LINE = ("normal_x", "normal_y", "x", "y", "sigma", "etch_factor")
 _GROUP, _MAX_RULERS = 64, 2048
-# Least sizes of the arrays on CPUs, so that boards of many sizes share programs; on GPUs they cost local memory.
+_MIN_SCALE = 1e-3  # least scale of the residuals in the pose, as in board_pose.cl
+# Build options of `SolvePose` that the fits of lines do not read.
+_OPTIONS_OF_POSE = ("POSE_PARAMETERS", "FREEDOMS", "START_STEPS", "CAPACITY")
+# Least sizes of the arrays of the vector variant, so that boards of many sizes share programs.
 _MIN_RULERS_PER_LINE, _MIN_RULERS = 32, 512
 
 
@@ -125,13 +148,158 @@ def place_rulers(
     return rulers, np.concatenate([normal, point, *more], axis=-1).astype(np.float32)
 
 
+class BoardEdges(NamedTuple):
+    """Edges along the rulers of a board.
+
+    Attributes
+    ----------
+    edges : float32, (lines, rulers_per_line)
+        Positions of the edges along the rulers [px]; NaN where no edge was found.
+    status : uint8, (lines, rulers_per_line)
+        `Status` flags of the rulers.
+    places : float32, (3, lines, rulers_per_line)
+        Positions along and across their lines [m]; one over the standard deviation across [1/m], 0 for no edge.
+    """
+
+    edges: FloatArray
+    status: StatusArray
+    places: FloatArray
+
+
+class BoardLines(NamedTuple):
+    """Lines of a board, fitted through their edges.
+
+    Attributes
+    ----------
+    rows : float32, (rows, 7 or 8)
+        Feature rows as `SolvePose` takes them: two of each line, or one where a line has one ruler.
+    edge_weights : float32, (lines, rulers_per_line)
+        Weight of each edge in the fit of its line, 0 to 1.
+    """
+
+    rows: FloatArray
+    edge_weights: FloatArray
+
+
 @dataclass(frozen=True, kw_only=True)
-class BoardPoseEstimator(VisionOperation[BoardPoseEstimate]):
+class MeasureBoardEdges(VisionOperation[BoardEdges]):
+    """Edges along the rulers of a board: ``op(image, rulers) -> BoardEdges``; first stage of `BoardPoseEstimator`.
+
+    Parameters
+    ----------
+    ruler : RulerEdges
+        Edge measurement, in its work-item variant.
+    lines, rulers_per_line : int
+        As in `BoardPoseEstimator`.
+    """
+
+    Result: ClassVar[type[Any]] = BoardEdges
+    takes_single_frames: ClassVar[bool] = True
+
+    ruler: RulerEdges
+    lines: int
+    rulers_per_line: int
+
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
+        found, real = (self.lines, self.rulers_per_line), np.dtype(np.float32)
+        edges = replace(self.ruler, count=math.prod(found), variant="work_item").launch(device, shape, dtype)
+        return replace(
+            edges,
+            source="board_pose/board_pose.cl",
+            kernel="board_edges",
+            inputs=[edges.inputs[0], ((*found, len(RULER)), real)],
+            outputs={"edges": (found, real), "status": (found, np.dtype(np.uint8)), "places": ((3, *found), real)},
+            defines={**edges.defines, "BOARD_EDGES": None},
+            arguments=[*edges.arguments[:4], np.uint32(math.prod(found))],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitBoardLines(VisionOperation[BoardLines]):
+    """Lines through the edges of a board: ``op(places, lines) -> BoardLines``; second stage of `BoardPoseEstimator`.
+
+    Parameters
+    ----------
+    solver : SolvePose
+        Its loss, tuning constant and scale apply to the fits.
+    """
+
+    Result: ClassVar[type[Any]] = BoardLines
+
+    solver: SolvePose
+
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
+        build = LaunchBuilder(self, device, shape, dtype, variant="work_item")
+        solver, (_, lines, rulers) = self.solver, shape
+        rows, pairs = lines * rows_of_line(rulers), start_pairs(rulers, solver.max_trials)
+        options = solver.defines(rows, vectors=False)
+        numbers = 7 + (solver.etch_bias_sigma is not None)
+        return build.launch(
+            "board_pose/board_pose.cl",
+            "board_lines",
+            work=build.work(lines, each=1, group=_GROUP),
+            more_inputs=[((lines, len(LINE)), build.real)],
+            outputs=build.outputs({"rows": (rows, numbers), "edge_weights": (lines, rulers)}),
+            defines={
+                **{name: value for name, value in options.items() if name not in _OPTIONS_OF_POSE},
+                "MAX_RULERS_PER_LINE": capacity(rulers),
+                "BOARD_LINES": None,
+            },
+            arguments=[
+                np.int32(lines),
+                np.int32(rulers),
+                pairs.ravel(),
+                np.int32(len(pairs)),
+                np.int32(solver.max_iterations),
+            ],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolveBoardLines(VisionOperation[BoardPose]):
+    """Pose of a board from rows of its lines: ``op(rows) -> BoardPose``; last stage of `BoardPoseEstimator`.
+
+    Parameters
+    ----------
+    solver : SolvePose
+    lines : int
+        Number of lines; the residuals and weights have the shape (lines, rows of a line).
+    """
+
+    Result: ClassVar[type[Any]] = BoardPose
+
+    solver: SolvePose
+    lines: int
+
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
+        solved = replace(self.solver, min_scale=_MIN_SCALE, variant="work_item").launch(device, shape, dtype)
+        of_rows = ((self.lines, shape[0] // self.lines), np.dtype(np.float32))
+        return replace(solved, outputs={**solved.outputs, "residuals": of_rows, "weights": of_rows})
+
+
+def rows_of_line(rulers: int) -> int:
+    """Return the number of rows that a line with some rulers gives: offset and angle, or the offset only."""
+    return 2 if rulers > 1 else 1
+
+
+def start_pairs(rulers: int, max_trials: int) -> npt.NDArray[np.int32]:
+    """Return the pairs of rulers (n, 2) of a line that give its start candidates."""
+    return sample_subsets(rulers, 2, max_trials) if rulers > 1 else np.zeros((1, 2), np.int32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardPoseEstimator(OperationSequence[BoardPoseEstimate]):
     """Fused board pose: ``op(image, rulers, lines) -> BoardPoseEstimate``.
 
     The image is as `RulerEdges` takes it. The rulers, float32 (lines, rulers_per_line, 9), and the lines, float32
     (lines, 6), are results of `place_rulers`. The pose is the motion of the artwork on the board's plane, from the
     expected to the measured position; 0 if the board is at the expected position.
+
+    On CPU runtimes one launch computes everything. On GPUs three launches follow one another: edges, in work-groups of
+    four rulers; lines, an item for each; and the pose, as `SolvePose` computes it.
 
     Parameters
     ----------
@@ -159,6 +327,7 @@ class BoardPoseEstimator(VisionOperation[BoardPoseEstimate]):
     """
 
     Result: ClassVar[type[Any]] = BoardPoseEstimate
+    kernel_folder: ClassVar[Path | None] = KERNEL_FOLDER
     takes_single_frames: ClassVar[bool] = True
 
     ruler: RulerEdges
@@ -186,16 +355,12 @@ class BoardPoseEstimator(VisionOperation[BoardPoseEstimate]):
             )
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
-        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        edges = self._edges(device, shape, dtype)
+        """Describe the one launch of the vector variant, as `Operation.launch` says."""
+        edges = replace(self.ruler, count=self.lines * self.rulers_per_line).launch(device, shape, dtype)
         build = LaunchBuilder(self, device, shape, dtype, variant=self.ruler.variant)
-        work = build.work(1, each=1, group=_GROUP, grouping="per_element")
+        work = build.work(1, each=1, group=1)
         count, solver = self._rows_of_line * self.lines, self.solver
-        pairs = (
-            sample_subsets(max(self.rulers_per_line, 2), 2, solver.max_trials)
-            if self.rulers_per_line > 1
-            else np.zeros((1, 2), np.int32)
-        )
+        pairs = start_pairs(self.rulers_per_line, solver.max_trials)
         found = (self.lines, self.rulers_per_line)
         shapes = solver.shapes((), (self.lines, self._rows_of_line))
         shapes |= dict.fromkeys(("edges", "edge_status", "edge_weights"), found)
@@ -208,35 +373,68 @@ class BoardPoseEstimator(VisionOperation[BoardPoseEstimate]):
             outputs=build.outputs(shapes, rank=np.int32, inliers=np.int32, edge_status=np.uint8),
             defines={
                 **edges.defines,
-                **solver.defines(count, vectors=work.vectors),
-                **self._capacities(vectors=work.vectors),
+                **solver.defines(count, vectors=True),
+                **self._capacities(),
             },
             arguments=[
                 *edges.arguments[:4],
-                np.int32(self.lines),
-                np.int32(self.rulers_per_line),
+                *map(np.int32, found),
                 pairs.ravel(),
                 np.int32(len(pairs)),
-                solver.starts(count, vectors=work.vectors),
+                solver.starts(count, vectors=True),
                 np.int32(solver.max_trials),
                 np.int32(solver.max_iterations),
                 *map(np.float32, limits),
             ],
-            passes_once=work.vectors,
+            passes_once=True,
         )
 
-    def _edges(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
-        """Return the launch of the rulers alone: its table, lens model and build options."""
-        return replace(self.ruler, count=self.lines * self.rulers_per_line).launch(device, shape, dtype)
+    def layout(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Layout:
+        """Return the stages of the work-item variant: edges, lines, pose."""
+        found, real = (self.lines, self.rulers_per_line), np.dtype(np.float32)
+        inputs = {
+            "image": (shape, dtype),
+            "rulers": ((*found, len(RULER)), real),
+            "lines": ((self.lines, len(LINE)), real),
+        }
+        measure = MeasureBoardEdges(ruler=self.ruler, lines=self.lines, rulers_per_line=self.rulers_per_line)
+        stages = [
+            Stage("edges", measure, ("image", "rulers")),
+            Stage("fits", FitBoardLines(solver=self.solver), ("edges.places", "lines")),
+            Stage("pose", SolveBoardLines(solver=self.solver, lines=self.lines), ("fits.rows",)),
+        ]
+        outputs = {name: f"pose.{name}" for name in BoardPose._fields}
+        return Layout(
+            inputs,
+            stages,
+            outputs | {"edges": "edges.edges", "edge_status": "edges.status", "edge_weights": "fits.edge_weights"},
+        )
+
+    def specs(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Specs:
+        """Return inputs, outputs and memory; see `Operation.specs`."""
+        is_fused = uses_vectors(self.ruler.variant, device)
+        return Operation.specs(self, device, shape, dtype) if is_fused else super().specs(device, shape, dtype)
+
+    def _bound_to(
+        self,
+        device: Device,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        queue: Any,
+        inputs: Sequence[DeviceArray],
+    ) -> Bound[BoardPoseEstimate]:
+        if uses_vectors(self.ruler.variant, device):
+            return Bound(self, device, shape, dtype, queue, inputs)
+        return super()._bound_to(device, shape, dtype, queue, inputs)
 
     @property
     def _rows_of_line(self) -> int:
-        return 2 if self.rulers_per_line > 1 else 1
+        return rows_of_line(self.rulers_per_line)
 
-    def _capacities(self, *, vectors: bool) -> dict[str, Define]:
+    def _capacities(self) -> dict[str, Define]:
         """Return the sizes of the arrays; with one ruler per line the code differs."""
         rulers = self.rulers_per_line
         return {
-            "MAX_RULERS_PER_LINE": capacity(rulers, least=_MIN_RULERS_PER_LINE if vectors and rulers > 1 else 1),
-            "MAX_RULERS": capacity(self.lines * rulers, least=_MIN_RULERS if vectors else 1),
+            "MAX_RULERS_PER_LINE": capacity(rulers, least=_MIN_RULERS_PER_LINE if rulers > 1 else 1),
+            "MAX_RULERS": capacity(self.lines * rulers, least=_MIN_RULERS),
         }

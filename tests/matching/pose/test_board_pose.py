@@ -1,4 +1,4 @@
-"""BoardPoseEstimator on devices: the fused launch gives the same pose as its parts in sequence."""
+"""BoardPoseEstimator on devices: both variants give the same pose as their parts one by one."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from canary import Guarded
@@ -140,6 +141,41 @@ def test_forty_lines_of_one_ruler(device: Device, variant: Any, rng: np.random.G
     np.testing.assert_array_equal(result.edge_status, Status.OK)
     assert result.rank == 3
     assert (np.abs(error(result)) < 5.0 * np.sqrt(np.diag(result.covariance))).all()
+
+
+@pytest.mark.slow
+@VARIANTS
+def test_a_large_board(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    """300 lines of 4 rulers: no kernel of the work-item variant takes more than 32 KiB of local memory."""
+    normal, point, _ = artwork()
+    which = np.arange(300) % LINES
+    offsets = (np.arange(300) // LINES * 1.5 - 18.0)[:, None] + np.array([-3.0, -1.0, 1.0, 3.0])
+    rulers, lines = place_rulers(normal[which], point[which], offsets * PIXEL, MATRIX)
+    fix = replace(operation(variant), lines=300, rulers_per_line=4)
+    result = fix(picture(rng), rulers, lines, device=device)
+    assert result.status == Status.OK
+    assert (np.abs(error(result)) < 5.0 * np.sqrt(np.diag(result.covariance))).all()
+    if variant == "work_item":
+        bound: Any = fix.bind(device, SHAPE, np.uint8)
+        for stage in bound.stages.values():
+            _, kernel, _, _ = stage.enqueue_arguments
+            info = cl.kernel_work_group_info.LOCAL_MEM_SIZE
+            assert kernel.get_work_group_info(info, device.queue.device) <= 32768
+
+
+@pytest.mark.parametrize("variant", ["work_item"])
+def test_odd_numbers_of_rulers_stay_within_the_outputs(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    """7 lines of 3 rulers: groups of four rulers, the last one with a single ruler."""
+    normal, point, along = artwork()
+    placed = place_rulers(normal[:7], point[:7], along[:7, ::2], MATRIX)
+    fix = replace(operation(variant), lines=7, rulers_per_line=3)
+    image = picture(rng)
+    result = fix(image, *placed, device=device)
+    assert result.status == Status.OK
+    guarded = Guarded(result)
+    fix(image, *placed, device=device, out=guarded.out)
+    guarded.assert_intact()
+    np.testing.assert_array_equal(guarded.out.pose, result.pose)
 
 
 @pytest.mark.slow

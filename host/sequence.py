@@ -97,7 +97,7 @@ class OperationSequence(Operation[R]):
         dtype: np.dtype[Any],
         queue: Any,
         inputs: Sequence[DeviceArray],
-    ) -> BoundSequence[R]:
+    ) -> Bound[R]:
         return BoundSequence(self, device, shape, dtype, queue, inputs)
 
 

@@ -154,7 +154,8 @@ def test_a_large_board(device: Device, variant: Any, rng: np.random.Generator) -
     fix = replace(operation(variant), lines=300, rulers_per_line=4)
     result = fix(picture(rng), rulers, lines, device=device)
     assert result.status == Status.OK
-    assert (np.abs(error(result)) < 5.0 * np.sqrt(np.diag(result.covariance))).all()
+    # The rulers overlap, so that their errors are not independent: a thirtieth of a pixel, and that over 3 mm.
+    assert (np.abs(error(result)) < (3e-7, 3e-7, 1e-4)).all()
     if variant == "work_item":
         bound: Any = fix.bind(device, SHAPE, np.uint8)
         for stage in bound.stages.values():

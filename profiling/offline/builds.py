@@ -73,6 +73,7 @@ class GpuModel(Device):
         self.label, self.kind, self.name, self.driver = "gpu", "gpu", "model of a GPU", ""
         self.is_cpu = self.prefers_vectors = self.takes_vectors = self.shares_memory = False
         self.has_double, self.has_denormals = has_double, True
+        self.has_fast_double = has_double  # there is no device whose rate could be measured
         # An H100 has 132 multiprocessors. The number sets the shares of work-items, not the code.
         self.compute_units = 132
         self.cache_bytes, self.max_allocation = 32 << 20, 16 << 30

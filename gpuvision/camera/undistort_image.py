@@ -23,6 +23,7 @@ from gpuvision.host import (
     StatusArray,
     Variant,
     WorkSize,
+    ceil_div,
     round_up,
     type_defines,
 )
@@ -45,8 +46,9 @@ _BORDERS = {
 _LARGEST_FRAME = 2**30
 # Rows of a map computed in one pass, so that the intermediate arrays of a camera model fit into the caches.
 _ROWS_AT_ONCE = 32
-# Columns and rows of a work-group; one work-item computes one pixel.
+# Work-items of a work-group along columns and rows.
 _GROUP = (32, 4)
+_PIXELS = 4  # of a work-item under QUAD: PIXELS in undistort_image.cl
 
 
 @runtime_checkable
@@ -110,7 +112,8 @@ class UndistortImage(VisionOperation[UndistortedImage]):
     precision : {"single", "double"}, optional
         Precision of computed source positions. Default "single": exact to the rounding of the coordinate.
     variant : {"auto", "vector", "work_item"}
-        Kernel variant: 16-wide vectors for CPU runtimes, a work-item per pixel for GPUs, or by the device (default).
+        Kernel variant: 16-wide vectors for CPU runtimes, a work-item per pixel for GPUs (per four pixels for bilinear
+        integer images of one channel), or by the device (default).
 
     Raises
     ------
@@ -242,13 +245,14 @@ class UndistortImage(VisionOperation[UndistortedImage]):
             work = WorkSize((made_rows, frames), (1, 1), vectors=True)
         else:
             wide, high = _GROUP
-            work = WorkSize((round_up(made_columns, wide), round_up(made_rows, high), frames), (wide, high, 1))
+            items = ceil_div(made_columns, _PIXELS if self._quad(dtype) else 1)
+            work = WorkSize((round_up(items, wide), round_up(made_rows, high), frames), (wide, high, 1))
         return build.launch(
             "undistort_image/undistort_image.cl",
             "undistort",
             work=work,
             outputs=build.outputs({"image": made, "status": (made_rows, made_columns)}, image=dtype),
-            defines=self._defines(dtype),
+            defines=self._defines(dtype) | ({} if build.uses_vectors else self._quad(dtype)),
             arguments=[
                 *tables,
                 np.array([columns, rows, made_columns, made_rows, *region[:2], self._missing], np.int32),
@@ -296,6 +300,12 @@ class UndistortImage(VisionOperation[UndistortedImage]):
             return self.model.packed((0.0, 0.0), 1.0, inverse=True).astype(real)
         table: npt.NDArray[Any] = self.model.packed(real, "distort", self.matrix)
         return table
+
+    def _quad(self, dtype: np.dtype[Any]) -> dict[str, Define]:
+        """Return the macro QUAD where a work-item of the work-item variant computes four pixels."""
+        if self.interpolation != "bilinear" or self.channels != 1 or dtype.kind != "u":
+            return {}
+        return {"QUAD": {1: "uint", 2: "ulong"}[dtype.itemsize]}
 
     def _defines(self, dtype: np.dtype[Any]) -> dict[str, Define]:
         defines = type_defines("CODE", dtype, 16)

@@ -41,7 +41,8 @@ PEAK_SELECTIONS = ("strongest", "first", "last", "nearest")
 LONGEST_PROFILE = 32767  # samples: the vector variant keeps sample indices in 16 bits
 WIDEST_WINDOW = 180  # samples on either side: sums of 16-bit samples times their index fit 32 bits
 _LANES = 16  # of a vector of the vector variant: its kernel's vectors have 16 elements
-_GROUP = 64  # work-items of a work-group
+_GROUP = 64  # work-items of a work-group that selects among candidates
+_TOGETHER = 256  # work-items of a work-group that reads profiles together: GROUP in line_group.h
 _STRIP = 1024  # largest number of columns of a strip: MAX_STRIP in line_strip.h
 _FIELDS = ("position", "peak", "width", "total", "status")  # default outputs without a triangulation
 _WIDE_BYTES = 64  # bytes of a wide vector (one cache line): WIDE in line_wide.h
@@ -165,8 +166,8 @@ class LineReadout(VisionOperation[LineReading]):
     precision : {"single", "double", None}
         Precision of the arithmetic and of the outputs; ``None`` is single.
     variant : {"auto", "vector", "work_item"}
-        Kernel variant: wide vectors on strips of profiles (CPU runtimes), or one work-item per profile (GPUs).
-        ``"auto"`` follows the device. Frames narrower than a vector use the work-item variant.
+        Kernel variant: wide vectors on strips of profiles (CPU runtimes), or work-groups that read profiles together
+        (GPUs). ``"auto"`` follows the device. Frames narrower than a vector use the work-item variant.
 
     Raises
     ------
@@ -324,7 +325,7 @@ class LineReadout(VisionOperation[LineReading]):
         if build.uses_vectors and self._fits_strip(rows, columns, dtype):
             work = WorkSize((self._items(device, frames, samples), frames), (1, 1), vectors=True)
         else:
-            work = WorkSize((round_up(samples, _GROUP), frames), (_GROUP, 1))
+            work = self._groups(frames, samples, dtype)
         chosen, of_samples = self.outputs or (), (*batch, samples)
         profiles = None
         if self.triangulation is not None:
@@ -352,6 +353,14 @@ class LineReadout(VisionOperation[LineReading]):
             # Along rows, both variants process one profile after the other and skip dark parts in vectors of samples.
             return self.along == "columns" and columns >= _LANES
         return columns >= _WIDE_BYTES // dtype.itemsize and (self.along == "columns" or rows >= _LANES)
+
+    def _groups(self, frames: int, samples: int, dtype: np.dtype[Any]) -> WorkSize:
+        """Return the work size of the work-item variant."""
+        if self._has_candidates:
+            return WorkSize((round_up(samples, _GROUP), frames), (_GROUP, 1))
+        # PROFILES in line_group.h
+        profiles = 8 if self.along == "rows" else 64 if dtype.itemsize == 1 else 32
+        return WorkSize((ceil_div(samples, profiles) * _TOGETHER, frames), (_TOGETHER, 1))
 
     def _items(self, device: Device, frames: int, samples: int) -> int:
         """Return the work-items per frame of the vector variant: few, but two per core at least over all frames."""

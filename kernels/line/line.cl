@@ -25,7 +25,8 @@
 //          LENS_K2, LENS_K3, LENS_K4, CAMERA, CAMERA_PROFILES (terms of the table of corrections), PAST_CACHES,
 //          VECTOR_VARIANT.
 // Work:    global size (work-items of a frame, frames). Vector variant: a work-item reads a strip of columns, or 16
-//          rows; under CANDIDATES 16 profiles. Otherwise: one work-item per profile, padded to whole work-groups.
+//          rows; under CANDIDATES 16 profiles. Otherwise: a work-group reads 32 or 64 columns, or 8 rows, together
+//          (line_group.h); under CANDIDATES one work-item per profile, padded to whole work-groups.
 #include "line/line_profiles.h"
 #include "common/sheet.h"
 
@@ -172,14 +173,15 @@ static inline void finish_centroid(const Profiles *profiles, const Centroid *cen
                   variance);
 }
 #else
-static inline void finish_peak(const Profiles *profiles, const Peak *peak, const Place *found,
+// `second`: under AMBIGUITY the highest sample outside the window.
+static inline void finish_peak(const Profiles *profiles, const Peak *peak, const Place *found, codes second,
                                constant LineTable *table, const Outputs *to, ulong first, int sample) {
     const Place place = middle_of_wide_top(peak, *found);
     const ints cut = cut_lanes(profiles, peak) & peak->found;
     ints flags = place.flags | common_flags(profiles, peak->level, peak->not_finite);
     flags |= flag_where(~peak->found, STATUS_LOW_SIGNAL) | flag_where(cut, STATUS_OUT_OF_RANGE);
 #ifdef AMBIGUITY
-    flags |= flag_where(has_second(profiles, peak, table->ambiguous_ratio) & peak->found, STATUS_AMBIGUOUS);
+    flags |= flag_where(is_second(profiles, peak, second, table->ambiguous_ratio) & peak->found, STATUS_AMBIGUOUS);
 #endif
 #ifdef COUNT_WIDTH
     const reals width = run_length(profiles, peak);
@@ -211,6 +213,8 @@ static inline Place place_in_window(const Profiles *profiles, Peak *peak, consta
 
 #ifdef VECTOR_VARIANT
 #include "line/line_strip.h"
+#elif !defined(CANDIDATES)
+#define TOGETHER
 #endif
 
 // The LANES profiles of a frame from profile `sample` on.
@@ -220,16 +224,19 @@ static inline Profiles profiles_from(const Profiles *frame, int sample) {
     return profiles;
 }
 
+#ifdef TOGETHER
+#include "line/line_group.h"
+#endif
+
 // read_frame: read the part of a frame that this work-item processes. `first` is the element of the frame's first
 // profile in the outputs.
-#if defined(CANDIDATES) || (!defined(VECTOR_VARIANT) && !defined(METHOD_CENTROID))
+#if defined(CANDIDATES)
 // LANES profiles, by a walk along them. Work-items beyond the last profile only fill up a work-group.
 static inline void read_frame(const Profiles *frame, int samples, constant LineTable *table, const Outputs *to,
                               ulong first, global const real *previous) {
     const int sample = min((int)get_global_id(0) * LANES, samples - LANES);
     if ((int)get_global_id(0) * LANES >= samples) return;
     const Profiles profiles = profiles_from(frame, sample);
-#ifdef CANDIDATES
     ints nearest = -1;
 #ifdef SELECT_NEAREST
     const reals before = *(global const reals_at *)(previous + first + sample);
@@ -237,26 +244,12 @@ static inline void read_frame(const Profiles *frame, int samples, constant LineT
     nearest = choose_ints(known, to_ints(rint(before)), -1);
 #endif
     Peak found = select_peak(&profiles, nearest, (int)table->min_width, (int)table->max_width);
-#else
-    Peak found = strongest_peak(&profiles);
-#endif
     const Place place = place_in_window(&profiles, &found, table);
-    finish_peak(&profiles, &found, &place, table, to, first + sample, sample);
+    finish_peak(&profiles, &found, &place, highest_outside(&profiles, found.at), table, to, first + sample, sample);
 }
 
-#elif !defined(VECTOR_VARIANT)
-// The centroid of one profile.
-static inline void read_frame(const Profiles *frame, int samples, constant LineTable *table, const Outputs *to,
-                              ulong first, global const real *previous) {
-    const int sample = get_global_id(0);
-    if (sample >= samples) return;
-    const Profiles profiles = profiles_from(frame, sample);
-    Centroid centroid = profile_centroid(&profiles);
-#ifdef NOISE
-    set_variances(&centroid, &profiles, table);
-#endif
-    finish_centroid(&profiles, &centroid, table, to, first + sample, sample);
-}
+#elif defined(TOGETHER)
+// All work-items of a group go on together: read_group in line_group.h.
 
 #elif !defined(ALONG_ROWS)
 // A strip of columns, in parts of at most MAX_STRIP columns. Memory is read nearly in sequence, while the sums of a
@@ -306,5 +299,10 @@ kernel void line_readout(global const CODE *restrict frames,
     const Outputs to = {position, peak,    width,   total,        status,       g,     h,
                         sigma,    sigma_g, sigma_h, systematic_g, systematic_h, sheet, table,
                         correction, samples};
+#ifdef TOGETHER
+    local Shared shared;
+    read_group(&frame, samples, table, &to, number * samples, &shared);
+#else
     read_frame(&frame, samples, table, &to, number * samples, previous);
+#endif
 }

@@ -76,25 +76,6 @@ static inline Centroid centroid_of(const Sums *sums) {
     return centroid;
 }
 
-static inline Centroid profile_centroid(const Profiles *profiles) {
-    Sums sums = zero_sums();
-    for (int first = 0; first < profiles->length; first += STEPS) {
-        const int steps = min(STEPS, profiles->length - first);
-        reals s = 0, m = 0;
-        for (int k = 0; k < steps; k++) {
-            const codes x = sample_of(profiles, first + k);
-            sums.peak = x > sums.peak ? x : sums.peak;
-            // Not x * 0, which Mesa's compiler replaces by 0 (22.3 and 25.0), also for infinite x.
-            sums.poison = nan_where(mask_of(LANED(not_finite)(to_reals(x))), sums.poison);
-            sums.width += choose_reals(int_mask(x > (codes)profiles->threshold), 1, 0);
-            s += over_threshold(x, profiles->threshold);
-            m += s;
-        }
-        add_block(&sums, s, m, first, steps);
-    }
-    return centroid_of(&sums);
-}
-
 #else
 
 // big: type of a moment.
@@ -144,23 +125,6 @@ static inline Centroid centroid_of_integers(uints total, bigs moment, uints widt
 #endif
     return centroid;
 }
-
-#ifndef VECTOR_VARIANT
-static inline Centroid profile_centroid(const Profiles *profiles) {
-    uints total = 0, width = 0;
-    bigs moment = 0;
-    codes peak = 0;
-    for (int k = 0; k < profiles->length; k++) {
-        const codes x = sample_of(profiles, k);
-        const uints v = x > profiles->threshold ? x - profiles->threshold : 0;
-        total += v;
-        moment += (bigs)v * k;
-        width += v > 0;
-        peak = max(peak, x);
-    }
-    return centroid_of_integers(total, moment, width, peak);
-}
-#endif
 
 #endif
 

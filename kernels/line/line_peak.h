@@ -110,23 +110,6 @@ static inline Peak select_peak(const Profiles *profiles, ints nearest, int min_w
     return peak;
 }
 
-#else
-
-// Walk along the profiles of all lanes and find the largest sample.
-static inline Peak strongest_peak(const Profiles *profiles) {
-    Peak peak;
-    peak.at = peak.not_finite = (ints)0;
-    peak.level = (codes)DARKEST;
-    for (int k = 0; k < profiles->length; k++) {
-        const codes x = sample_of(profiles, k);
-        peak.at = choose_ints(int_mask(x > peak.level), k, peak.at);
-        peak.level = x > peak.level ? x : peak.level;
-        peak.not_finite |= not_finite_codes(x);
-    }
-    peak.found = ~dark_lanes(profiles, peak.level);
-    return peak;
-}
-
 #endif
 
 #ifdef AMBIGUITY
@@ -153,11 +136,13 @@ static inline codes highest_outside(const Profiles *profiles, ints peak) {
 #endif
 }
 
-// Lanes where a sample outside the window has at least `ratio` of the peak's light.
-static inline ints has_second(const Profiles *profiles, const Peak *peak, real ratio) {
-    const reals second = over_threshold(highest_outside(profiles, peak->at), profiles->threshold);
+// Lanes where the highest sample outside the window has at least `ratio` of the peak's light.
+static inline ints is_second(const Profiles *profiles, const Peak *peak, codes highest, real ratio) {
+    const reals second = over_threshold(highest, profiles->threshold);
     return int_mask(second > 0) & int_mask(second >= ratio * over_threshold(peak->level, profiles->threshold));
 }
+#else
+static inline codes highest_outside(const Profiles *profiles, ints peak) { return (codes)DARKEST; }
 #endif
 
 #endif

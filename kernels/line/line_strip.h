@@ -117,7 +117,7 @@ static inline void finish_quarter(const Profiles *profiles, const WidePeak *wide
         place = place_in_window(profiles, &peak, table);
 #endif
     }
-    finish_peak(profiles, &peak, &place, table, to, first, sample);
+    finish_peak(profiles, &peak, &place, highest_outside(profiles, peak.at), table, to, first, sample);
 }
 
 // Read the columns begin <= column < end, at most MAX_STRIP.
@@ -161,7 +161,7 @@ static inline void read_rows(const Profiles *profiles, constant LineTable *table
     peak.not_finite = *(const ints_at *)not_finite_mask;
     peak.found = ~dark_lanes(profiles, peak.level);
     const Place place = place_in_window(profiles, &peak, table);
-    finish_peak(profiles, &peak, &place, table, to, first, sample);
+    finish_peak(profiles, &peak, &place, highest_outside(profiles, peak.at), table, to, first, sample);
 }
 #endif
 #endif

@@ -10,9 +10,11 @@
 //          the lens or camera model; size (7,) int32: sizes, origin of the output and status of missing pixels; fill:
 //          value of pixels without a source.
 // Options: CODE, MAX_CODE (largest value of an integer CODE), CHANNELS (1 or 3, interleaved), BICUBIC (otherwise
-//          bilinear), BORDER_MASK, BORDER_CONSTANT, BORDER_REPLICATE or BORDER_REFLECT, FROM_MODEL, LENS or CAMERA,
+//          bilinear), QUAD (unsigned integer of four samples: work-item variant of bilinear integer images of one
+//          channel), BORDER_MASK, BORDER_CONSTANT, BORDER_REPLICATE or BORDER_REFLECT, FROM_MODEL, LENS or CAMERA,
 //          PAST_CACHES.
-// Variants: vector: a work-item per row and frame, in runs of 16 pixels; work-item: one pixel per item.
+// Variants: vector: a work-item per row and frame, in runs of 16 pixels; work-item: four neighbouring pixels per item
+//          under QUAD (undistort_image_quad.h), otherwise one pixel per item.
 #include "common/camera.h"
 #include "common/lanes.h"
 #include "common/lens.h"
@@ -49,20 +51,48 @@ void undistort(global const CODE *image, global CODE *made, global uchar *status
 #endif
 }
 #else
-// One work-item per pixel.
+#ifdef QUAD
+#include "undistort_image/undistort_image_quad.h"
+#define PIXELS 4
+#else
+#define PIXELS 1
+#endif
+
+// PIXELS neighbouring pixels per work-item.
 kernel void undistort(global const CODE *image, global CODE *made, global uchar *status, global const int4 *heads,
                       global const float8 *curves, global const float2 *points, constant real *model,
                       constant int *size, const float fill) {
-    const int column = get_global_id(0), row = get_global_id(1), columns = size[MADE_COLUMNS];
-    const size_t frame = get_global_id(2), pixel = (size_t)row * columns + column;
-    if (column >= columns || row >= size[MADE_ROWS]) return;
-    image += frame * size[SOURCE_ROWS] * size[SOURCE_COLUMNS] * CHANNELS;
+    const int begin = (int)get_global_id(0) * PIXELS, row = get_global_id(1), columns = size[MADE_COLUMNS];
+    const size_t frame = get_global_id(2), pixel = (size_t)row * columns + begin;
+    if (begin >= columns || row >= size[MADE_ROWS]) return;
+    const size_t samples = (size_t)size[SOURCE_ROWS] * size[SOURCE_COLUMNS] * CHANNELS, first = frame * samples;
     made += (frame * size[MADE_ROWS] * columns + pixel) * CHANNELS;
+#ifdef QUAD
+    if (begin + PIXELS <= columns) {
+        int source_column, source_row;
+        float x[PIXELS], y[PIXELS];
+        QUAD quad;
 #ifdef FROM_MODEL
-    const uchar found = computed_pixel(image, made, column, row, model, size, fill);
+        const int found = quad_places(begin, row, model, size, &source_column, &source_row, x, y);
 #else
-    const uchar found = mapped_pixel(image, made, column, row, heads, curves, points, size, fill);
+        const int found = quad_places(begin, row, heads, curves, points, size, &source_column, &source_row, x, y);
 #endif
-    if (frame == 0) status[pixel] = found;
+        if (found && interpolated_quad(image, first, get_global_size(2) * samples, source_column, source_row, x, y, size,
+                                       &quad)) {
+            store_quad(quad, made);
+            if (frame == 0) store_good_quad(status + pixel);
+            return;
+        }
+    }
+#endif
+    for (int k = 0; k < PIXELS && begin + k < columns; k++) {
+#ifdef FROM_MODEL
+        const uchar found = computed_pixel(image + first, made + k * CHANNELS, begin + k, row, model, size, fill);
+#else
+        const uchar found =
+            mapped_pixel(image + first, made + k * CHANNELS, begin + k, row, heads, curves, points, size, fill);
+#endif
+        if (frame == 0) status[pixel + k] = found;
+    }
 }
 #endif

@@ -76,7 +76,7 @@ def trace(
     group_size : int, optional
         Work-items of a group along the first axis. Default: as the operation launches it.
     offset : int
-        Bytes between an aligned address and the first element of every input and output, default 0.
+        Elements between an aligned address and the first element of every input and output, default 0.
 
     Raises
     ------
@@ -88,11 +88,13 @@ def trace(
     launch = operation.launch(GpuModel(), inputs[0].shape, inputs[0].dtype)
     kernel = parse_kernel(_assembly(launch), launch.kernel)
     memory, outputs = Memory(), {}
-    values: list[float] = [memory.add(f"input {number}", each.copy(), offset) for number, each in enumerate(inputs)]
+    values: list[float] = [
+        memory.add(f"input {number}", each.copy(), offset * each.itemsize) for number, each in enumerate(inputs)
+    ]
     for name, spec in launch.outputs.items():
         if spec is not None:
             outputs[name] = np.full(math.prod(spec[0]) * spec[1].itemsize, 255, np.uint8).view(spec[1]).reshape(spec[0])
-        values.append(0 if spec is None else memory.add(name, outputs[name], offset))
+        values.append(0 if spec is None else memory.add(name, outputs[name], offset * spec[1].itemsize))
     for number, argument in enumerate(launch.arguments):
         if isinstance(argument, np.ndarray):
             values.append(memory.add(f"table {number}", np.ascontiguousarray(argument)))

@@ -25,7 +25,7 @@ class DetectionStage:
     speed : float
         Largest unpredicted speed of the features [m/s], 0 or more, default 0.
     features : int
-        Number of features per frame, default 1.
+        Number of features per frame, default 1. Range: 1 or more.
 
     Raises
     ------

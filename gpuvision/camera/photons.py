@@ -73,7 +73,7 @@ def image_irradiance(
     f_number
         Focal length over the diameter of the aperture, above 0.
     magnification
-        Size of the image over the size of the object, default 0 (a far object).
+        Size of the image over the size of the object, default 0 (a far object). Range: 0 or more.
     transmission
         Part of the light that the lens transmits, above 0 to 1, default 1.
 

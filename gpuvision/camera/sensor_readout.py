@@ -53,17 +53,18 @@ class SensorReadout:
     pixel_clock : float
         Pixels per second of one tap [Hz], above 0.
     taps : int
-        Number of pixels that leave the sensor at the same time, default 1.
+        Number of pixels that leave the sensor at the same time, default 1. Range: 1 or more.
     shutter : {"global", "rolling"}
         "global": all rows collect light at the same time. "rolling": each row is read, and starts again, one row time
         after the row before. Default "global".
     row_overhead, frame_overhead : float
-        Time for each row and for each frame without pixels [s], default 0.
+        Time for each row and for each frame without pixels [s], default 0. Range: 0 or more.
     overlaps : bool
         Whether a global shutter collects light for a frame while the frame before is read. A rolling shutter always
         does so. Default True.
     buffers : int
         Number of complete frames that are stored before the transfer; each one adds a period to the delay. Default 0.
+        Range: 0 or more.
 
     Raises
     ------
@@ -107,7 +108,7 @@ class SensorReadout:
         shape
             Rows and columns of the region of interest that are read.
         exposure
-            Time during which a row collects light [s]; with ``flash`` the length of the flash.
+            Time during which a row collects light [s]; with ``flash`` the length of the flash. Range: above 0.
         flash
             Whether a flash is the only light. All rows then collect light at the same time; a rolling shutter has to
             open all rows before the flash and to read them after it. Default False.

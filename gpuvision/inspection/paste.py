@@ -46,10 +46,10 @@ class PasteSettings:
         Height above the board [m] from which on a cell counts to the area. Default: half of the stencil.
     margin : float
         Distance from the aperture [m] up to which paste belongs to it. Default 50 um. Of two apertures, a cell belongs
-        to the nearest.
+        to the nearest. Range: 0 or more.
     ring : float
         Width of the ring around the margin [m] in which the board is the reference. Default 0.2 mm; wider where the
-        ring has too few cells.
+        ring has too few cells. Range: above 0.
     reference_order : int
         Order of the reference surface, 0 to 2. Default 1: a plane.
     pad_height : float
@@ -58,7 +58,7 @@ class PasteSettings:
     least_valid : float
         Least fraction of cells with a height, above 0, at most 1; below it a deposit is not measured. Default 0.8.
     least_reference : int
-        Least number of cells of the reference surface. Default 30.
+        Least number of cells of the reference surface. Default 30. Range: 7 or more.
 
     Raises
     ------

@@ -150,9 +150,10 @@ class FocusStack:
         |2 I - I_up - I_down|`` over the window and suits a textured surface; ``"intensity"`` is the grey level itself,
         for points of light behind pinholes (confocal), as in section 2.3.4 of the thesis.
     window : int
-        Half size of the window of the Laplacian [px], default 2: 5 x 5 pixels. 0 is one pixel.
+        Half size of the window of the Laplacian [px], default 2: 5 x 5 pixels. 0 is one pixel. Range: 0 or more.
     neighbours : int
-        Frames before and after the sharpest one to which the Gaussian is fitted, default 1: three frames.
+        Frames before and after the sharpest one to which the Gaussian is fitted, default 1: three frames. Range: 1 or
+        more.
     threshold : float
         Smallest focus measure of a valid pixel [grey levels; mean over the window], default 0.
     ambiguity : float, optional
@@ -167,7 +168,7 @@ class FocusStack:
         the heights. Default: not known.
     gain : float
         Grey levels per electron, for shot noise: the variance of a pixel is ``read_noise**2 + gain * level``, plus 1/12
-        for integer frames. 0, the default: no shot noise. Only with ``read_noise``.
+        for integer frames. 0, the default: no shot noise. Only with ``read_noise``. Range: 0 or more.
 
     Raises
     ------

@@ -145,7 +145,7 @@ class LineReadout(VisionOperation[LineReading]):
         Default 1 and no limit. A hot pixel is a run of 1.
     saturation : float, optional
         Level at which a sample is saturated [grey levels]; default: the largest code of integer frames, no limit for
-        float32. ``"ml"`` leaves saturated samples out of the fit.
+        float32. ``"ml"`` leaves saturated samples out of the fit. Range: above 0.
     ambiguity : float, optional
         Fraction of the peak's light, above 0, at most 1. A sample outside the window with at least this fraction sets
         the flag AMBIGUOUS. Default: no search for such samples.

@@ -53,7 +53,7 @@ class PidGains:
     integral : float
         Time constant of the integral part [s]; infinite (default) for none.
     derivative : float
-        Time constant of the derivative part [s]; 0 (default) for none.
+        Time constant of the derivative part [s]; 0 (default) for none. Range: 0 or more.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def gains_without_oscillation(delay: float, period: float) -> PidGains:
     delay : float
         Delay from the middle of the exposure to the command [s]: `DelayBudget.latency`, or a measured delay.
     period : float
-        Time between two frames [s].
+        Time between two frames [s]. Range: above 0.
     """
     period = finite(period, "period", above=0.0)
     return PidGains(proportional=non_oscillating_gain(delay / period) / period)
@@ -94,9 +94,10 @@ def simc_gains(delay: float, *, lag: float = 0.0, closed_loop: float | None = No
     delay : float
         Total delay [s], with half a frame for the hold: `DelayBudget.total`. Above 0.
     lag : float
-        Time constant of the velocity of the plant [s]; the derivative part cancels it. Default 0.
+        Time constant of the velocity of the plant [s]; the derivative part cancels it. Default 0. Range: 0 or more.
     closed_loop : float, optional
         Wanted time constant of the closed loop [s]. Default: the delay, Skogestad's compromise of speed and margin.
+        Range: above 0.
     integral : bool
         Whether the controller has an integral part, which removes constant disturbances. Default True.
 
@@ -212,12 +213,12 @@ class SmithPredictor:
     Parameters
     ----------
     delay : float
-        Delay of the measurements [s].
+        Delay of the measurements [s]. Range: 0 or more.
     lag : array_like
         (3,) time constants with which the velocities of the axes follow the command [s], 0 or more; 0 (default) follows
         at once.
     plant_gain : float
-        Velocity of the plant per commanded velocity. Default 1.
+        Velocity of the plant per commanded velocity. Default 1. Range: above 0.
     history : int
         Number of commands that are kept. Default 256.
 

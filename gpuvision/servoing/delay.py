@@ -356,7 +356,7 @@ class DelayBudget:
     Parameters
     ----------
     period : float
-        Time between two frames [s].
+        Time between two frames [s]. Range: above 0.
     exposure : float
         Time of exposure [s], 0 or more. Half of it counts. Default 0.
     readout : float

@@ -80,11 +80,11 @@ def excitation(count: int, speed: float, *, hold: int = 4, seed: int = 0) -> Flo
     Parameters
     ----------
     count : int
-        Number of frames.
+        Number of frames. Range: 1 or more.
     speed : float
-        Velocity of the motions [m/s] or [rad/s].
+        Velocity of the motions [m/s] or [rad/s]. Range: above 0.
     hold : int
-        Number of frames for which each velocity lasts. Default 4.
+        Number of frames for which each velocity lasts. Default 4. Range: 1 or more.
     seed : int
         Seed of the sequence. Default 0.
 
@@ -105,7 +105,7 @@ def chirp(count: int, period: float, amplitude: float, low: float, high: float) 
     Parameters
     ----------
     count : int
-        Number of frames.
+        Number of frames. Range: 2 or more.
     period : float
         Frame time [s].
     amplitude : float

@@ -169,7 +169,7 @@ def normal_delays(mean: float, sigma: float) -> tuple[Float64, Float64]:
     Parameters
     ----------
     mean, sigma : float
-        Mean and standard deviation of the delay [frames].
+        Mean and standard deviation of the delay [frames]. Range: 0 or more.
     """
     nodes = np.linspace(-_RANGE, _RANGE, _NODES)
     weights = np.exp(-0.5 * nodes**2)

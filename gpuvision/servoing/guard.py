@@ -43,7 +43,8 @@ class LoopLimits:
     Parameters
     ----------
     hold_after : float
-        Age of the newest accepted exposure from which on the head stands still [s]. Default 10 ms (chosen).
+        Age of the newest accepted exposure from which on the head stands still [s]. Default 10 ms (chosen). Range:
+        above 0.
     abort_after : float
         Age from which on the loop gives up [s]. Default 0.1 s (chosen).
     gated : int
@@ -51,7 +52,7 @@ class LoopLimits:
         measurement is beyond the gate once in 1000.
     margin_sigmas : float
         Largest travel beyond the error of a measured pose [standard deviations of this pose].
-        Default 3.
+        Default 3. Range: 0 or more.
     overshoot : tuple of float
         Travel beyond the error of a measured pose by the overshoot of the step response [m], [m], [rad], which is
         allowed only in frames with a new trusted pose. Default 0: a controller with an integral part is slower then,

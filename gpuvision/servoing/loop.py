@@ -102,7 +102,8 @@ class WallClock:
     Parameters
     ----------
     spin : float
-        Time of polling at the end of a wait [s]: the operating system may end a sleep late. Default 0.2 ms.
+        Time of polling at the end of a wait [s]: the operating system may end a sleep late. Default 0.2 ms. Range: 0 or
+        more.
 
     Attributes
     ----------
@@ -202,7 +203,7 @@ class ServoLoop:
     clock : Clock
         `WallClock`, or `SimulatedClock` for a simulation.
     period : float
-        Frame time [s].
+        Frame time [s]. Range: above 0.
     limits : LoopLimits, optional
         Thresholds of the guards. None switches them off: the loop may then diverge. Default: `LoopLimits()`.
 
@@ -241,7 +242,7 @@ class ServoLoop:
         target : array_like or function
             (3,): x [m], y [m], theta [rad]; or a function of the time [s] that returns pose and velocity.
         duration : float
-            Longest time [s].
+            Longest time [s]. Range: above 0.
         settling : SettlingRule, optional
             Rule that ends the loop. Default: the loop runs for the duration.
         """

@@ -29,7 +29,7 @@ def low_latency(*, core: int | None = None, priority: int = 0) -> Iterator[None]
     Parameters
     ----------
     core : int, optional
-        Core on which the calling thread runs. Default: the cores that it may use now.
+        Core on which the calling thread runs. Default: the cores that it may use now. Range: 0 or more.
     priority : int
         Real-time priority (SCHED_FIFO) of the calling thread, 1 (lowest) to 99; 0 (default) keeps the ordinary
         scheduling. Other programs then interrupt the thread only with a higher priority. 1 to 50 is usual: interrupt

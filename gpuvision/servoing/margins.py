@@ -70,11 +70,11 @@ def open_loop(
     delay : float
         Delay from the middle of the exposure to the command [s].
     period : float
-        Frame time [s].
+        Frame time [s]. Range: above 0.
     z : array_like
         (...,) complex numbers, not 1.
     lag : float
-        Time constant with which the plant follows the commanded velocity [s]. Default 0.
+        Time constant with which the plant follows the commanded velocity [s]. Default 0. Range: 0 or more.
     """
     z = np.asarray(z, np.complex128)
     whole, part = delay_taps(delay / finite(period, "period", above=0.0))
@@ -235,7 +235,7 @@ def observer_matrix(
         Time constant of the velocity in the `MotionModel` of the observer [frames]. Default 0.
     noise_ratio : float
         Standard deviation of the random motion of the model during a frame, over the standard deviation of a
-        measurement. Default 1.
+        measurement. Default 1. Range: above 0.
     plant_delay, plant_lag : float, optional
         Delay and time constant of the plant [frames]. Default: the values of the model.
     plant_gain : float

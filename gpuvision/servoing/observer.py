@@ -212,7 +212,7 @@ class PoseObserver:
         the oldest of them is refused.
     gate : float
         Squared Mahalanobis distance above which a measurement is not taken. Default 16.27: a valid measurement
-        exceeds it with a probability of 0.001.
+        exceeds it with a probability of 0.001. Range: above 0.
 
     Raises
     ------

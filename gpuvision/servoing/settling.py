@@ -201,11 +201,11 @@ class VibrationSettling:
     damping : array_like
         (3,) damping ratios. Default 0.02.
     miss_probability : float
-        Largest probability of an error beyond the tolerance. Default 0.0027 (3 sigma).
+        Largest probability of an error beyond the tolerance. Default 0.0027 (3 sigma). Range: above 0 to 1.
     window : int
         Number of the last errors to which the vibration is fitted, 4 or more. Default 24.
     lead : float
-        Time from the decision to the contact of the part with the board [s]. Default 0.
+        Time from the decision to the contact of the part with the board [s]. Default 0. Range: 0 or more.
     is_filtered : bool
         Whether the errors are estimates of a filter, such as `PoseObserver`, whose noise is correlated from one frame
         to the next. False for independent measurements, such as from `LatestPose` with a new pose in each frame.

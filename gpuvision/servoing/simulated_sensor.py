@@ -24,18 +24,18 @@ class SimulatedPoseSensor:
     pose : function
         True pose (n, 3) at times (n,) [s], such as `SimulatedPlant.pose`.
     period : float
-        Time between two frames [s].
+        Time between two frames [s]. Range: above 0.
     delay : float
         Time from the middle of the exposure to the arrival of the pose [s]. Without jitter frame k arrives at
-        ``k * period``, for every delay: in time for frame k of a loop that starts at 0.
+        ``k * period``, for every delay: in time for frame k of a loop that starts at 0. Range: 0 or more.
     exposure : float
-        Time of exposure [s]: the pose is the mean over it. Default 0.
+        Time of exposure [s]: the pose is the mean over it. Default 0. Range: 0 or more.
     covariance : array_like
         (3, 3): covariance of the noise. Default 1e-12 for each axis (1 um, 1 urad).
     is_noisy : bool
         Whether the noise is added to the poses. Default True.
     jitter : float
-        Standard deviation of the delay, normally distributed and not below 0 [s]. Default 0.
+        Standard deviation of the delay, normally distributed and not below 0 [s]. Default 0. Range: 0 or more.
     fault : function, optional
         Fault of each frame; see `Fault`.
     seed : int

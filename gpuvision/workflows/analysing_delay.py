@@ -260,7 +260,7 @@ def analyse_delay(
     recording : LoopRecording, optional
         Recording of an excited axis; its delay is measured and used instead of the delay of the budget.
     jitter : float, optional
-        Standard deviation of the delay [s]. Default: the jitter of the recording, or 0.
+        Standard deviation of the delay [s]. Default: the jitter of the recording, or 0. Range: 0 or more.
 
     Raises
     ------

@@ -160,7 +160,7 @@ def inspect_leads(
         Place of the regions in the height map. Default: they are in the coordinates of the height map.
     sigma : float, optional
         Random standard deviation of all heights [m]. Default: ``heights.sigma``, or else estimated.
-        ``heights.phase`` is added in both cases, as an error that the cells of a lead share.
+        ``heights.phase`` is added in both cases, as an error that the cells of a lead share. Range: above 0.
     correlation_area : float
         Number of cells whose noise is common, 1 or more. Default 1.
     centre : tuple of float, optional

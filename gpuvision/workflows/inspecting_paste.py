@@ -42,7 +42,7 @@ class VolumeLimits:
     Parameters
     ----------
     minimum, maximum : float
-        Least and greatest fraction. Default 0.5 and 1.5.
+        Least and greatest fraction. Default 0.5 and 1.5. Range: 0 or more.
 
     Raises
     ------
@@ -317,7 +317,8 @@ def inspect_paste(
         Largest shift [m] and rotation [rad] of the search. Default 2 mm and 3 degrees.
     sigma : float, optional
         Random standard deviation of all heights [m]. Default: ``heights.sigma``, or else estimated; see
-        `measure_deposits`. ``heights.phase`` is added in both cases, as an error that neighbouring cells share.
+        `measure_deposits`. ``heights.phase`` is added in both cases, as an error that neighbouring cells share. Range:
+        above 0.
     correlation_area : float, optional
         Number of cells whose noise is common. Default: estimated; see `measure_deposits`.
     limits : VolumeLimits

@@ -36,7 +36,7 @@ def sensor_imaging(
     pixel : float
         Size of a pixel on the board [m].
     white_electrons : float
-        Photoelectrons of white board during the exposure, see `CmosSensor.electrons`.
+        Photoelectrons of white board during the exposure, see `CmosSensor.electrons`. Range: above 0.
     exposure : float
         Exposure time for the dark current [s], default 0.
     reflectance : BoardReflectance, optional
@@ -107,7 +107,7 @@ def smallest_exposure(
     pixel : float
         Size of a pixel on the board [m].
     speed : float
-        Speed of the board across its edges [m/s], default 0: motion blur.
+        Speed of the board across its edges [m/s], default 0: motion blur. Range: 0 or more.
     bare : bool
         True: edges of bare copper. Default False: edges under the mask.
     reflectance : BoardReflectance, optional

@@ -30,7 +30,7 @@ class Imaging:
         Height of the step at an edge over the noise of a pixel, above 0, for bare copper (default 40) and for copper
         under the mask (default 15).
     width_px : int
-        Number of lines that a ruler averages, default 5.
+        Number of lines that a ruler averages, default 5. Range: 1 or more.
     etch_bias_sigma : float
         Standard deviation of the etch bias, common to the whole board [m], default 10 um.
     registration : float

@@ -204,7 +204,7 @@ class RulerEdges(VisionOperation[Edges]):
         Ratio of the second strongest to the strongest gradient from which on the edge is flagged AMBIGUOUS, above 0 to
         1, with ``edge_selection="strongest"`` only. None: no check.
     saturation : float, optional
-        Grey level from which on a sample is saturated. None: no check.
+        Grey level from which on a sample is saturated. None: no check. Range: above 0.
     noise : float
         Standard deviation of a pixel [grey levels], 0 or more, default 1. The rounding of integer images is added.
     radius_px : float, optional

@@ -130,7 +130,7 @@ class CameraFeatures:
     placement : (float, float)
         Placement point on the artwork [m].
     pixel_size : float
-        Size of a pixel on the board [m].
+        Size of a pixel on the board [m]. Range: above 0.
     frame_shape : (int, int)
         Rows and columns of the full image, whose middle the pose refers to.
     mirrored : bool

@@ -108,7 +108,7 @@ class Settling:
         machine needs them.
     miss_probability : float
         Largest probability that the head leaves the tolerance after the release, for the rule "vibration". Default
-        0.0027 (3 sigma).
+        0.0027 (3 sigma). Range: above 0 to 1.
     window : int
         Number of the last errors to which the rule "vibration" fits the vibration, 4 or more. Default 24.
     lead : float

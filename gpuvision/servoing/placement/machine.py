@@ -46,9 +46,10 @@ class PlacementCamera:
     exposure : float
         Exposure time [s], above 0.
     electrons : float, optional
-        Photoelectrons of a white board during the exposure. Default: 0.8 of the saturation of the sensor.
+        Photoelectrons of a white board during the exposure. Default: 0.8 of the saturation of the sensor. Range: above
+        0.
     blur_px : float
-        Standard deviation of the blur of the lens [px], without the extent of a pixel; default 0.5.
+        Standard deviation of the blur of the lens [px], without the extent of a pixel; default 0.5. Range: 0 or more.
     mirrored : bool
         The camera sees the bottom side of the board, as `BoardView.mirrored`; see `Machine.for_side`. Default False.
     lens : Lens or Camera, optional
@@ -135,7 +136,7 @@ class Tolerance:
     max_time : float
         Time after which a placement is aborted [s], above 0; default 1 s.
     max_refused : int
-        Number of frames in a row without a valid pose after which a placement is aborted; default 20.
+        Number of frames in a row without a valid pose after which a placement is aborted; default 20. Range: 1 or more.
 
     Raises
     ------

@@ -106,9 +106,9 @@ class RenderBoard(VisionOperation[BoardImage]):
         Sensor. Default: none; the image is the reflectance in float32.
     electrons : float
         Photoelectrons of white board (reflectance 1) during the exposure; with a sensor only. Default: 0.8 of its
-        saturation.
+        saturation. Range: above 0.
     exposure : float
-        Exposure time for the dark current [s], default 0.
+        Exposure time for the dark current [s], default 0. Range: 0 or more.
     noise : bool
         Whether noise from frame to frame is added. Default True.
     seed : int

@@ -262,6 +262,13 @@ def test_pairs_have_the_middle_whatever_the_width(device: Device, variant: Any, 
     np.testing.assert_allclose(ours.spacing, spacing, rtol=0, atol=0.02)
     single = replace(operation, pairs=False)(image, rulers, device=device)
     np.testing.assert_allclose(ours.sigma, single.sigma / math.sqrt(2.0), rtol=0.05)
+    # All outputs are those of the two edges measured one by one.
+    second = replace(operation, pairs=False, polarity="falling")(image, rulers, device=device)
+    np.testing.assert_allclose(ours.position, 0.5 * (single.position + second.position), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(ours.spacing, second.position - single.position, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(ours.amplitude, 0.5 * (single.amplitude - second.amplitude), rtol=1e-5)
+    np.testing.assert_allclose(ours.width, 0.5 * (single.width + second.width), rtol=1e-5)
+    np.testing.assert_allclose(ours.sigma, 0.5 * np.hypot(single.sigma, second.sigma), rtol=1e-5)
     # The same stripe is not found as a dark stripe.
     dark = replace(operation, polarity="falling")(image, rulers, device=device)
     assert (dark.status == Status.LOW_SIGNAL).all()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from gpuvision.host import Device, to_numpy
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.features.feature_set import edge_clearance
 from gpuvision.servoing.frames import compose_poses
+from gpuvision.servoing.observer import SAME_TIME
+from gpuvision.servoing.placement import vision
 from gpuvision.servoing.placement.board_renderer import board_renderer
 from gpuvision.servoing.placement.budget import predict_budget
 from gpuvision.servoing.placement.control import Control
@@ -146,3 +149,27 @@ def test_sampling_error_of_frames_without_noise_is_within_the_budget(
     error = compose_poses(np.array(found), nozzle) - compose_poses(poses, nozzle)
     ratio = np.sqrt(np.mean(error**2, axis=0) / np.diag(plan.sampling))
     assert np.all((ratio > 0.1) & (ratio < 1.0)), ratio
+
+
+def test_frames_that_arrive_during_the_registration_are_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first frame is registered, which takes 0.25 s; the next one is the first that arrives after that."""
+    monkeypatch.setattr(vision, "move_view", lambda view, pose: SimpleNamespace(pose=pose))
+    sensor: Any = object.__new__(BoardPoseSensor)
+    searched: list[int] = []
+
+    def landing(image: int, device: Any) -> Any:
+        searched.append(image)
+        return SimpleNamespace(status=int(image == 0), pose=(1.0, 2.0, 3.0))
+
+    sensor._plan, sensor._view, sensor._device = SimpleNamespace(camera_pose=np.zeros(3), landing=landing), None, None
+    sensor._undistort, sensor._landing_time, sensor._measure = None, 0.25, lambda frame, predicted: frame.image
+    ready = (0.5 + 0.25) + 0.25
+    times = [0.5, 0.6, 0.75, 0.8, np.nextafter(ready - SAME_TIME, 0.0), ready - SAME_TIME, 1.5]
+    frames = [SimpleNamespace(image=k, exposed=each - 0.1, arrived=each) for k, each in enumerate(times)]
+    sensor.camera = lambda time: frames
+    sensor.reset()
+    refused, *measured = sensor(2.0)
+    assert (refused.exposed, refused.arrived, refused.status) == (0.4, 0.5, 1)
+    assert searched == [0, 2]
+    assert measured == [5, 6]
+    assert sensor._last.tolist() == [1.0, 2.0, 3.0]

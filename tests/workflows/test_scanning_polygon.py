@@ -69,6 +69,7 @@ def test_a_tilted_plane(device: Device) -> None:
     np.testing.assert_allclose(done.heights.z[known], plane[known], rtol=0, atol=2e-6)
 
 
+@pytest.mark.double
 def test_noise_scatters_the_points_by_the_predicted_sigma(device: Device, rng: np.random.Generator) -> None:
     """Noise of the currents moves a spot along its beam: by its sigma in x and z, and not in y."""
     currents, _, _ = recording(0.05, 0.1)

@@ -221,6 +221,22 @@ def test_covers() -> None:
     assert not camera(-0.4, matrix=wide).covers((1280, 1024))
 
 
+def test_the_whole_border_is_covered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each pixel of the border is tested, and no pixel beyond it; a single one without an ideal point suffices."""
+    border = {(x, y) for x in range(5) for y in range(4) if x in (0, 4) or y in (0, 3)}
+    asked: list[tuple[int, int]] = []
+    for lost in (None, *sorted(border)):
+        asked.clear()
+
+        def undistort(_: Camera, points: np.ndarray, lost: object = lost) -> np.ndarray:
+            asked.extend((int(x), int(y)) for x, y in points)
+            return np.array([[np.nan] * 2 if each == lost else each for each in asked], np.float64)
+
+        monkeypatch.setattr(Camera, "undistort", undistort)
+        assert camera(-0.12).covers((5, 4)) == (lost is None)
+        assert set(asked) == border
+
+
 # ---- other properties ---------------------------------------------------------------------------------------
 
 

@@ -42,7 +42,6 @@ LONGEST_PROFILE = 32767  # samples: the vector variant keeps sample indices in 1
 WIDEST_WINDOW = 180  # samples on either side: sums of 16-bit samples times their index fit 32 bits
 _LANES = 16  # of a vector of the vector variant: its kernel's vectors have 16 elements
 _GROUP = 64  # work-items of a work-group that selects among candidates
-_TOGETHER = 256  # work-items of a work-group that reads profiles together: GROUP in line_group.h
 _STRIP = 1024  # largest number of columns of a strip: MAX_STRIP in line_strip.h
 _FIELDS = ("position", "peak", "width", "total", "status")  # default outputs without a triangulation
 _WIDE_BYTES = 64  # bytes of a wide vector (one cache line): WIDE in line_wide.h
@@ -358,9 +357,12 @@ class LineReadout(VisionOperation[LineReading]):
         """Return the work size of the work-item variant."""
         if self._has_candidates:
             return WorkSize((round_up(samples, _GROUP), frames), (_GROUP, 1))
-        # PROFILES in line_group.h
-        profiles = 8 if self.along == "rows" else 64 if dtype.itemsize == 1 else 32
-        return WorkSize((ceil_div(samples, profiles) * _TOGETHER, frames), (_TOGETHER, 1))
+        # GROUP and PROFILES in line_group.h
+        if self.method == "ml":
+            group, profiles = 64, 64
+        else:
+            group, profiles = 256, 64 if dtype.itemsize == 1 and self.along == "columns" else 32
+        return WorkSize((ceil_div(samples, profiles) * group, frames), (group, 1))
 
     def _items(self, device: Device, frames: int, samples: int) -> int:
         """Return the work-items per frame of the vector variant: few, but two per core at least over all frames."""

@@ -25,7 +25,7 @@
 //          LENS_K2, LENS_K3, LENS_K4, CAMERA, CAMERA_PROFILES (terms of the table of corrections), PAST_CACHES,
 //          VECTOR_VARIANT.
 // Work:    global size (work-items of a frame, frames). Vector variant: a work-item reads a strip of columns, or 16
-//          rows; under CANDIDATES 16 profiles. Otherwise: a work-group reads 32 or 64 columns, or 8 rows, together
+//          rows; under CANDIDATES 16 profiles. Otherwise: a work-group reads 32 or 64 columns, or 32 or 64 rows, together
 //          (line_group.h); under CANDIDATES one work-item per profile, padded to whole work-groups.
 #include "line/line_profiles.h"
 #include "common/sheet.h"

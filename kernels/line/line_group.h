@@ -3,23 +3,37 @@
 //
 // SLICES work-items share a profile. Columns: a work-item reads PER columns at once, in every SLICES-th row; a warp reads
 // parts of one or two rows that are 64 bytes wide, or 128 for float samples. ALONG_ROWS: a warp reads a row, PER samples
-// for each work-item at once. Each work-item keeps a part (sums, or the largest sample); the parts of a profile are
-// joined in local memory, and one work-item finishes the profile. The joined result does not depend on the order of the
-// parts, but for rounding of float sums: integer sums are exact, and of equally large samples the first one is the peak.
+// for each work-item at once, and HELD rows one after the other. Each work-item keeps HELD parts (sums, or the largest
+// sample), one for each of its profiles; the parts of a profile are joined in local memory, and one work-item finishes
+// the profile. The joined result does not depend on the order of the parts, but for rounding of float sums: integer sums
+// are exact, and of equally large samples the first one is the peak.
+//
+// A group keeps its registers until its last work-item ends. The fit of METHOD_ML takes longer than the search, so that
+// its groups have a work-item to finish each profile; along rows, 8 work-items then read 32 bytes of a row.
 #ifndef LINE_GROUP_H
 #define LINE_GROUP_H
 
-#define GROUP 256           // work-items (_GROUP in gpuvision/ranging/line.py)
+// Work-items and profiles of a group: LineReadout._groups in gpuvision/ranging/line.py has the same numbers.
+#ifdef METHOD_ML
+#define GROUP 64
+#define PROFILES 64
+#else
+#define GROUP 256
+#if CODE_BITS == 8 && !defined(ALONG_ROWS)
+#define PROFILES 64
+#else
+#define PROFILES 32
+#endif
+#endif
 #define PER (32 / CODE_BITS)  // samples of a load of 4 bytes
 #ifdef ALONG_ROWS
-#define PROFILES 8  // _PROFILES in gpuvision/ranging/line.py
-#define SLICES (GROUP / PROFILES)
-#define HELD 1  // profiles of a work-item
+#define HELD (GROUP == 64 ? 8 : 4)
+#define HELD_STEP (PROFILES / HELD)  // from one profile of a work-item to its next one
 #else
-#define PROFILES (CODE_BITS == 8 ? 64 : 32)
-#define SLICES (GROUP * PER / PROFILES)
 #define HELD PER
+#define HELD_STEP 1
 #endif
+#define SLICES (GROUP * HELD / PROFILES)
 
 // Type of a sample in local memory: structs of 4-byte numbers have no gaps. Mesa 22.3 (rusticl) loses members of 1 and 2
 // bytes where it copies a struct.
@@ -134,7 +148,7 @@ static inline Seat seat_of_item(void) {
 #ifdef ALONG_ROWS
     const Seat seat = {item % SLICES, item / SLICES};
 #else
-    const Seat seat = {item / (PROFILES / PER), item % (PROFILES / PER) * PER};
+    const Seat seat = {item / (PROFILES / HELD), item % (PROFILES / HELD) * HELD};
 #endif
     return seat;
 }
@@ -160,29 +174,38 @@ static inline void load_row_part(global const CODE *at, int is_aligned, int coun
 #endif
 }
 
-// Read the samples of this work-item: HELD parts, one for each of its profiles.
-static inline void read_parts(const Profiles *frame, int samples, int begin, Seat seat, Part *parts) {
-    for (int i = 0; i < HELD; i++) parts[i] = empty_part();
+// Place of number i of the HELD profiles of a work-item in arrays (SLICES, PROFILES) of local memory.
+static inline int held_place(Seat seat, int i) { return seat.slice * PROFILES + seat.profile + i * HELD_STEP; }
+
+// Read the samples of this work-item; store HELD parts, one for each of its profiles.
+static inline void read_parts(const Profiles *frame, int samples, int begin, Seat seat, local Part *parts) {
     const int first = begin + seat.profile;
-    if (first >= samples) return;
 #ifdef ALONG_ROWS
     const int is_aligned = has_aligned_rows(frame, frame->length);
-    global const CODE *row = frame->first + (long)first * frame->lane_stride;
-    _Pragma("unroll 4") for (int k = seat.slice * PER; k < frame->length; k += SLICES * PER) {
-        CODE x[PER];
-        load_row_part(row + k, is_aligned, frame->length - k, x);
-        for (int i = 0; i < PER; i++) {
-            if (k + i < frame->length) add_to_part(&parts[0], x[i], k + i, frame->threshold);
+    for (int held = 0; held < HELD; held++) {
+        Part part = empty_part();
+        const int number = first + held * HELD_STEP, end = number < samples ? frame->length : 0;
+        global const CODE *row = frame->first + (long)number * frame->lane_stride;
+        _Pragma("unroll 4") for (int k = seat.slice * PER; k < end; k += SLICES * PER) {
+            CODE x[PER];
+            load_row_part(row + k, is_aligned, end - k, x);
+            for (int i = 0; i < PER; i++) {
+                if (k + i < end) add_to_part(&part, x[i], k + i, frame->threshold);
+            }
         }
+        parts[held_place(seat, held)] = part;
     }
 #else
-    const int is_aligned = has_aligned_rows(frame, samples);
+    Part part[HELD];
+    for (int i = 0; i < HELD; i++) part[i] = empty_part();
+    const int is_aligned = has_aligned_rows(frame, samples), end = first < samples ? frame->length : 0;
     global const CODE *at = frame->first + first;
-    _Pragma("unroll 4") for (int k = seat.slice; k < frame->length; k += SLICES) {
+    _Pragma("unroll 4") for (int k = seat.slice; k < end; k += SLICES) {
         CODE x[PER];
         load_row_part(at + (long)k * frame->stride, is_aligned, samples - first, x);
-        for (int i = 0; i < PER; i++) add_to_part(&parts[i], x[i], k, frame->threshold);
+        for (int i = 0; i < HELD; i++) add_to_part(&part[i], x[i], k, frame->threshold);
     }
+    for (int i = 0; i < HELD; i++) parts[held_place(seat, i)] = part[i];
 #endif
 }
 
@@ -225,34 +248,41 @@ static inline Peak peak_of_part(const Part *part, const Profiles *profiles) {
 #endif
 
 #ifdef AMBIGUITY
-// Find the highest sample outside the windows around the peaks `at`, among the samples of this work-item.
+// Store the highest samples outside the windows around the peaks `at`, among the samples of this work-item.
 static inline void read_outside(const Profiles *frame, int samples, int begin, Seat seat, local const int *at,
-                                CODE *highest) {
-    for (int i = 0; i < HELD; i++) highest[i] = DARKEST;
+                                local kept_code *outside) {
     const int first = begin + seat.profile;
-    if (first >= samples) return;
 #ifdef ALONG_ROWS
-    const int is_aligned = has_aligned_rows(frame, frame->length), peak = at[seat.profile];
-    global const CODE *row = frame->first + (long)first * frame->lane_stride;
-    for (int k = seat.slice * PER; k < frame->length; k += SLICES * PER) {
-        CODE x[PER];
-        load_row_part(row + k, is_aligned, frame->length - k, x);
-        for (int i = 0; i < PER; i++) {
-            const int counts = k + i < frame->length && (int)abs(k + i - peak) > RADIUS;
-            highest[0] = counts && x[i] > highest[0] ? x[i] : highest[0];
+    const int is_aligned = has_aligned_rows(frame, frame->length);
+    for (int held = 0; held < HELD; held++) {
+        CODE level = DARKEST;
+        const int number = first + held * HELD_STEP, end = number < samples ? frame->length : 0;
+        const int peak = at[seat.profile + held * HELD_STEP];
+        global const CODE *row = frame->first + (long)number * frame->lane_stride;
+        for (int k = seat.slice * PER; k < end; k += SLICES * PER) {
+            CODE x[PER];
+            load_row_part(row + k, is_aligned, end - k, x);
+            for (int i = 0; i < PER; i++) {
+                const int counts = k + i < end && (int)abs(k + i - peak) > RADIUS;
+                level = counts && x[i] > level ? x[i] : level;
+            }
         }
+        outside[held_place(seat, held)] = level;
     }
 #else
-    const int is_aligned = has_aligned_rows(frame, samples);
+    CODE highest[HELD];
+    for (int i = 0; i < HELD; i++) highest[i] = DARKEST;
+    const int is_aligned = has_aligned_rows(frame, samples), end = first < samples ? frame->length : 0;
     global const CODE *from = frame->first + first;
-    for (int k = seat.slice; k < frame->length; k += SLICES) {
+    for (int k = seat.slice; k < end; k += SLICES) {
         CODE x[PER];
         load_row_part(from + (long)k * frame->stride, is_aligned, samples - first, x);
-        for (int i = 0; i < PER; i++) {
+        for (int i = 0; i < HELD; i++) {
             const int counts = (int)abs(k - at[seat.profile + i]) > RADIUS;
             highest[i] = counts && x[i] > highest[i] ? x[i] : highest[i];
         }
     }
+    for (int i = 0; i < HELD; i++) outside[held_place(seat, i)] = highest[i];
 #endif
 }
 #endif
@@ -272,9 +302,7 @@ static inline void read_group(const Profiles *frame, int samples, constant LineT
     const Seat seat = seat_of_item();
     const int begin = (int)get_group_id(0) * PROFILES, item = get_local_id(0), sample = begin + item;
     const int finishes = item < PROFILES && sample < samples;
-    Part parts[HELD];
-    read_parts(frame, samples, begin, seat, parts);
-    for (int i = 0; i < HELD; i++) shared->parts[seat.slice * PROFILES + seat.profile + i] = parts[i];
+    read_parts(frame, samples, begin, seat, shared->parts);
     barrier(CLK_LOCAL_MEM_FENCE);
     const Profiles profiles = profiles_from(frame, finishes ? sample : 0);
 #if defined(METHOD_CENTROID)
@@ -293,9 +321,7 @@ static inline void read_group(const Profiles *frame, int samples, constant LineT
 #ifdef AMBIGUITY
     if (finishes) shared->at[item] = peak.at;
     barrier(CLK_LOCAL_MEM_FENCE);
-    CODE highest[HELD];
-    read_outside(frame, samples, begin, seat, shared->at, highest);
-    for (int i = 0; i < HELD; i++) shared->outside[seat.slice * PROFILES + seat.profile + i] = highest[i];
+    read_outside(frame, samples, begin, seat, shared->at, shared->outside);
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int slice = 0; finishes && slice < SLICES; slice++) {
         second = higher_of(second, (CODE)shared->outside[slice * PROFILES + item]);

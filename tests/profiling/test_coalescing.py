@@ -153,7 +153,7 @@ STREAMS: list[tuple[str, Any, list[NDArray[Any]], float, float]] = [
     ("line, columns, float", gv.LineReadout(threshold=20), [_frames(np.float32)], 1.22, 1.0),
     ("line, columns, ambiguity", gv.LineReadout(threshold=20, ambiguity=0.5), [_frames(np.uint8)], 1.46, 1.0),
     ("centroid, columns", gv.LineReadout(method="centroid", threshold=20), [_frames(np.uint8)], 1.0, 1.0),
-    ("line, rows", gv.LineReadout(threshold=20, along="rows"), [_ROW], 1.67, 1.0),
+    ("line, rows", gv.LineReadout(threshold=20, along="rows"), [_ROW], 1.75, 1.0),
     ("centroid, rows", gv.LineReadout(method="centroid", threshold=20, along="rows"), [_ROW], 1.06, 1.0),
     ("image", gv.UndistortImage(model=_CAMERA), [_image(np.uint8)], 1.65, 1.0),
     ("image, colour", gv.UndistortImage(model=_CAMERA, channels=3), [_image(np.uint8, 3)], 3.4, 2.5),

@@ -25,6 +25,7 @@ _TESTS_OF_TEXTS = (
     "tests/test_source_rules.py",
     "tests/test_house.py::test_dataclasses_are_frozen",
     "tests/docs/test_documented_defaults.py",
+    "tests/docs/test_checked_ranges.py",
     "tests/cli/test_option_defaults.py",
 )
 

@@ -150,6 +150,20 @@ def test_other_warnings() -> None:
         assert len(folds) == is_folded
 
 
+def test_folds_are_sought_along_the_border() -> None:
+    """At points of all four sides, a distance of 1/16 of the side apart, from corner to corner."""
+    asked: list[tuple[float, float]] = []
+
+    def undistort(points: np.ndarray) -> np.ndarray:
+        asked.extend((x, y) for x, y in points.tolist())
+        return points
+
+    fit = _fit(camera=SimpleNamespace(matrix=CAMERA.matrix, undistort=undistort))
+    assert not [each for each in _warnings(fit) if "folds" in each]
+    across, down = ([last * k / 16 for k in range(17)] for last in (640.0, 480.0))
+    assert set(asked) == {(x, y) for x in across for y in down if x in (0.0, 640.0) or y in (0.0, 480.0)}
+
+
 def test_every_warning_in_its_order() -> None:
     found = _warnings(converged=False, focus=1.0, noise=1.0, outliers=3, mirrored=True)
     words = ("focal length", "converged", "times the given noise", "outliers", "from behind")

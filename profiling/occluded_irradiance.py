@@ -4,7 +4,9 @@ The peer samples the line, keeps the pairs that face each other (by matrix produ
 each pair with Embree on all cores, and sums. The peer computes one profile per call; gpuvision computes eight profiles
 in sequence. Both errors are medians over the receivers that get light, relative to OccludedIrradiance in double, which
 the tests compare with rays in float64; they are NaN on a device without double. Cases ``growth/...`` have four times
-the segments or receivers of the board, or four and sixteen times its triangles.
+the segments or receivers of the board, or four and sixteen times its triangles. In the cases ``board/p95-...`` the peer
+computes the closed form on the visible parts of the segments, found with adaptive shadow rays, with the fewest rays for
+which the 95th percentile of its relative error is below the number in the name (devices with double only).
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from __future__ import annotations
 import functools
 import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +26,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from gpuvision.host import Bound, Device, to_numpy
+from gpuvision.profiling import adaptive_shadow_rays as adaptive
 from gpuvision.profiling.harness import Case
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LitSegments
@@ -94,6 +97,9 @@ def cases(device: Device) -> Iterator[Case]:
     board = Board.of()
     for samples in (1024, 16_384):
         yield _case(device, board, f"board/{samples}", samples)
+    if device.has_double:
+        for limit, name in ((3e-2, "3e-2"), (2e-3, "2e-3")):
+            yield _adaptive_case(device, board, limit, f"board/p95-{name}")
     yield _case(device, Board.of(parts_of_segments=4), "growth/segments-x4", base=_BASE)
     yield _case(device, Board.of(strips=4 * _STRIPS), "growth/receivers-x4", base=_BASE)
     for finer in (1, 2):
@@ -101,33 +107,83 @@ def cases(device: Device) -> Iterator[Case]:
 
 
 def _case(device: Device, board: Board, name: str, samples: int = 1024, **more: str) -> Case:
+    operation, bound = _bound(device, board)
+    ours = to_numpy(bound.run().irradiance).ravel()
+    truth = _truth(device, board, operation) if device.has_double else np.full(ours.shape, np.nan)
+    peer = functools.partial(irradiance_by_samples, board, samples, embree_of(board.scene))
+    metadata = {**_sizes(board), "peer_error": error_of(peer(), truth), **more}
+    return _finished_case(name, bound, {"numpy+embreex": peer}, error_of(ours, truth), metadata)
+
+
+def _adaptive_case(device: Device, board: Board, limit: float, name: str) -> Case:
+    """Return a case with the cheapest setting of the adaptive peer whose 95th percentile is below `limit`."""
+    operation, bound = _bound(device, board)
+    ours = to_numpy(bound.run().irradiance).ravel()
+    truth = _truth(device, board, operation)
+    receivers, table = board.receivers.reshape(-1, 6), adaptive.segment_table(board.segments)
+    free = functools.partial(_free, embree_of(board.scene))
+
+    def peer(form: adaptive.Form, setting: adaptive.Setting) -> NDArray[np.float32]:
+        return adaptive.irradiance_by_adaptive_rays(form, receivers, table, free, setting, _LIFT)
+
+    of_setting = {each: error_of(peer(adaptive.NUMBA, each), truth, 0.95) for each in adaptive.SETTINGS}
+    setting = next(each for each, p95 in of_setting.items() if p95 <= limit)
+    metadata = {
+        **_sizes(board),
+        **setting._asdict(),
+        "peer_error": error_of(peer(adaptive.NUMBA, setting), truth),
+        "peer_p95": of_setting[setting],
+        "p95": error_of(ours, truth, 0.95),
+    }
+    peers = {
+        "numpy+embreex": functools.partial(peer, adaptive.NUMPY, setting),
+        "numba+embreex": functools.partial(peer, adaptive.NUMBA, setting),
+    }
+    return _finished_case(name, bound, peers, error_of(ours, truth), metadata)
+
+
+def _bound(device: Device, board: Board) -> tuple[OccludedIrradiance, Bound[Any]]:
+    """Return the operation, and a bound instance with its inputs."""
     rows, receivers = segment_rows(board.segments), board.receivers
     weights = np.ones((*receivers.shape[:2], 2), np.float32)
     operation = OccludedIrradiance(scene=board.scene, segments=len(rows), clearance=_LIFT)
     bound = operation.bind(device, receivers.shape, receivers.dtype)
     for target, source in zip(bound.inputs, (receivers, weights, rows.astype(np.float32)), strict=True):
         target.set(source)
-    ours = to_numpy(bound.run().irradiance)
-    truth = np.full(ours.shape, np.nan)
-    if device.has_double:
-        truth = to_numpy(operation(receivers.astype(float), weights.astype(float), rows, device=device).irradiance)
-    peer = functools.partial(irradiance_by_samples, board, samples, embree_of(board.scene))
-    metadata = {
-        "triangles": len(board.scene.corners),
-        "segments": len(rows),
-        "receivers": ours.size,
-        "peer_error": error_of(peer(), truth.ravel()),
-        **more,
-    }
+    return operation, bound
+
+
+def _truth(device: Device, board: Board, operation: OccludedIrradiance) -> NDArray[np.float64]:
+    """Return the irradiance in double precision."""
+    receivers, weights = board.receivers.astype(float), np.ones((*board.receivers.shape[:2], 2))
+    truth: NDArray[np.float64] = to_numpy(
+        operation(receivers, weights, segment_rows(board.segments), device=device).irradiance
+    ).ravel()
+    return truth
+
+
+def _sizes(board: Board) -> dict[str, Any]:
+    receivers = board.receivers.size // 6
+    return {"triangles": len(board.scene.corners), "segments": len(board.segments.exitance), "receivers": receivers}
+
+
+def _finished_case(
+    name: str,
+    bound: Bound[Any],
+    peers: Mapping[str, Callable[[], object]],
+    error: float,
+    metadata: Mapping[str, Any],
+) -> Case:
+    """Return a case of profiles in sequence; a peer computes one profile."""
     return Case(
         "reflections",
         name,
         functools.partial(_in_a_row, bound),
-        {"numpy+embreex": peer},
-        error_of(ours, truth),
+        peers,
+        error,
         repeats=_PROFILES,
         metadata=metadata,
-        factors={"numpy+embreex": _PROFILES},
+        factors=dict.fromkeys(peers, _PROFILES),
     )
 
 
@@ -137,10 +193,10 @@ def _in_a_row(bound: Bound[Any]) -> None:
     bound.run()
 
 
-def error_of(values: NDArray[Any], truth: NDArray[np.float64]) -> float:
-    """Return the median relative error of the lit receivers; NaN if no receiver is lit."""
+def error_of(values: NDArray[Any], truth: NDArray[np.float64], quantile: float = 0.5) -> float:
+    """Return a quantile of the relative error of the lit receivers, default the median; NaN if no receiver is lit."""
     lit = truth > 1e-6 * np.nanmax(truth)
-    return float(np.median(np.abs(values[lit] / truth[lit] - 1.0))) if lit.any() else float("nan")
+    return float(np.quantile(np.abs(values[lit] / truth[lit] - 1.0), quantile)) if lit.any() else float("nan")
 
 
 def embree_of(scene: Scene) -> Any:

@@ -33,7 +33,7 @@ from gpuvision.simulation.transport.line_irradiance import LitSegments
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
 
 _PARTS, _STRIPS, _EACH = 40, 100, 30
-_LIFT = 1e-6  # clearance from a surface [m]; the rays of the peer use the same clearance at their ends
+CLEARANCE = 1e-6  # clearance from a surface [m]; the rays of the peer use the same clearance at their ends
 _PROFILES = 8  # profiles in sequence, as in a scan; the peer gains nothing from a sequence
 _BLOCK = 1 << 22  # pairs per block of the peer
 _BASE = "board/1024"  # case that the sizes of growth/... refer to
@@ -121,10 +121,10 @@ def _adaptive_case(device: Device, board: Board, limit: float, name: str) -> Cas
     ours = to_numpy(bound.run().irradiance).ravel()
     truth = _truth(device, board, operation)
     receivers, table = board.receivers.reshape(-1, 6), adaptive.segment_table(board.segments)
-    free = functools.partial(_free, embree_of(board.scene))
+    free = functools.partial(trace_free, embree_of(board.scene))
 
     def peer(form: adaptive.Form, setting: adaptive.Setting) -> NDArray[np.float32]:
-        return adaptive.irradiance_by_adaptive_rays(form, receivers, table, free, setting, _LIFT)
+        return adaptive.irradiance_by_adaptive_rays(form, receivers, table, free, setting, CLEARANCE)
 
     of_setting = {each: error_of(peer(adaptive.NUMBA, each), truth, 0.95) for each in adaptive.SETTINGS}
     setting = next(each for each, p95 in of_setting.items() if p95 <= limit)
@@ -146,7 +146,7 @@ def _bound(device: Device, board: Board) -> tuple[OccludedIrradiance, Bound[Any]
     """Return the operation, and a bound instance with its inputs."""
     rows, receivers = segment_rows(board.segments), board.receivers
     weights = np.ones((*receivers.shape[:2], 2), np.float32)
-    operation = OccludedIrradiance(scene=board.scene, segments=len(rows), clearance=_LIFT)
+    operation = OccludedIrradiance(scene=board.scene, segments=len(rows), clearance=CLEARANCE)
     bound = operation.bind(device, receivers.shape, receivers.dtype)
     for target, source in zip(bound.inputs, (receivers, weights, rows.astype(np.float32)), strict=True):
         target.set(source)
@@ -219,9 +219,9 @@ def irradiance_by_samples(board: Board, samples: int, embree: Any) -> NDArray[np
         toward = facing[some] @ points.T - plane_offset[some]
         height = (normals @ places[some].T - lit).T
         i, j = np.nonzero((toward > 0.0) & (height > 0.0))
-        start = places[some][i] + _LIFT * facing[some][i]
-        step_to = points[j] + _LIFT * normals[j] - start
-        seen = _free(embree, start, step_to)
+        start = places[some][i] + CLEARANCE * facing[some][i]
+        step_to = points[j] + CLEARANCE * normals[j] - start
+        seen = trace_free(embree, start, step_to)
         i, j = i[seen], j[seen]
         square = np.einsum("nk,nk->n", step_to, step_to)[seen]
         value = toward[i, j] * height[i, j] * light[j] / (square * square)
@@ -246,7 +246,9 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count() or 1)
 
 
-def _free(embree: Any, start: NDArray[np.float32], step: NDArray[np.float32]) -> NDArray[np.bool_]:
+def trace_free(embree: Any, start: NDArray[np.float32], step: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return whether rays (n, 3) from a start, each as long as its step (n, 3), hit nothing; on all cores."""
+
     def query(some: slice) -> NDArray[Any]:
         far = np.ones(len(start[some]), np.float32)
         return np.asarray(embree.run(start[some], step[some], dists=far, query="OCCLUDED"))

@@ -156,10 +156,8 @@ def _bound(device: Device, board: Board) -> tuple[OccludedIrradiance, Bound[Any]
 def _truth(device: Device, board: Board, operation: OccludedIrradiance) -> NDArray[np.float64]:
     """Return the irradiance in double precision."""
     receivers, weights = board.receivers.astype(float), np.ones((*board.receivers.shape[:2], 2))
-    truth: NDArray[np.float64] = to_numpy(
-        operation(receivers, weights, segment_rows(board.segments), device=device).irradiance
-    ).ravel()
-    return truth
+    light = operation(receivers, weights, segment_rows(board.segments), device=device)
+    return np.asarray(to_numpy(light.irradiance), np.float64).ravel()
 
 
 def _sizes(board: Board) -> dict[str, Any]:

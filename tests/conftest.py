@@ -118,7 +118,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_collection_finish() -> None:
     """Start the garbage collector, without the modules and the collected tests: it is 100 times faster then."""
-    gc.collect()
     gc.freeze()
     gc.enable()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import subprocess
 import sys
@@ -30,11 +31,20 @@ PLANTED = tomllib.loads((ROOT / "tests" / "mutants" / "planted.toml").read_text(
 KILLING = sorted({name for fault in PLANTED for name in fault["tests"]})
 
 
+@functools.cache
+def _items_of_files(session: pytest.Session) -> dict[Path, list[pytest.Item]]:
+    """Return the collected tests of each file."""
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in collected_items(session):
+        files.setdefault(item.path, []).append(item)
+    return files
+
+
 @pytest.mark.parametrize("name", KILLING)
 def test_the_fast_tier_has_each_killing_test(request: pytest.FixtureRequest, name: str) -> None:
     path, _, function = name.partition("::")
     function = function.partition("[")[0]
-    of_file = [item for item in collected_items(request.session) if item.path == ROOT / path]
+    of_file = _items_of_files(request.session).get(ROOT / path, [])
     named = {item for item in of_file if function_of(item) == function or not function}
     best = best_devices()
     chosen = named.intersection(select_fast(of_file, best).chosen)

@@ -63,6 +63,7 @@ def test_like_float64(device, rng, variant, dtype, layout, batch):
     assert_like_reference(readout, reading, *values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [0, 1])
 def test_more_than_the_caches_hold(device, rng, shift):
     """Outputs bypass the caches, at addresses that are aligned to a vector and at other addresses."""

@@ -196,6 +196,7 @@ def test_dense_copper_may_be_bright_or_dark(tmp_path: Path) -> None:
     assert np.all(np.isnan(located.covariance))
 
 
+@pytest.mark.slow
 def test_copper_that_repeats_is_not_mistaken_by_half_a_pitch(tmp_path: Path) -> None:
     """56 of 60 rulers find edges 0.2 mm off with the wrong polarity of copper, and 0.4 mm off with the right one."""
     dense = dense_board(tmp_path)
@@ -603,15 +604,11 @@ def board_of(folder: Path) -> Artwork:
     return read_artwork(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize(
     ("name", "middle"),
-    [
-        ("upverter", (-50e-3, 10e-3)),
-        # Gerbonara takes seconds for each of these.
-        pytest.param("fritzing", (20e-3, 25e-3), marks=pytest.mark.slow),
-        pytest.param("kicad-x2-tests/x2ap", (60e-3, -45e-3), marks=pytest.mark.slow),
-    ],
+    [("upverter", (-50e-3, 10e-3)), ("fritzing", (20e-3, 25e-3)), ("kicad-x2-tests/x2ap", (60e-3, -45e-3))],
 )
 def test_boards_of_three_tools_are_located(data: Path, name: str, middle: tuple[float, float], device: Device) -> None:
     board = board_of(data / "gerber" / name)

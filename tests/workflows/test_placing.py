@@ -371,14 +371,14 @@ def test_the_command_places_on_the_bottom_side(folder: Path, machine_file: Path,
     assert abs(placement["error"]["x_m"]) < 5e-6
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize(
     ("name", "window", "target"),
     [
         ("eagle", 256, (43.547e-3, 4.252e-3)),
-        # Reading these boards takes seconds.
-        pytest.param("upverter", 512, (-48.98e-3, 35.925e-3), marks=pytest.mark.slow),
-        pytest.param("kicad-x2-tests/x2ap", 512, (75.934e-3, -47.0486e-3), marks=pytest.mark.slow),
+        ("upverter", 512, (-48.98e-3, 35.925e-3)),
+        ("kicad-x2-tests/x2ap", 512, (75.934e-3, -47.0486e-3)),
     ],
 )
 def test_three_sigma_on_real_boards_are_below_half_a_pixel(

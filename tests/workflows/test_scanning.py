@@ -381,6 +381,7 @@ def test_a_bad_recording_is_a_line_and_leaves_nothing(make: Any, message: str, t
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_the_decoder_of_videos_keeps_quiet(tmp_path: Path) -> None:
     """Standard error contains exactly one line, including output of the video libraries."""
     complete = video(tmp_path / "whole.mp4", two_lines().repeat(8, 0), "mp4v")
@@ -506,6 +507,7 @@ def runs_of(row: Any, threshold: int) -> list[tuple[int, int]]:
     return list(zip(lit[np.r_[0, breaks + 1]], lit[np.r_[breaks, len(lit) - 1]], strict=True)) if len(lit) else []
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_rows_without_a_clear_line_are_flagged_not_invented(corner: Scan, data: Path) -> None:
     assert corner.valid_fraction > 0.88

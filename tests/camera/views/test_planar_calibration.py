@@ -75,7 +75,8 @@ def test_many_cold_starts_never_fail(kind, tilt, draws):
         check(made, fit_camera(views, made.size, model="tilt"), sigma)
 
 
-@pytest.mark.parametrize(("tilt", "draws"), [(0, 3), (20, 3), pytest.param(30, 25, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("tilt", "draws"), [(0, 3), (20, 3), (30, 25)])
 def test_never_worse_than_opencv(tilt, draws):
     """On the same points, in single precision as OpenCV requires; equal residuals are accepted."""
     stuck = 0
@@ -127,20 +128,22 @@ def test_predicted_covariance_is_the_bound(rng):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "tilt", "corner"), [("grid", 20, None), ("grid", 45, None), ("dots", 10, 10.0)])
-def test_errors_reach_the_bound_and_deviations_cover_them(kind, tilt, corner, rng):
-    """600 draws determine a coverage of 95 % to 0.9 %, and an rms error to 2.9 %."""
+def test_errors_reach_the_bound_and_deviations_cover_them(kind, tilt, corner, rng, draws):
+    """300 draws determine a coverage of 95 % to 1.3 %, and an rms error to 4.1 %; 600 (nightly) to 0.9 % and 2.9 %."""
+    count = draws(300, 300, 600)
+    wider = math.sqrt(600 / count)
     made = scene(rng, kind, tilt, corner_px=corner, views=10 if kind == "grid" else 5)
     errors, covered, poses = [], [], []
-    for _ in range(600):
+    for _ in range(count):
         fit = fit_camera(made.views(rng, 0.1), made.size, model="tilt")
         errors.append(found(fit) - made.truth)
         covered.append(np.abs(errors[-1]) <= 1.96 * np.sqrt(np.diag(fit.covariance)))
         poses.append(_pose_in_deviations(fit, made))
     coverage = np.mean(covered, axis=0)
-    np.testing.assert_array_less(np.abs(coverage - 0.95), 0.03)
-    np.testing.assert_array_less(np.abs(np.mean(np.abs(poses) <= 1.96, axis=0) - 0.95), 0.03)
+    np.testing.assert_array_less(np.abs(coverage - 0.95), 0.03 * wider)
+    np.testing.assert_array_less(np.abs(np.mean(np.abs(poses) <= 1.96, axis=0) - 0.95), 0.03 * wider)
     against_bound = np.sqrt(np.mean(np.square(errors), axis=0) / np.diag(made.bound(0.1)))
-    np.testing.assert_array_less(np.abs(against_bound - 1.0), 0.1)
+    np.testing.assert_array_less(np.abs(against_bound - 1.0), 0.1 * wider)
 
 
 def _pose_in_deviations(fit, made):

@@ -25,6 +25,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> BoardFix:
     return BoardFix.drawn(tmp_path_factory.mktemp("drawn"))
 
 
+@pytest.mark.slow
 def test_a_camera_that_looks_past_the_board(board: BoardFix, device: Device, rng: np.random.Generator) -> None:
     """Beyond the search range, no edges or other edges are found, and the pose is refused."""
     x, y = board.view.corner

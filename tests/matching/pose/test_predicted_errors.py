@@ -172,10 +172,10 @@ def test_many_fixes_of_a_real_board(
 def test_no_wrong_pose_of_disturbed_real_boards(
     data: Path, name: str, kind: str, device: Device, rng: np.random.Generator, draws: Draws
 ) -> None:
-    """In 3 x 4 x 250 poses a rate of wrong poses of 0.1 % is found with a probability of 95 %, 0.025 % nightly."""
-    count = draws(250, 250, 1000)
+    """In 3 x 4 x 100 poses a rate of wrong poses of 0.25 % is found with a probability of 95 %, 0.025 % nightly."""
+    count = draws(100, 100, 1000)
     board = replace(of_tool(data / "gerber" / name, TOOLS[name]), motion_px=5.0 if kind == "motion" else 0.0)
-    pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else draws(5, 5, 20))]
+    pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else draws(4, 4, 20))]
     fixes = board.fixes(pictures, count, device, rng)
     assert not (fixes.squares > GROSS).any()
     if kind == "reversed":

@@ -185,7 +185,9 @@ def test_covariance_of_the_two_currents(independent: float, opposed: float, shot
 
 
 @pytest.mark.parametrize("modulated", [True, False])
-@pytest.mark.parametrize("ambient", [0.0, 2e-6, 20e-6, 200e-6])
+@pytest.mark.parametrize(
+    "ambient", [0.0, *(pytest.param(each, marks=pytest.mark.slow) for each in (2e-6, 20e-6)), 200e-6]
+)
 @pytest.mark.parametrize("windows", [None, (-3e-3, 0.5e-3)])
 def test_sigma_with_ambient_light(
     ambient: float, modulated: bool, windows: tuple[float, float] | None, device: Device

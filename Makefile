@@ -8,7 +8,7 @@ CACHES := XDG_CACHE_HOME="$(CURDIR)/build/cache" MPLCONFIGDIR="$(CURDIR)/build/c
 # otherwise.
 PYTEST = PYTHONDONTWRITEBYTECODE= .venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
 
-.PHONY: demo test test-full nightly fuzz mutants offline sanitize lint docs clean
+.PHONY: demo test test-full test-rusticl nightly fuzz mutants offline sanitize lint docs clean
 
 demo: .venv/ready
 	.venv/bin/gpuvision demo
@@ -20,6 +20,13 @@ test: .venv/ready-tests
 test-full: .venv/ready-tests
 	$(PYTEST) --tier full
 
+# A few tests on Mesa's rusticl (Debian package mesa-opencl-icd), which runs kernels as a GPU does, on the CPU.
+test-rusticl: export RUSTICL_ENABLE = llvmpipe
+test-rusticl: export GPUVISION_DEVICE = rusticl
+test-rusticl: .venv/ready-tests
+	$(PYTEST) --tier fast --one-case
+
+# With RUSTICL_ENABLE=llvmpipe also all tests on rusticl.
 nightly: .venv/ready-tests
 	$(PYTEST) --tier nightly
 	$(MAKE) fuzz FUZZ_ARGS="--engine atheris --runs 20000 --seconds 60"

@@ -7,6 +7,9 @@ of both variants of a kernel a few tests for each file, and of hypothesis tests 
 products of three or more parameters. ``nightly`` runs all tests on every device, with more hypothesis examples.
 ``GPUVISION_DEVICE`` selects the best device, see `Device.best`.
 
+The option ``--one-case`` reduces the fast and the full tier to the best device, and to one case of each test function
+of kernels and of ``tests/host``.
+
 No tier runs the cases that a device refuses: double precision without doubles, vectors on a runtime without them. The
 last lines of a run state their number. A case that PoCL or Intel's CPU runtime refuses is an error.
 """
@@ -38,7 +41,7 @@ from driver_faults import mark_faults
 from gpuvision.host import Device, debug
 from gpuvision.host.discovery import INSTALL_HINT
 from processor_time import record_test, table_of_files
-from tiers import LEFT, best_devices, device_of, select_fast, select_full, split_refused
+from tiers import LEFT, best_devices, device_of, has_one_case, one_case_each, select_fast, select_full, split_refused
 
 ROOT = Path(__file__).resolve().parents[1]
 # Compiled kernels of all runtimes, verdicts of devices, fonts of matplotlib: kept in the clone, so that a second run is
@@ -81,7 +84,14 @@ ALLOWED_SKIPS = (
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--tier", choices=TIERS, default="full", help="which tests run: see tests/conftest.py")
+    parser.addoption("--one-case", action="store_true", help="one case of each test function of kernels, on one device")
     parser.addoption("--strict-skips", action="store_true", help="fail when a test is skipped for an unexpected reason")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not import the files without tests of the option ``--one-case``."""
+    is_left = config.getoption("one_case") and collection_path.is_file() and not has_one_case(collection_path)
+    return True if is_left else None
 
 
 @pytest.hookimpl(trylast=True)  # after -m and -k: the smoke set is selected from the remaining tests
@@ -103,7 +113,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     _set_examples(items, EXAMPLES[tier])
     if tier == "nightly":
         return
-    chosen, left, without_inline = (select_fast if tier == "fast" else select_full)(items, best)
+    selection = (select_fast if tier == "fast" else select_full)(items, best)
+    chosen, left, without_inline = one_case_each(selection, best) if config.getoption("one_case") else selection
     for item in without_inline:
         item.stash[WITHOUT_INLINE] = True
     if left:

@@ -16,11 +16,13 @@ import pytest
 
 from gpuvision.host import Device
 from tiers import (
+    Selection,
     best_devices,
     collected_items,
     device_of,
     function_of,
     is_refused,
+    one_case_each,
     select_fast,
     split_refused,
     without_other_variants,
@@ -195,3 +197,30 @@ def test_a_run_in_which_pocl_refuses_doubles_fails(tmp_path: Path, workers: int)
     run = run_cases(tmp_path, Device.best(), "'pocl'", workers=workers)
     assert run.returncode not in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
     assert "refuses test_cases.py::test_case[" in run.stdout + run.stderr, run.stdout
+
+
+class Case(SimpleNamespace):
+    """Stand-in of a test: equal only to itself, and hashable."""
+
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+
+def test_one_case_of_each_function_of_a_kernel(tmp_path: Path) -> None:
+    """The option ``--one-case`` leaves the best device, the files of kernels and of tests/host, and the first cases."""
+    other = SimpleNamespace(label="other")
+    best = SimpleNamespace(label="best")
+
+    def item_of(path: str, function: str, device: Any) -> Any:
+        place = tmp_path / path
+        params = {"device": device} if device else {}
+        return Case(name="", path=place, parent=place, originalname=function, callspec=SimpleNamespace(params=params))
+
+    psd, whole = "ranging/test_psd.py", "workflows/test_psd.py"
+    places = [(psd, "a", other), (psd, "a", best), (psd, "a", best), (psd, "b", best), (psd, "c", None)]
+    places += [(whole, "a", best), ("ranging/test_focus.py", "a", best), ("host/test_ring.py", "a", best)]
+    items = [item_of(*each) for each in places]
+    chosen, left, without_inline = one_case_each(Selection(items, [], {items[1], items[2]}), [best])
+    assert [items.index(each) for each in chosen] == [1, 3, 7]
+    assert [items.index(each) for each in left] == [0, 2, 4, 5, 6]
+    assert without_inline == {items[1]}

@@ -104,6 +104,26 @@ def select_fast(items: Sequence[pytest.Item], best: Collection[Device]) -> Selec
     return selection
 
 
+def one_case_each(selection: Selection, best: Collection[Device]) -> Selection:
+    """Return the first case of each test function of kernels and of ``tests/host`` on the best device.
+
+    For a runtime that compiles slowly: most functions have one set of build options in their first case.
+    """
+    first: dict[Any, pytest.Item] = {}
+    for item in selection.chosen:
+        if device_of(item) in best and has_one_case(item.path):
+            first.setdefault((item.path, item.parent, function_of(item)), item)
+    chosen = list(first.values())
+    kept = set(chosen)
+    left = [*selection.left, *(item for item in selection.chosen if item not in kept)]
+    return Selection(chosen, left, selection.without_inline & kept)
+
+
+def has_one_case(path: Path) -> bool:
+    """Return whether `one_case_each` chooses tests of a file: a file about one kernel, or in ``tests/host``."""
+    return path.parent.name == "host" or (path.stem in _OF_KERNELS and path.parent.name not in _COMPOSED)
+
+
 def is_refused(item: pytest.Item) -> bool:
     """Return whether the device of a test lacks a property that the test needs.
 

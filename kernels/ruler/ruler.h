@@ -187,7 +187,7 @@ static inline reals ruler_gradient(private const reals *profile, int i, constant
 }
 
 // Find the edges along the profiles of 16 rulers. `flags`: flags of the rulers.
-static inline void ruler_find(private const reals *values, const ruler_place *place, masks flags, constant real *table,
+static inline void ruler_find(private const reals *values, private const ruler_place *place, masks flags, constant real *table,
                        private ruler_edge *edges) {
     masks found = 0, wins;
     reals best = 0, rival = 0;

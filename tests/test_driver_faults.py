@@ -12,6 +12,7 @@ from driver_faults import FAULTS, DriverFault, mark_faults
 from tiers import collected_items
 
 AFFECTED = {
+    "long searches": ("tests/a/test_field_pose.py::test_clutter_of_70_percent[rusticl]", False),
     "times of events": ("tests/host/test_double_rate.py::test_the_kernel_of_the_measurement_runs[rusticl]", True),
     "blob kernel": ("tests/matching/features/test_blob.py::test_any[rusticl-uint8]", False),
     "accuracy of blobs": ("tests/matching/features/test_blob_accuracy.py::test_any[rusticl]", False),

@@ -90,9 +90,13 @@ def small_groups(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def fitted_examples(monkeypatch: pytest.MonkeyPatch) -> dict[str, Example]:
-    """Return an example of each operation whose last work-group moves back to end with the last element."""
-    real, fitted = launch_builder._GROUPINGS["fitted"], []
-    monkeypatch.setitem(launch_builder._GROUPINGS, "fitted", lambda *size: fitted.append(size) or real(*size))
+    """Return an example of each operation whose work-groups overlap, or process several elements a group apart."""
+    fitted: list[Any] = []
+    for name in ("fitted", "strided"):
+        real = launch_builder._GROUPINGS[name]
+        monkeypatch.setitem(
+            launch_builder._GROUPINGS, name, lambda *size, real=real: fitted.append(size) or real(*size)
+        )
     found: dict[str, Example] = {}
     seen = set()
     for example in (*ranging_builds.examples(), *simulation_builds.examples()):

@@ -162,7 +162,9 @@ def test_short_work_comes_after_the_long_work_before_it(device, rng):
 @pytest.mark.parametrize("count", [0, 16, 400_000])
 def test_work_in_an_inline_queue_is_done_on_return(device, rng, count):
     queue = device.new_queue(inline=True)
-    assert device.is_inline(queue) or not device.prefers_vectors
+    # PoCL 5 and 6 have no inline device, see `request_inline_device`.
+    always = device.prefers_vectors and (device.kind == "intel" or device.driver.startswith("3."))
+    assert device.is_inline(queue) or not always
     assert not device.is_inline(device.queue)
     if not device.is_inline(queue):
         pytest.skip(f"{device.label} has no inline queues")

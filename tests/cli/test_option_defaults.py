@@ -17,6 +17,7 @@ from gpuvision.cli.simulate import simulate
 from gpuvision.matching.features.imaging import Imaging
 from gpuvision.workflows import simulating
 from gpuvision.workflows.merging import merge_scans
+from source_trees import tree_of
 
 COMMANDS = Path(__file__).resolve().parents[2] / "gpuvision" / "cli"
 ON_BY_DEFAULT = {("simulate.py", "noise")}
@@ -46,7 +47,7 @@ def test_an_option_has_the_default_of_its_parameter(
 def _flags() -> Iterator[tuple[str, str, bool]]:
     """Yield the file, the name and the default of each parameter of a command whose default is True or False."""
     for path in sorted(COMMANDS.glob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.arguments):
                 places = [*node.posonlyargs, *node.args]
                 pairs = [*zip(places[len(places) - len(node.defaults) :], node.defaults, strict=True)]

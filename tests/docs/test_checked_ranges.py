@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from source_trees import tree_of
+
 ROOT = Path(__file__).resolve().parents[2]
 FILES = [path for folder in ("gpuvision", "host") for path in sorted((ROOT / folder).rglob("*.py"))]
 _ENTRY = re.compile(r"^(?P<names>\w+(?:, \w+)*)(?: :[^\n]*)?\n(?P<text>(?:(?:[ ]{4}[^\n]*)?\n)+)", re.MULTILINE)
@@ -78,7 +80,7 @@ def test_a_checked_range_is_the_stated_one() -> None:
     checks = [
         each._replace(name=f"{path.relative_to(ROOT)}: {each.name}")
         for path in FILES
-        for each in _checks(ast.parse(path.read_text()), ())
+        for each in _checks(tree_of(path), ())
     ]
     assert len(checks) > 100
     wrong = [each for each in checks if _stated(each.text) != each.bounds and each.name not in OTHERS]

@@ -74,8 +74,8 @@ def _light(scene: Scene) -> Iterator[Example]:
         kind = np.dtype(dtype)
         yield Example(f"irradiance {kind}", LineIrradiance(segments=segments), (10_000, 6), dtype)
         strips = OccludedIrradiance(scene=scene, segments=6)
-        yield Example(f"intervals {kind}", strips, (100, 64, 6), dtype)
-        yield Example(f"rays {kind}", replace(strips, visibility="rays"), (100, 64, 6), dtype)
+        yield Example(f"intervals {kind}", strips, (2, 17, 6), dtype)
+        yield Example(f"rays {kind}", replace(strips, visibility="rays"), (2, 17, 6), dtype)
         for name, occluders in (("", None), (", occluders", scene)):
             factors = FormFactors(patches=patches, scene=occluders)
             yield Example(f"factors {kind}{name}", factors, (1000, 6), dtype)
@@ -83,12 +83,12 @@ def _light(scene: Scene) -> Iterator[Example]:
             yield Example(f"light {kind}{name}", light, (1000, 6), dtype)
     yield Example("single from double", LineIrradiance(segments=segments, precision="single"), (10_000, 6), np.float64)
     chosen = OccludedIrradiance(scene=scene, segments=6, selected=40)
-    yield Example("selected", chosen, (100, 64, 6))
-    yield Example("selected, rays", replace(chosen, visibility="rays"), (100, 64, 6))
-    yield Example("selected, no double", chosen, (100, 64, 6), has_double=False)
+    yield Example("selected", chosen, (2, 17, 6))
+    yield Example("selected, rays", replace(chosen, visibility="rays"), (2, 17, 6))
+    yield Example("selected, no double", chosen, (2, 17, 6), has_double=False)
     yield Example("irradiance, no double", LineIrradiance(segments=segments), (10_000, 6), has_double=False)
     open_light = OccludedIrradiance(scene=scene, segments=6, visibility="none")
-    yield Example("no occlusion", open_light, (100, 64, 6))
+    yield Example("no occlusion", open_light, (2, 17, 6))
     for occluders in (None, scene):
         for clusters in (False, True):
             selection = LightClustering(tolerance=1e-6, scene=occluders, clusters=clusters).selection(127, 64)

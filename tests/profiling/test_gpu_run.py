@@ -145,6 +145,36 @@ def test_a_wrong_result_is_a_failure(device: Device, monkeypatch: pytest.MonkeyP
         breakage.sizes(device.label)
 
 
+def test_times_leave_out_what_may_not_end(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of the 21 measurements takes 10 s: within 95 s, nine of them end."""
+    clock = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+
+    def slow(device: Device, sample: Any) -> dict[str, Any]:
+        clock[0] += 10.0
+        return {"operation": sample.name}
+
+    monkeypatch.setattr(times, "measure", slow)
+    result = times.run(device, 95.0)
+    assert (len(result["rows"]), result["not_reached"]) == (9, 12)
+    assert clock[0] == 90.0
+
+
+def test_slow_kernels_are_launched_a_few_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
+    for seconds, expected in ((0.0, 23), (0.5, 10), (20.0, 5)):
+        launches: list[float] = []
+
+        def launch(seconds: float = seconds, launches: list[float] = launches) -> Any:
+            launches.append(seconds)
+            profile = SimpleNamespace(start=0, end=int(1e9 * seconds) or 1000)
+            return SimpleNamespace(wait=lambda: clock.__setitem__(0, clock[0] + seconds), profile=profile)
+
+        times.launch_seconds(launch)
+        assert len(launches) == expected
+
+
 def test_summary_of_the_suite() -> None:
     text = "....F\nFAILED tests/a.py::test_x[nvidia] - boom\nERROR tests/b.py\n1 failed, 4 passed, 1 error in 3.2s\n"
     assert suite.read_summary(text) == {

@@ -103,6 +103,9 @@ class _Rays(VisionOperation[R]):
         where, tree = build.shape[:-1], self.scene.bvh
         count = math.prod(where)
         work = build.work(count, each=_RAYS_PER_STRIP, group=_GROUP)
+        # The vector variant traces rays one by one, too: two floats are built for one ray per work-item.
+        two_floats = not (build.doubles_positions or work.vectors)
+        place = build.widest if not two_floats else np.dtype(np.float32)
         return build.launch(
             "rays/rays.cl",
             kernel,
@@ -111,12 +114,16 @@ class _Rays(VisionOperation[R]):
             defines={
                 **type_defines("INPUT", build.dtype),
                 "BVH_DEPTH": tree.stack_size,
-                **flags(ANY_HIT=kernel == "any_hit", DOUBLE_POSITIONS=build.device.has_double),
+                **flags(
+                    ANY_HIT=kernel == "any_hit",
+                    DOUBLE_POSITIONS=place == np.float64,
+                    TWO_FLOAT_POSITIONS=two_floats,
+                ),
             },
             arguments=[
                 *tree.tables(build.real),
-                tree.middle.astype(build.widest),
-                build.widest.type(tree.radius),
+                build.positions(tree.middle) if two_floats else tree.middle.astype(place),
+                place.type(tree.radius),
                 build.real.type(self.clearance),
                 np.uint64(count),
                 np.uint64(work.each),
@@ -155,8 +162,9 @@ class ClosestHit(_Rays[Hits]):
     Notes
     -----
     Error: coordinates are rounded once to the real type, relative to the centre of the scene. The error of the distance
-    is a few roundings of the scene's size and of the distance, divided by the cosine of incidence. On devices with
-    doubles it does not depend on the distance of the origin.
+    is a few roundings of the scene's size and of the distance, divided by the cosine of incidence. It does not depend
+    on the distance of the origin, up to a million scene sizes: positions outside of the scene are doubles, or two
+    floats (kernels/common/two_float.h) on GPUs without fast doubles.
     """
 
     Result: ClassVar[type[Any]] = Hits

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from pathlib import Path
 from typing import Any
@@ -319,6 +320,48 @@ def test_rays_from_afar(device: Device, variant: Any, dtype: Any, rng: np.random
     assert (ClosestHit(scene=Scene(corners), variant=variant)(rays.astype(dtype), device=device).triangle == -1).all()
     segments[:, 3:] = segments[:, :3] * dtype(0.5)
     assert not AnyHit(scene=Scene(corners), variant=variant)(segments, device=device).occluded.any()
+
+
+@pytest.mark.parametrize("distance", [0.0, 30.0, 1e3, 1e6])
+def test_rays_without_doubles(device: Device, distance: float, rng: np.random.Generator) -> None:
+    """Two floats keep the digits of rays from a distance, and of a scene far from the origin."""
+    slow = copy.copy(device)
+    slow.has_fast_double = False
+    away = np.array([5000.0, -3000.0, 1000.0])
+    corners = soup(rng, 200) + away
+    starts = (away + distance * random_directions(rng, 600)).astype(np.float32)
+    rays = np.hstack([starts, (away + rng.uniform(-0.7, 0.7, (600, 3)) - starts).astype(np.float32)])
+    exact = rays.astype(np.float64)
+    sure = far_from_edges(corners, exact, 3e-4)
+    triangle, far, u, v = reference.closest(corners, exact)
+    hits = ClosestHit(scene=Scene(corners), variant="work_item")(rays, device=slow)
+    np.testing.assert_array_equal(hits.triangle[sure], triangle[sure])
+    hit = sure & (triangle >= 0)
+    assert hit.mean() > (0.3 if distance < 1e6 else 0.1)
+    # The sine of incidence and the size of the triangle magnify the rounding of the scene's size.
+    np.testing.assert_allclose(hits.barycentric[hit], np.column_stack([u, v])[hit], atol=3e-4)
+    np.testing.assert_allclose(hits.distance[hit], far[hit], rtol=4 * eps_of(np.float32), atol=2e-5)
+    segments = np.hstack([starts, (away + rng.uniform(-1.0, 1.0, (600, 3))).astype(np.float32)])
+    ends = segments.astype(np.float64)
+    expected = reference.occluded(corners, ends)
+    sure = far_from_edges(corners, np.hstack([ends[:, :3], ends[:, 3:] - ends[:, :3]]), 3e-4)
+    by = 1e-4 / max(distance, 1.0)
+    sure &= reference.occluded(corners, ends, -by) == reference.occluded(corners, ends, by)
+    result = AnyHit(scene=Scene(corners), variant="work_item")(segments, device=slow)
+    np.testing.assert_array_equal(result.occluded[sure], expected[sure])
+    assert 0.2 < expected[sure].mean() < 0.95
+    # Rays that point away have no hit; lengths beyond the squares of single precision are directions, too.
+    rays[:, 3:] *= np.float32(2.0**80)
+    again = ClosestHit(scene=Scene(corners), variant="work_item")(rays, device=slow)
+    np.testing.assert_array_equal(again.triangle[hit], hits.triangle[hit])
+    if distance:
+        rays[:, 3:] *= np.float32(-(2.0**-80))
+        assert (ClosestHit(scene=Scene(corners), variant="work_item")(rays, device=slow).triangle[sure] == -1).all()
+
+
+def random_directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 @WAYS

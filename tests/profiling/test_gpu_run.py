@@ -35,6 +35,7 @@ def fail() -> None:
     raise ValueError("first\nsecond")
 
 
+@pytest.mark.slow
 def test_worker_outlives_errors_crashes_and_hangs() -> None:
     with Worker() as worker:
         assert worker.call(twice, 4, seconds=60) == (8, "")

@@ -160,6 +160,7 @@ def test_writes_nothing_else(device, rng, method, variant, along):
     assert_same(guarded.out, read_lines(frames, method=method, along=along, threshold=20, window=WINDOW), slack=4.0)
 
 
+@pytest.mark.slow
 def test_reads_within_its_frames():
     assert_within_pages("line")
 

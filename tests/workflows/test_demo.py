@@ -42,7 +42,9 @@ def away_from_edges(height: Any) -> Any:
     return maximum_filter(known, 5) - minimum_filter(known, 5) < 1e-3
 
 
-@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=pytest.mark.slow if each == "camera_line" else ()) for each in SENSORS]
+)
 def test_a_scan_of_the_recording_is_what_was_predicted(name: str, light: Path, device: Device) -> None:
     task = task_of(name)
     recording = simulate_recording(task, light, seed=7)

@@ -151,11 +151,9 @@ static inline reals ruler_strength(reals slope, private const ruler_place *place
     return as_reals((as_masks(slope) ^ place->sign_flip) & place->sign_keep);
 }
 
-// Whether gradient peak.here is a local maximum of the strength, and at least the threshold.
-static inline masks ruler_is_peak(ruler_peak peak, private const ruler_place *place, constant real *table) {
-    const reals strength = ruler_strength(peak.here, place);
-    return mask_of(strength >= table[RULER_THRESHOLD]) & mask_of(strength > ruler_strength(peak.before, place)) &
-           mask_of(strength >= ruler_strength(peak.after, place));
+// Whether a gradient of a strength is a local maximum and at least the threshold; `before`, `after`: of its neighbours.
+static inline masks ruler_is_peak(reals strength, reals before, reals after, real threshold) {
+    return mask_of(strength >= threshold) & mask_of(strength > before) & mask_of(strength >= after);
 }
 
 #ifdef PAIRS
@@ -189,6 +187,7 @@ static inline reals ruler_gradient(private const reals *profile, int i, constant
 // Find the edges along the profiles of 16 rulers. `flags`: flags of the rulers.
 static inline void ruler_find(private const reals *values, private const ruler_place *place, masks flags, constant real *table,
                        private ruler_edge *edges) {
+    const real threshold = table[RULER_THRESHOLD];
     masks found = 0, wins;
     reals best = 0, rival = 0;
     ruler_peak peak = {0, 0, 1, 0};
@@ -208,9 +207,10 @@ static inline void ruler_find(private const reals *values, private const ruler_p
     for (int i = 1; i < slopes - 1; i++) {
         peak.after = ruler_gradient(values, i + 1, table);
         peak.at = i;
-        const masks is_peak = ruler_is_peak(peak, place, table);
+        reals strength = ruler_strength(peak.here, place);
+        const masks is_peak = ruler_is_peak(strength, ruler_strength(peak.before, place),
+                                            ruler_strength(peak.after, place), threshold);
         if (any_compared(is_peak)) {
-            reals strength = ruler_strength(peak.here, place);
             masks candidate = is_peak;
 #ifdef PAIRS
             candidate &= ruler_closes(other, has_other, peak, place, table, &strength);

@@ -115,6 +115,15 @@ static inline ruler_peak ruler_peak_at(local const ruler_memory *shared, int i) 
     return (ruler_peak){i, slope[-RULERS_PER_GROUP], slope[0], slope[RULERS_PER_GROUP]};
 }
 
+// Whether gradient i of this item's ruler is a peak, and its strength.
+static inline int ruler_finds_peak(local const ruler_memory *shared, int i, private const ruler_place *place,
+                                   constant real *table, private real *strength) {
+    const ruler_peak peak = ruler_peak_at(shared, i);
+    *strength = ruler_strength(peak.here, place);
+    return ruler_is_peak(*strength, ruler_strength(peak.before, place), ruler_strength(peak.after, place),
+                         table[RULER_THRESHOLD]) != 0;
+}
+
 #if defined(PAIRS) || defined(CHOOSE_ALL)
 static inline void ruler_mark(local uint *bits_of_rulers, int i) {
     atomic_or(bits_of_rulers + i / 32 * RULERS_PER_GROUP + ruler_of_item(), 1u << i % 32);
@@ -125,8 +134,9 @@ static inline void ruler_mark(local uint *bits_of_rulers, int i) {
 // Mark the peaks among the gradients of the rulers of a group.
 static inline void ruler_mark_peaks(private const ruler_place *place, constant real *table, local ruler_memory *shared) {
     const int slopes = (int)table[RULER_LENGTH] - 2 * TAPS;
+    real strength;
     for (int i = 1 + ruler_lane(); i < slopes - 1; i += RULER_ITEMS)
-        if (ruler_is_peak(ruler_peak_at(shared, i), place, table)) ruler_mark(shared->peaks, i);
+        if (ruler_finds_peak(shared, i, place, table, &strength)) ruler_mark(shared->peaks, i);
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
@@ -154,11 +164,9 @@ static inline ruler_peak ruler_peak_before(local const ruler_memory *shared, int
 // Whether gradient i is an edge, or the second edge of a pair, and its strength.
 static inline int ruler_is_candidate(local const ruler_memory *shared, int i, private const ruler_place *place,
                                      constant real *table, private real *strength) {
-    const ruler_peak peak = ruler_peak_at(shared, i);
-    *strength = ruler_strength(peak.here, place);
-    if (!ruler_is_peak(peak, place, table)) return 0;
+    if (!ruler_finds_peak(shared, i, place, table, strength)) return 0;
 #ifdef PAIRS
-    const ruler_peak from = ruler_peak_before(shared, i);
+    const ruler_peak from = ruler_peak_before(shared, i), peak = ruler_peak_at(shared, i);
     return ruler_closes(from, mask_of(from.at > 0), peak, place, table, strength) != 0;
 #else
     return 1;

@@ -16,6 +16,11 @@
 // Order of work: (1) facing tests of 16 receivers with a line reject most pairs; (2) the visible parts of the remaining
 // pairs are found pair by pair; (3) the visible parts of any receivers and segments are collected until 16 of them fill
 // the vectors of the closed form.
+// In single precision the work-item variant keeps hidden intervals in local memory: 256 bytes for each item. In double
+// precision a group would need more than 32 KiB, and they stay in private memory.
+#if defined(INTERVALS) && !defined(VECTOR_VARIANT) && !defined(REAL_IS_DOUBLE)
+#define HIDDEN_GROUP GROUP
+#endif
 #include "line_irradiance/line_irradiance.h"
 #include "occluded_irradiance/lit_lines.h"
 #include "common/status.h"
@@ -45,6 +50,9 @@ typedef struct {
     real exitance[LANES];
     int lane[LANES];
     int count;
+#ifdef HIDDEN_GROUP
+    local real *room; // of this item, for hidden intervals
+#endif
 } pieces;
 
 // Evaluate the closed form of the waiting parts; unused lanes have height 0, which gives 0.
@@ -115,10 +123,10 @@ static void add_seen(const hidden *dark, real from, real to, const chunk *lit, i
     const real begin = lit->begin[k], end = lit->end[k], per = (real)1 / (end - begin), stop = fmin(to, end);
     real start = fmax(from, begin);
     for (int n = 0; n <= dark->count && start < stop; n++) {
-        const real low = n < dark->count ? fmin(dark->low[n], stop) : stop;
+        const real low = n < dark->count ? fmin(dark->low[HIDDEN_AT(n)], stop) : stop;
         const real share = low == end ? (real)1 : (low - begin) * per;
         add_piece(lit, k, own, lane, (start - begin) * per, share, waiting, sums);
-        if (n < dark->count) start = fmax(start, dark->high[n]);
+        if (n < dark->count) start = fmax(start, dark->high[HIDDEN_AT(n)]);
     }
 }
 
@@ -134,6 +142,9 @@ static int add_visible(const bvh_tree *tree, const chunk *lit, int line, const b
     int is_whole = 1;
     real from = begin, to = end;
     hidden dark;
+#ifdef HIDDEN_GROUP
+    dark.low = waiting->room, dark.high = waiting->room + HIDDEN_AT(MAX_HIDDEN);
+#endif
     while (from < end) {
         hidden_begin(&dark, from, to);
         view_trace(tree, v, &dark, hint);
@@ -360,6 +371,9 @@ AS_IT_IS kernel void occluded_irradiance(global const INPUT *restrict receivers,
 #ifndef VECTOR_VARIANT
     local place both[2 * GROUP];
 #endif
+#ifdef HIDDEN_GROUP
+    local real room[2 * HIDDEN_AT(MAX_HIDDEN)];
+#endif
     chunk lit;
     int hint = NO_HINT, loaded = -1; // first segment of the chunk that is loaded
     for (ulong strip = strips * group / groups; strip < strips * (group + 1) / groups; strip++) {
@@ -371,6 +385,9 @@ AS_IT_IS kernel void occluded_irradiance(global const INPUT *restrict receivers,
             uchar flag = STATUS_OK;
             pieces waiting;
             waiting.count = 0;
+#ifdef HIDDEN_GROUP
+            waiting.room = room + get_local_id(0);
+#endif
 #ifdef SELECTED
             const ulong list = strip * ((each + SELECTION_BLOCK - 1) / SELECTION_BLOCK) + first / SELECTION_BLOCK;
             if (starts[list] < 0 || starts[list + 1] > (int)pick_count) flag |= STATUS_OUT_OF_RANGE;

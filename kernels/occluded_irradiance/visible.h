@@ -40,11 +40,21 @@ typedef struct {
     view_half halves[VIEW_HALVES];                    // occluders reach into all of these
 } view;
 
+// Hidden intervals in local memory, in groups of HIDDEN_GROUP items: number n of an item is HIDDEN_GROUP numbers after
+// number n - 1, so that the items of a warp access different banks. Otherwise they lie in private memory.
+#ifdef HIDDEN_GROUP
+#define HIDDEN_AT(n) ((n) * HIDDEN_GROUP)
+typedef local real *hidden_numbers;
+#else
+#define HIDDEN_AT(n) (n)
+typedef real hidden_numbers[MAX_HIDDEN];
+#endif
+
 // Part [from, to] of the segment that is not hidden at its ends, and the hidden intervals inside it (disjoint, unsorted).
 typedef struct {
     real from, to;
     int count, is_full;
-    real low[MAX_HIDDEN], high[MAX_HIDDEN];
+    hidden_numbers low, high;
 } hidden;
 
 INLINE view_half view_half_of(const view *view, real x, real y, real z, real beyond) {
@@ -238,10 +248,10 @@ INLINE void hidden_begin(hidden *all, real from, real to) {
 INLINE void hidden_add(hidden *all, real low, real high) {
     if (!(low < high && low < all->to && high > all->from)) return;
     for (int n = 0; n < all->count;) {
-        if (low <= all->high[n] + SMALLEST_GAP && all->low[n] <= high + SMALLEST_GAP) {
-            low = fmin(low, all->low[n]), high = fmax(high, all->high[n]);
+        if (low <= all->high[HIDDEN_AT(n)] + SMALLEST_GAP && all->low[HIDDEN_AT(n)] <= high + SMALLEST_GAP) {
+            low = fmin(low, all->low[HIDDEN_AT(n)]), high = fmax(high, all->high[HIDDEN_AT(n)]);
             all->count--;
-            all->low[n] = all->low[all->count], all->high[n] = all->high[all->count];
+            all->low[HIDDEN_AT(n)] = all->low[HIDDEN_AT(all->count)], all->high[HIDDEN_AT(n)] = all->high[HIDDEN_AT(all->count)];
         } else n++;
     }
     const int at_start = low <= all->from + SMALLEST_GAP, at_end = high >= all->to - SMALLEST_GAP;
@@ -250,7 +260,7 @@ INLINE void hidden_add(hidden *all, real low, real high) {
     else if (at_end) all->to = low;
     else if (all->count == MAX_HIDDEN) all->is_full = 1;
     else {
-        all->low[all->count] = low, all->high[all->count] = high;
+        all->low[HIDDEN_AT(all->count)] = low, all->high[HIDDEN_AT(all->count)] = high;
         all->count++;
     }
 }
@@ -258,12 +268,12 @@ INLINE void hidden_add(hidden *all, real low, real high) {
 // Sort the hidden intervals along the segment (insertion sort: few, nearly sorted).
 INLINE void hidden_sort(hidden *all) {
     for (int n = 1; n < all->count; n++) {
-        const real low = all->low[n], high = all->high[n];
+        const real low = all->low[HIDDEN_AT(n)], high = all->high[HIDDEN_AT(n)];
         int at = n;
-        for (; at > 0 && all->low[at - 1] > low; at--) {
-            all->low[at] = all->low[at - 1], all->high[at] = all->high[at - 1];
+        for (; at > 0 && all->low[HIDDEN_AT(at - 1)] > low; at--) {
+            all->low[HIDDEN_AT(at)] = all->low[HIDDEN_AT(at - 1)], all->high[HIDDEN_AT(at)] = all->high[HIDDEN_AT(at - 1)];
         }
-        all->low[at] = low, all->high[at] = high;
+        all->low[HIDDEN_AT(at)] = low, all->high[HIDDEN_AT(at)] = high;
     }
 }
 
@@ -273,7 +283,7 @@ INLINE int hidden_is_done(const hidden *all) { return all->is_full || all->from 
 INLINE real hidden_add_all(hidden *all, const shadows *cast) {
     const reals low = cast->low, high = cast->high;
     masks hides = mask_of(low < high) & mask_of(low < all->to) & mask_of(high > all->from);
-    for (int n = 0; n < all->count; n++) hides &= mask_of(low < all->low[n]) | mask_of(high > all->high[n]);
+    for (int n = 0; n < all->count; n++) hides &= mask_of(low < all->low[HIDDEN_AT(n)]) | mask_of(high > all->high[HIDDEN_AT(n)]);
     real gone = 0;
     if (!any_compared(hides)) return gone;
 #ifdef VECTOR_VARIANT
@@ -310,25 +320,30 @@ INLINE real view_leaf(const bvh_tree *tree, const view *view, int child, hidden 
 INLINE uint view_leaves(const bvh_tree *tree, const view *view, int node, uint met, int known, hidden *all,
                             real *most, int *hint) {
     uint inner = 0;
+#ifdef VECTOR_VARIANT
     int count = 0, leaves[WIDTH];
     for (; met; met &= met - 1) {
         const int child = tree->children[node * WIDTH + lowest_bit(met)];
         if (child >= 0) inner |= met & -met;
         else if (child != known) leaves[count++] = child;
     }
-#ifdef VECTOR_VARIANT
     // Compute all shadows before any is merged: merging branches on the data and would stall the arithmetic of the next.
     shadows cast[WIDTH];
     for (int n = 0; n < count; n++) view_shadows(view, tree->leaves + (size_t)~leaves[n] * (9 * WIDTH), cast + n);
-#endif
     for (int n = 0; n < count && !hidden_is_done(all); n++) {
-#ifdef VECTOR_VARIANT
         const real gone = hidden_add_all(all, cast + n);
-#else
-        const real gone = view_leaf(tree, view, leaves[n], all);
-#endif
         if (gone > *most) *most = gone, *hint = leaves[n];
     }
+#else
+    for (; met; met &= met - 1) {
+        const int child = tree->children[node * WIDTH + lowest_bit(met)];
+        if (child >= 0) inner |= met & -met;
+        else if (child != known && !hidden_is_done(all)) {
+            const real gone = view_leaf(tree, view, child, all);
+            if (gone > *most) *most = gone, *hint = child;
+        }
+    }
+#endif
     return inner;
 }
 

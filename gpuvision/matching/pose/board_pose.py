@@ -358,6 +358,8 @@ class BoardPoseEstimator(OperationSequence[BoardPoseEstimate]):
         """Describe the one launch of the vector variant, as `Operation.launch` says."""
         edges = replace(self.ruler, count=self.lines * self.rulers_per_line).launch(device, shape, dtype)
         build = LaunchBuilder(self, device, shape, dtype, variant=self.ruler.variant)
+        if not build.uses_vectors:
+            raise ValueError(f"BoardPoseEstimator has three launches on {device.label}; see its layout")
         work = build.work(1, each=1, group=1)
         count, solver = self._rows_of_line * self.lines, self.solver
         pairs = start_pairs(self.rulers_per_line, solver.max_trials)

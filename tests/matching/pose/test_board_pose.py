@@ -226,6 +226,11 @@ def test_place_of_lines_on_the_board(device: Device, rng: np.random.Generator) -
     assert np.sqrt(result.covariance[0, 0]) > 1e-6 / np.sqrt(12)
 
 
+def test_work_items_have_no_single_launch() -> None:
+    with pytest.raises(ValueError, match="three launches"):
+        operation("work_item").launch(Device.best(), SHAPE, np.dtype(np.uint8))
+
+
 def test_writes_within_its_outputs(device: Device, rng: np.random.Generator) -> None:
     image, (rulers, lines) = picture(rng), board_rulers()
     result = operation()(image, rulers, lines, device=device)

@@ -8,7 +8,7 @@ products of three or more parameters. ``nightly`` runs all tests on every device
 ``GPUVISION_DEVICE`` selects the best device, see `Device.best`.
 
 The option ``--one-case`` reduces the fast and the full tier to the best device, and to one case of each test function
-of kernels and of ``tests/host``.
+of kernels and of ``tests/host``. Expected failures do not run then: their kernels take minutes to compile.
 
 No tier runs the cases that a device refuses: double precision without doubles, vectors on a runtime without them. The
 last lines of a run state their number. A case that PoCL or Intel's CPU runtime refuses is an error.
@@ -109,7 +109,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=refused)
         devices = [device for device in map(device_of, refused) if device is not None]
         config.stash[REFUSED_COUNTS] = dict(Counter(device.label for device in devices))
-    mark_faults(items)
+    mark_faults(items, run=not config.getoption("one_case"))
     _set_examples(items, EXAMPLES[tier])
     if tier == "nightly":
         return

@@ -86,13 +86,15 @@ FAULTS = (
 )
 
 
-def mark_faults(items: list[pytest.Item]) -> None:
-    """Mark the tests that faults of drivers affect as expected failures."""
+def mark_faults(items: list[pytest.Item], *, run: bool = True) -> None:
+    """Mark the tests that faults of drivers affect as expected failures; with `run`, run those that end."""
     for item in items:
         device = device_of(item)
         for fault in FAULTS:
             if device is not None and _affects(fault, device, item.nodeid):
-                item.add_marker(pytest.mark.xfail(reason=fault.reason, run=not fault.ends_process, strict=False))
+                item.add_marker(
+                    pytest.mark.xfail(reason=fault.reason, run=run and not fault.ends_process, strict=False)
+                )
 
 
 def _affects(fault: DriverFault, device: Device, name: str) -> bool:

@@ -34,14 +34,14 @@ UNAFFECTED = (
 )
 
 
-def marks_of(name: str, kind: str | None = "rusticl", driver: str = "22.3.6") -> list[pytest.Mark]:
+def marks_of(name: str, kind: str | None = "rusticl", driver: str = "22.3.6", *, run: bool = True) -> list[pytest.Mark]:
     """Return the marks of a test of a device."""
     marks: list[Any] = []
     device = None if kind is None else SimpleNamespace(kind=kind, driver=driver)
     item: Any = SimpleNamespace(
         nodeid=name, add_marker=marks.append, callspec=SimpleNamespace(params={"device": device} if device else {})
     )
-    mark_faults([item])
+    mark_faults([item], run=run)
     return [each.mark for each in marks]
 
 
@@ -51,6 +51,7 @@ def test_affected_test_is_an_expected_failure(name: str, runs: bool) -> None:
     assert mark.name == "xfail"
     assert mark.kwargs["reason"].startswith("Mesa 22.3 ")
     assert (mark.kwargs["run"], mark.kwargs["strict"]) == (runs, False)
+    assert [each.kwargs["run"] for each in marks_of(name, run=False)] == [False]
     for kind, driver in (("pocl", "22.3.6"), ("rusticl", "25.0.1"), (None, "")):
         assert marks_of(name, kind, driver) == []
 

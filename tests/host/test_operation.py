@@ -345,7 +345,8 @@ def test_host_view_refuses_memory_that_is_not_shared(device):
 
 
 def test_a_program_is_built_once(device):
-    defines = {"INPUT": "float", "INPUT16": "float16", "WITH_POSITION": None}
+    vectors = {f"INPUT{width}": f"float{width}" for width in (2, 4, 16)}
+    defines = {"INPUT": "float", **vectors, "WITH_POSITION": None}
     assert build(device, KERNEL_FOLDER, "psd/psd.cl", defines) is build(
         device, KERNEL_FOLDER, "psd/psd.cl", dict(reversed(defines.items()))
     )

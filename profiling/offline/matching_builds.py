@@ -60,7 +60,7 @@ def _rulers() -> Iterator[Example]:
 
 
 def _blobs() -> Iterator[Example]:
-    blobs = FindBlobs(threshold=12.0, count=100)
+    blobs = FindBlobs(threshold=12.0, count=2)
     for dtype in (np.uint8, np.float32):
         yield Example(f"circle {np.dtype(dtype)}", blobs, _IMAGE, dtype)
     for shape in ("ring", "cross"):

@@ -128,15 +128,18 @@ kernel void board_pose(global const CODE *restrict image, global const BoardRule
         sum_x += row[2][i];
         sum_y += row[3][i];
     }
-    reals room[CAPACITY];
+    reals distances[CAPACITY];
+    const pose_room room = {distances, 0};
     pose_rows all = {row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], padded, etch_certainty};
     const pose_frame frame = centre_rows(&all, sum, sum_x, sum_y);
     const laned_pose about = {0, 0, 0, 0, 0, 0, 0};
-    const solved_pose fit = pose_solved(about, all, subsets, trials, steps, 1e-3f, rank_tolerance, room);
+    solved_pose fit;
+    fit.pose = about;
+    pose_solved(&fit, all, subsets, trials, steps, 1e-3f, rank_tolerance, room);
     const pose_outputs outputs = {pose,   deformation, placement, covariance, residuals, weights,
                                   scale,  residual_scale,      condition, rank,       inliers,   status,     etch,
                                   inlier_fraction, leverage};
     const pose_limits limits = {min_inlier_fraction, max_leverage, max_shift, max_turn};
-    store_pose(fit, all, frame, 1, 0, count, limits, place_x, place_y, outputs);
+    store_pose(&fit, all, frame, 1, 0, count, limits, place_x, place_y, outputs);
 }
 #endif

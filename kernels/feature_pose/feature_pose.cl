@@ -94,7 +94,8 @@ kernel void feature_pose(global const WIDE *restrict expected, global const real
                          const real matched_sigma_px, const real drilled_sigma_px, const real tolerance) {
     if (get_global_id(0)) return;
     real nx[CAPACITY], ny[CAPACITY], px[CAPACITY], py[CAPACITY], ex[CAPACITY], ey[CAPACITY], certainty[CAPACITY];
-    reals room[CAPACITY];
+    reals distances[CAPACITY];
+    const pose_room room = {distances, 0};
 #ifdef WITH_ETCH_BIAS
     real etch_factor[CAPACITY];
 #else
@@ -133,7 +134,9 @@ kernel void feature_pose(global const WIDE *restrict expected, global const real
     pose_rows all = {nx, ny, px, py, ex, ey, certainty, etch_factor, padded, etch_certainty};
     const pose_frame centred = centre_rows(&all, sum, sum_x, sum_y);
     const laned_pose about = {0, 0, 0, 0, 0, 0, 0};
-    solved_pose fit = pose_solved(about, all, subsets, trials, steps, min_scale, rank_tolerance, room);
+    solved_pose fit;
+    fit.pose = about;
+    pose_solved(&fit, all, subsets, trials, steps, min_scale, rank_tolerance, room);
     const pose_outputs outputs = {motion, 0,         0,    motion_covariance, residuals, weights, scale, residual_scale,
                                   condition, rank, inliers, status,           etch,      inlier_fraction, leverage};
     const pose_limits limits = {min_inlier_fraction, max_leverage, max_shift, max_turn};
@@ -143,7 +146,7 @@ kernel void feature_pose(global const WIDE *restrict expected, global const real
     const real factor = fit.covariance_factor;
     if (factor < 1) fit.covariance_factor = 1;
 #endif
-    store_pose(fit, all, centred, is_pose_finite, 0, count, limits, at_x, at_y, outputs);
+    store_pose(&fit, all, centred, is_pose_finite, 0, count, limits, at_x, at_y, outputs);
 #ifdef GIVEN_SCALE
     const real smallest = 1;
 #else

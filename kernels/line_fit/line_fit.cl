@@ -8,23 +8,23 @@
 //          (lines,); inliers (lines,); status (lines,); with WITH_WEIGHTS also weights (lines, count), 0 to 1.
 // Options: INPUT, REAL_IS_DOUBLE, WITH_SIGMA, WITH_WEIGHTS, CAPACITY (size of the point arrays), GIVEN_SCALE,
 //          EFFICIENCY (line_fit.h), loss options (common/robust.h).
-// Variants: vector: 16 lines per work-item, a line per lane; work-item: one line per item.
-//
-// The last lanes of the last vector repeat the last line; they are not stored.
+// Variants: vector: 16 lines per work-item, a line per lane; the last lanes of the last vector repeat the last line, and
+//          are not stored. work-item: a group of up to 64 items per line, the points, and the start candidates, divided
+//          over the items. The points are read from global memory wherever they are needed (line_fit_points.h). The
+//          results do not depend on the size of the group (common/group.h).
+#ifndef VECTOR_VARIANT
+#define GROUP_PER_PROBLEM
+#endif
 #include "line_fit/line_fit.h"
 #include "common/status.h"
 
-// Indices of elements of global memory, one per lane. gather: the value at each lane's index.
 #ifdef VECTOR_VARIANT
-typedef long16 indices;
-static inline reals gather(global const INPUT *from, indices at) {
+// Gather the values of global memory at the index in each lane.
+static inline reals gather(global const INPUT *from, long16 at) {
     return (reals)(from[at.s0], from[at.s1], from[at.s2], from[at.s3], from[at.s4], from[at.s5], from[at.s6],
                    from[at.s7], from[at.s8], from[at.s9], from[at.sa], from[at.sb], from[at.sc], from[at.sd],
                    from[at.se], from[at.sf]);
 }
-#else
-typedef long indices;
-static inline reals gather(global const INPUT *from, indices at) { return (real)from[at]; }
 #endif
 
 kernel void line_fit_sets(global const INPUT *restrict points,
@@ -36,16 +36,29 @@ kernel void line_fit_sets(global const INPUT *restrict points,
                           global real *restrict weights, global uchar *restrict status, const long lines,
                           const int count, constant int *pairs, const int trials, const int steps,
                           const real min_scale) {
+#ifdef IN_GROUP
+    const long first = (long)get_group_id(0);
+    local real sums[ROOM_FOR_SUMS], distances[ROOM_FOR_DISTANCES];
+#ifdef WITH_SIGMA
+    global const INPUT *sigma_of_line = sigma + first * count;
+#else
+    global const INPUT *sigma_of_line = 0;
+#endif
+    const laned_points given = {points + 2 * first * count, sigma_of_line, 0, 0, distances, sums, count};
+    real reach;
+    const laned_points all = about_first_point(given, &reach);
+    const real origin_x = all.origin_x, origin_y = all.origin_y;
+#else
     reals x[CAPACITY], y[CAPACITY], certainty[CAPACITY], distances[CAPACITY];
     const long first = (long)get_global_id(0) * LANES;
     if (first >= lines) return;
-    const indices line = min((indices)first + LANED(convert_long)(LANE_NUMBERS), (indices)(lines - 1));
-    const indices set = line * (indices)count;
+    const long16 line = min((long16)first + LANED(convert_long)(LANE_NUMBERS), (long16)(lines - 1));
+    const long16 set = line * (long16)count;
     // Coordinates relative to the first valid point: coordinates of a large image leave few digits for distances.
     reals origin_x = 0, origin_y = 0, reach = 0;
     masks found = 0;
     for (int i = 0; i < count; i++) {
-        const indices at = set + (indices)i;
+        const long16 at = set + (long16)i;
         const reals px = gather(points, 2 * at), py = gather(points, 2 * at + 1);
         masks good = ~(mask_of(LANED(not_finite)(px)) | mask_of(LANED(not_finite)(py)));
 #ifdef WITH_SIGMA
@@ -68,14 +81,26 @@ kernel void line_fit_sets(global const INPUT *restrict points,
         x[i] = kept_where(good, x[i] - origin_x);
         y[i] = kept_where(good, y[i] - origin_y);
     }
+    const laned_points all = {x, y, certainty, distances, count, 0};
+#endif
     // The scale is at least the rounding error of the coordinates: eps times the largest |x| + |y|, in sigmas.
     const reals rounding = (reals)REAL_EPSILON * reach + (reals)1e-30f;
     const reals least_scale = rounding > (reals)min_scale ? rounding : (reals)min_scale;
-    const laned_points all = {x, y, certainty, distances, count};
     laned_fit fit = line_fit(all, pairs, trials, steps, least_scale);
 
     const masks few = mask_of(fit.points < 2);
     const masks bad = few | fit.coincide;
+#ifdef WITH_WEIGHTS
+    for (int k = GROUP_ITEM; k < count; k += GROUP_ITEMS) {
+        const laned_point at = point_at(all, k);
+        const reals v = line_distance(fit.line, at.x, at.y);
+        const masks there = ~bad & mask_of(at.certainty > (reals)0);
+        const reals weight = kept_where(there, loss_weight(v * at.certainty / fit.scale));
+        for (int lane = 0; lane < LANES && first + lane < lines; lane++)
+            weights[(first + lane) * count + k] = LANE(weight, lane);
+    }
+#endif
+    if (GROUP_ITEM) return;
     masks flags = few ? (masks)STATUS_NO_DATA : (fit.coincide ? (masks)STATUS_AMBIGUOUS : (masks)0);
     flags |= ~bad & mask_of(2 * fit.inliers < fit.points) & (masks)STATUS_AMBIGUOUS;
     // The direction is ambiguous by half a turn: choose c > 0, or c = 0 and s > 0.
@@ -101,13 +126,4 @@ kernel void line_fit_sets(global const INPUT *restrict points,
         inliers[i] = (int)LANE_BITS(in, lane);
         status[i] = (uchar)LANE_BITS(flags, lane);
     }
-#ifdef WITH_WEIGHTS
-    for (int k = 0; k < count; k++) {
-        const reals v = line_distance(fit.line, x[k], y[k]);
-        const masks there = ~bad & mask_of(certainty[k] > (reals)0);
-        const reals weight = kept_where(there, loss_weight(v * certainty[k] / fit.scale));
-        for (int lane = 0; lane < LANES && first + lane < lines; lane++)
-            weights[(first + lane) * count + k] = LANE(weight, lane);
-    }
-#endif
 }

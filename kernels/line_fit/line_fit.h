@@ -1,4 +1,4 @@
-// Robust straight line through points, one line per lane.
+// Robust straight line through points: one line per lane, or one line per work-group (IN_GROUP, common/group.h).
 //
 // The line minimises sum rho(v / (sigma scale)), v = c (y - y0) - s (x - x0) the distance of a point to the line
 // through (x0, y0) along (c, s), and rho the loss of common/robust.h. The start is the best line through a pair of
@@ -9,7 +9,8 @@
 #ifndef LINE_FIT_H
 #define LINE_FIT_H
 
-#include "common/robust.h"
+#include "common/group.h"
+#include "line_fit/line_fit_points.h"
 
 #ifdef GIVEN_SCALE
 #define SCALE ((real)(GIVEN_SCALE))
@@ -19,15 +20,6 @@
 typedef struct {
     reals x, y, c, s;
 } laned_line;
-
-// Points of each lane, and their certainties 1/sigma (0: missing point).
-typedef struct {
-    private const reals *x;
-    private const reals *y;
-    private const reals *certainty;
-    private reals *distances; // scratch space for `count` values
-    int count;
-} laned_points;
 
 // Fitted line; variances of its angle [rad2] and of its offset at (x, y).
 typedef struct {
@@ -42,52 +34,74 @@ static inline reals line_distance(laned_line line, reals x, reals y) {
     return line.c * (y - line.y) - line.s * (x - line.x);
 }
 
-// Absolute distances in units of the points' sigma, infinite for missing points.
-static inline void line_distances(laned_line line, laned_points all) {
-    for (int i = 0; i < all.count; i++) {
-        const reals w = all.certainty[i];
-        const reals z = FABS(line_distance(line, all.x[i], all.y[i]) * w);
-        all.distances[i] = w > (reals)0 ? z : (reals)INFINITY;
-    }
+// Absolute distance in units of the point's sigma, infinite for missing points.
+static inline reals line_sigmas(laned_line line, laned_point at) {
+    const reals z = FABS(line_distance(line, at.x, at.y) * at.certainty);
+    return at.certainty > (reals)0 ? z : (reals)INFINITY;
 }
 
 // Return the score of a line, least is best: the loss where the scale is given, otherwise the distance of the given
 // rank (median) to 1 %.
-static inline reals line_score(laned_line line, laned_points all, masks rank) {
+//
+// A work-group has no room for the distances of every candidate: it computes them anew for every three bits of the order
+// statistic.
+BETWEEN_BARRIERS reals line_score(laned_line line, laned_points all, masks rank) {
 #ifdef SCALE
     reals sum = 0;
-    for (int i = 0; i < all.count; i++)
-        sum += loss_of(line_distance(line, all.x[i], all.y[i]) * all.certainty[i] * (reals)((real)1 / SCALE));
+    for (int i = 0; i < all.count; i++) {
+        const laned_point at = point_at(all, i);
+        sum += loss_of(line_distance(line, at.x, at.y) * at.certainty * (reals)((real)1 / SCALE));
+    }
     return sum;
+#elif defined(IN_GROUP)
+    bits found = 0;
+    for (int shift = BITS_BELOW_SIGN - 3; shift >= BITS_TO_ONE_PERCENT; shift -= 3) {
+        int below[DIGITS];
+        for (int k = 0; k < DIGITS; k++) below[k] = 0;
+        for (int i = 0; i < all.count; i++) count_below(as_bits(line_sigmas(line, point_at(all, i))), found, shift, below);
+        found |= (bits)digit_of(below, rank) << shift;
+    }
+    return as_real(found);
 #else
-    line_distances(line, all);
+    for (int i = 0; i < all.count; i++) all.distances[i] = line_sigmas(line, point_at(all, i));
     return ranked_of(all.distances, all.count, rank, BITS_TO_ONE_PERCENT);
 #endif
 }
 
 // Return the line through the weighted mean of all points, along x.
-static inline laned_line line_middle(laned_points all) {
-    reals sum = 0, sum_x = 0, sum_y = 0;
-    for (int i = 0; i < all.count; i++) {
-        const reals w = all.certainty[i] * all.certainty[i];
-        sum += w, sum_x += w * all.x[i], sum_y += w * all.y[i];
+INLINE laned_line line_middle(laned_points all) {
+    reals sums[3];
+    EACH_PART(part) {
+        reals sum = 0, sum_x = 0, sum_y = 0;
+        for (int i = part; i < all.count; i += PARTS) {
+            const laned_point at = point_at(all, i);
+            const reals w = at.certainty * at.certainty;
+            sum += w, sum_x += w * at.x, sum_y += w * at.y;
+        }
+        sums[0] = sum, sums[1] = sum_x, sums[2] = sum_y;
+        group_put(sums, 3, part, all.sums);
     }
-    const reals per = (reals)1 / (sum > (reals)0 ? sum : (reals)1);
-    return (laned_line){sum_x * per, sum_y * per, 1, 0};
+    GROUP_SPACE const reals *totals = group_total(sums, 3, all.sums);
+    const reals per = (reals)1 / (totals[0] > (reals)0 ? totals[0] : (reals)1);
+    return (laned_line){totals[1] * per, totals[2] * per, 1, 0};
 }
 
-// Find the line through a pair of points with the least score. A pair of coinciding or missing points is skipped.
-static inline laned_line line_start(laned_points all, constant const int *pairs, int trials, masks rank) {
+// Find the line through a pair of points with the least score. A pair of coinciding or missing points is skipped. The items
+// of a group take different pairs.
+INLINE laned_line line_start(laned_points all, constant const int *pairs, int trials, masks rank) {
     laned_line best = line_middle(all);
     reals least = INFINITY;
-    for (int trial = 0; trial < trials; trial++) {
-        const int i = pairs[2 * trial], j = pairs[2 * trial + 1];
-        const reals along_x = all.x[j] - all.x[i], along_y = all.y[j] - all.y[i];
+#ifdef IN_GROUP
+    int chosen = INT_MAX;
+#endif
+    for (int trial = GROUP_ITEM; trial < trials; trial += GROUP_ITEMS) {
+        const laned_point from = point_at(all, pairs[2 * trial]), to = point_at(all, pairs[2 * trial + 1]);
+        const reals along_x = to.x - from.x, along_y = to.y - from.y;
         const reals square = along_x * along_x + along_y * along_y;
         const masks usable =
-            mask_of(square > (reals)0) & mask_of(all.certainty[i] * all.certainty[j] > (reals)0);
+            mask_of(square > (reals)0) & mask_of(from.certainty * to.certainty > (reals)0);
         const reals per = (reals)1 / sqrt(usable ? square : (reals)1);
-        const laned_line candidate = {all.x[i], all.y[i], along_x * per, along_y * per};
+        const laned_line candidate = {from.x, from.y, along_x * per, along_y * per};
         const reals score = line_score(candidate, all, rank);
         const masks better = usable & mask_of(score < least);
         least = better ? score : least;
@@ -95,27 +109,34 @@ static inline laned_line line_start(laned_points all, constant const int *pairs,
         best.y = better ? candidate.y : best.y;
         best.c = better ? candidate.c : best.c;
         best.s = better ? candidate.s : best.s;
+#ifdef IN_GROUP
+        chosen = better ? trial : chosen;
+#endif
     }
+#ifdef IN_GROUP
+    // The item of the best pair shares it in the room for totals.
+    if (group_best(least, chosen, all.sums) == GROUP_ITEM) {
+        all.sums[0] = best.x, all.sums[1] = best.y, all.sums[2] = best.c, all.sums[3] = best.s;
+    }
+    group_barrier();
+    best = (laned_line){all.sums[0], all.sums[1], all.sums[2], all.sums[3]};
+#endif
     return best;
 }
 
-// Do one step of reweighted total least squares (orthogonal regression).
+// Sums of w, w u, w v, w u u, w u v and w v v in the frame of a line.
+#define MOMENTS 6
+
+// Turn and move a line by its moments: one step of total least squares (orthogonal regression).
 //
 // With the central moments S of the points in the frame of the current line (u along it, v across), the line of least
 // sum w v^2 is turned by phi / 2, tan(phi) = 2 S_uv / (S_uu - S_vv). Half-angle formulas need no arctangent:
 // cos(phi / 2) = sqrt((1 + cos(phi)) / 2), sin(phi / 2) = sin(phi) / (2 cos(phi / 2)). Both use |cos(phi)|, which
 // avoids cancellation; where cos(phi) < 0, cosine and sine of the half angle are exchanged. `coincide` gets the lanes
 // without a direction: S_uu = S_vv and S_uv = 0 up to rounding.
-static inline laned_line line_step(laned_line line, laned_points all, reals per_scale, masks *coincide) {
-    reals sum = 0, sum_u = 0, sum_v = 0, sum_uu = 0, sum_uv = 0, sum_vv = 0;
-    for (int i = 0; i < all.count; i++) {
-        const reals x = all.x[i] - line.x, y = all.y[i] - line.y;
-        const reals u = line.c * x + line.s * y, v = line.c * y - line.s * x;
-        const reals certainty = all.certainty[i];
-        const reals w = certainty * certainty * loss_weight(v * certainty * per_scale);
-        sum += w, sum_u += w * u, sum_v += w * v;
-        sum_uu += w * u * u, sum_uv += w * u * v, sum_vv += w * v * v;
-    }
+static inline laned_line line_turned(laned_line line, GROUP_SPACE const reals *moments, private masks *coincide) {
+    const reals sum = moments[0], sum_u = moments[1], sum_v = moments[2];
+    const reals sum_uu = moments[3], sum_uv = moments[4], sum_vv = moments[5];
     const reals per = (reals)1 / (sum > (reals)0 ? sum : (reals)1), u = sum_u * per, v = sum_v * per;
     const reals across = (reals)2 * (sum_uv - sum_u * v), along = sum_uu - sum_u * u - (sum_vv - sum_v * v);
     const reals length = sqrt(along * along + across * across);
@@ -136,19 +157,53 @@ static inline laned_line line_step(laned_line line, laned_points all, reals per_
     return next;
 }
 
+// Do one step of reweighted total least squares.
+INLINE laned_line line_step(laned_line line, laned_points all, reals per_scale, masks *coincide) {
+    reals moments[MOMENTS];
+    EACH_PART(part) {
+        reals sum = 0, sum_u = 0, sum_v = 0, sum_uu = 0, sum_uv = 0, sum_vv = 0;
+        for (int i = part; i < all.count; i += PARTS) {
+            const laned_point at = point_at(all, i);
+            const reals x = at.x - line.x, y = at.y - line.y;
+            const reals u = line.c * x + line.s * y, v = line.c * y - line.s * x;
+            const reals w = at.certainty * at.certainty * loss_weight(v * at.certainty * per_scale);
+            sum += w, sum_u += w * u, sum_v += w * v;
+            sum_uu += w * u * u, sum_uv += w * u * v, sum_vv += w * v * v;
+        }
+        moments[0] = sum, moments[1] = sum_u, moments[2] = sum_v;
+        moments[3] = sum_uu, moments[4] = sum_uv, moments[5] = sum_vv;
+        group_put(moments, MOMENTS, part, all.sums);
+    }
+    return line_turned(line, group_total(moments, MOMENTS, all.sums), coincide);
+}
+
 // Return the scale of the distances in sigmas: GIVEN_SCALE, or 1.4826 times the median absolute distance with the
 // small-sample correction 1 + few / (n - 2). Only distances up to `reach` take part: once a first scale is known, this
 // removes the outliers, which raise the median.
-static inline reals line_scale(laned_line line, laned_points all, reals reach, real few, reals min_scale) {
+INLINE reals line_scale(laned_line line, laned_points all, reals reach, real few, reals min_scale) {
 #ifdef SCALE
     return (reals)SCALE;
 #else
-    line_distances(line, all);
-    masks within = 0;
-    for (int i = 0; i < all.count; i++)
-        within -= mask_of(all.distances[i] <= reach) & mask_of(all.certainty[i] > (reals)0);
-    const reals middle = ranked_of(all.distances, all.count, (within >> 1) + 1, 0);
-    const reals free = LANED(convert_real)(within) - (reals)2;
+    reals counted;
+    EACH_PART(part) {
+        masks within = 0;
+        for (int i = part; i < all.count; i += PARTS) {
+            const laned_point at = point_at(all, i);
+            const reals z = line_sigmas(line, at);
+            within -= mask_of(z <= reach) & mask_of(at.certainty > (reals)0);
+            all.distances[i] = z;
+        }
+        counted = LANED(convert_real)(within);
+        group_put(&counted, 1, part, all.sums);
+    }
+    const reals many = *group_total(&counted, 1, all.sums);
+    const masks rank = (to_masks(many) >> 1) + 1;
+#ifdef IN_GROUP
+    const real middle = group_ranked(all.distances, all.count, (int)rank, 0, all.sums);
+#else
+    const reals middle = ranked_of(all.distances, all.count, rank, 0);
+#endif
+    const reals free = many - (reals)2;
     const reals scale = (reals)MAD_TO_SIGMA * ((reals)1 + (reals)few / (free > (reals)1 ? free : (reals)1)) * middle;
     return scale > min_scale ? scale : min_scale;
 #endif
@@ -159,38 +214,53 @@ static inline reals line_scale(laned_line line, laned_points all, reals reach, r
 // Covariance of an M-estimator (Huber, 1981): f A^-1 with A = sum of h h^T / sigma^2 over the inliers. A is diagonal
 // for offset and angle at the weighted mean: sum w and sum w u^2. With a given scale f = scale^2 / EFFICIENCY,
 // otherwise f = scale^2 (sum psi(z)^2 / (n - 2)) / (mean psi'(z))^2, NaN for two inliers.
-static inline void line_variances(laned_fit *fit, laned_points all) {
+INLINE void line_variances(laned_fit *fit, laned_points all) {
     const reals per_scale = (reals)1 / fit->scale;
-    reals sum = 0, sum_uu = 0, slopes = 0, squares = 0;
-    masks inliers = 0;
-    for (int i = 0; i < all.count; i++) {
-        const reals x = all.x[i] - fit->line.x, y = all.y[i] - fit->line.y;
-        const reals u = fit->line.c * x + fit->line.s * y, v = fit->line.c * y - fit->line.s * x;
-        const reals certainty = all.certainty[i], z = v * certainty * per_scale, weight = loss_weight(z);
-        const masks is_in = mask_of(certainty * weight > (reals)0);
-        const reals w = kept_where(is_in, certainty * certainty);
-        inliers -= is_in;
-        sum += w, sum_uu += w * u * u;
-        slopes += kept_where(is_in, loss_slope(z));
-        squares += kept_where(is_in, weight * weight * z * z);
+    reals sums[5];
+    EACH_PART(part) {
+        reals sum = 0, sum_uu = 0, slopes = 0, squares = 0;
+        masks inliers = 0;
+        for (int i = part; i < all.count; i += PARTS) {
+            const laned_point at = point_at(all, i);
+            const reals x = at.x - fit->line.x, y = at.y - fit->line.y;
+            const reals u = fit->line.c * x + fit->line.s * y, v = fit->line.c * y - fit->line.s * x;
+            const reals certainty = at.certainty, z = v * certainty * per_scale, weight = loss_weight(z);
+            const masks is_in = mask_of(certainty * weight > (reals)0);
+            const reals w = kept_where(is_in, certainty * certainty);
+            inliers -= is_in;
+            sum += w, sum_uu += w * u * u;
+            slopes += kept_where(is_in, loss_slope(z));
+            squares += kept_where(is_in, weight * weight * z * z);
+        }
+        sums[0] = sum, sums[1] = sum_uu, sums[2] = slopes, sums[3] = squares, sums[4] = LANED(convert_real)(inliers);
+        group_put(sums, 5, part, all.sums);
     }
-    fit->inliers = inliers;
+    GROUP_SPACE const reals *totals = group_total(sums, 5, all.sums);
+    const reals many = totals[4];
+    fit->inliers = to_masks(many);
     reals factor = fit->scale * fit->scale;
 #ifdef SCALE
     factor *= (reals)(1 / (real)(EFFICIENCY));
 #else
-    const reals many = LANED(convert_real)(inliers), each = slopes / many;
-    factor *= squares / (many - (reals)2) / (each * each);
-    factor = inliers > 2 ? factor : (reals)REAL_NAN;
+    const reals each = totals[2] / many;
+    factor *= totals[3] / (many - (reals)2) / (each * each);
+    factor = fit->inliers > 2 ? factor : (reals)REAL_NAN;
 #endif
-    fit->variance_of_offset = factor / sum;
-    fit->variance_of_angle = factor / sum_uu;
+    fit->variance_of_offset = factor / totals[0];
+    fit->variance_of_angle = factor / totals[1];
 }
 
 // Fit the lines: start, then `steps` reweighted steps. `pairs` (trials, 2) holds the points of the start candidates.
-static inline laned_fit line_fit(laned_points all, constant const int *pairs, int trials, int steps, reals min_scale) {
+INLINE laned_fit line_fit(laned_points all, constant const int *pairs, int trials, int steps, reals min_scale) {
     laned_fit fit = {line_middle(all), min_scale, 0, 0, 0, 0, 0};
-    for (int i = 0; i < all.count; i++) fit.points -= mask_of(all.certainty[i] > (reals)0);
+    reals present;
+    EACH_PART(part) {
+        masks points = 0;
+        for (int i = part; i < all.count; i += PARTS) points -= mask_of(point_at(all, i).certainty > (reals)0);
+        present = LANED(convert_real)(points);
+        group_put(&present, 1, part, all.sums);
+    }
+    fit.points = to_masks(*group_total(&present, 1, all.sums));
 #ifdef ROBUST
     fit.line = line_start(all, pairs, trials, (fit.points >> 1) + 1);
     fit.scale = line_scale(fit.line, all, (reals)INFINITY, FEW_TRIED, min_scale);

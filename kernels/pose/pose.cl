@@ -11,22 +11,14 @@
 //          inliers, status, inlier_fraction, leverage. Refused poses are NaN.
 // Options: INPUT, REAL_IS_DOUBLE, WITH_INITIAL_POSE (initial pose; otherwise no motion), POSE_PARAMETERS, FREEDOMS,
 //          WITH_ETCH_BIAS, CAPACITY, START_STEPS, GIVEN_SCALE, EFFICIENCY (pose.h), loss options (common/robust.h).
-// Variants: vector: 16 rows, or 16 start candidates, in a vector; work-item: one row or start candidate after the
-//           other.
-//
-// One work-item solves one pose.
-#include "pose/pose_result.h"
-
-// Feature row: ROW in pose.py, and the etch factor.
-typedef struct {
-    INPUT normal_x, normal_y;             // unit normal n
-    INPUT x, y;                           // place p in the artwork [m]
-    INPUT displacement_x, displacement_y; // e, from p to the place where the feature was seen [m]
-    INPUT sigma;                          // along the normal [m]
-#ifdef WITH_ETCH_BIAS
-    INPUT etch_factor;                    // g
+// Variants: vector: a work-item per pose, 16 rows or 16 start candidates in a vector; work-item: a group of up to 64 items
+//          per pose, the rows, and the start candidates, divided over the items. The rows are read from global memory
+//          wherever they are needed (pose_input.h). The results do not depend on the size of the group (common/group.h).
+#ifndef VECTOR_VARIANT
+#define GROUP_PER_PROBLEM
 #endif
-} PoseRow;
+#include "pose/pose_input.h"
+#include "pose/pose_result.h"
 
 kernel void pose_sets(global const PoseRow *restrict rows,
 #ifdef WITH_INITIAL_POSE
@@ -42,10 +34,18 @@ kernel void pose_sets(global const PoseRow *restrict rows,
                       const real min_inlier_fraction, const real max_leverage, const real max_shift,
                       const real max_turn, const real place_x, const real place_y,
                       const real etch_certainty) {
+#ifdef IN_GROUP
+    const long item = (long)get_group_id(0);
+    local real sums[ROOM_FOR_SUMS], distances[ROOM_FOR_DISTANCES];
+    const pose_room room = {distances, sums};
+    const pose_rows all = framed_rows(rows + item * count, count, etch_certainty, sums);
+    const pose_frame frame = all.frame;
+#else
     const long item = (long)get_global_id(0);
     if (item >= poses) return;
     real nx[CAPACITY], ny[CAPACITY], px[CAPACITY], py[CAPACITY], ex[CAPACITY], ey[CAPACITY], certainty[CAPACITY];
-    reals room[CAPACITY];
+    reals distances[CAPACITY];
+    const pose_room room = {distances, 0};
 #ifdef WITH_ETCH_BIAS
     real etch_factor[CAPACITY];
 #else
@@ -54,45 +54,35 @@ kernel void pose_sets(global const PoseRow *restrict rows,
     // The row count is padded with rows of certainty 0 to whole vectors. Missing rows also get certainty 0.
     const int padded = (count + LANES - 1) / LANES * LANES;
     real sum = 0, sum_x = 0, sum_y = 0;
-    int all_finite = 1;
     for (int i = 0; i < padded; i++) {
-        global const PoseRow *row = rows + item * count + min(i, count - 1);
-        int good = i < count;
-        // By field: Mesa 22.3 drops the index of a pointer to numbers that was cast from a pointer to a struct.
-        good &= !not_finite((real)row->normal_x) & !not_finite((real)row->normal_y) & !not_finite((real)row->x) &
-                !not_finite((real)row->y) & !not_finite((real)row->displacement_x) &
-                !not_finite((real)row->displacement_y) & !not_finite((real)row->sigma);
+        const pose_row row = read_row(rows + item * count + min(i, count - 1), i < count);
+        nx[i] = row.nx, ny[i] = row.ny, px[i] = row.px, py[i] = row.py, ex[i] = row.ex, ey[i] = row.ey;
+        certainty[i] = row.certainty;
 #ifdef WITH_ETCH_BIAS
-        good &= !not_finite((real)row->etch_factor);
+        etch_factor[i] = row.etch_factor;
 #endif
-        good &= row->sigma > 0;
-        nx[i] = good ? row->normal_x : 0;
-        ny[i] = good ? row->normal_y : 0;
-        px[i] = good ? row->x : 0;
-        py[i] = good ? row->y : 0;
-        ex[i] = good ? row->displacement_x : 0;
-        ey[i] = good ? row->displacement_y : 0;
-        certainty[i] = good ? 1 / (real)row->sigma : 0;
-#ifdef WITH_ETCH_BIAS
-        etch_factor[i] = good ? row->etch_factor : 0;
-#endif
-        sum += good;
+        sum += row.certainty > 0;
         sum_x += px[i];
         sum_y += py[i];
     }
     pose_rows all = {nx, ny, px, py, ex, ey, certainty, etch_factor, padded, etch_certainty};
     const pose_frame frame = centre_rows(&all, sum, sum_x, sum_y);
+#endif
+    int all_finite = 1;
     laned_pose about = {0, 0, 0, 0, 0, 0, 0};
 #ifdef WITH_INITIAL_POSE
     const real x = start[3 * item], y = start[3 * item + 1], turn = start[3 * item + 2];
     all_finite = !(not_finite(x) | not_finite(y) | not_finite(turn));
     about = pose_in_frame(x, y, turn, frame);
 #endif
-    const solved_pose fit = pose_solved(about, all, subsets, trials, steps, min_scale, rank_tolerance, room);
+    GROUP_SPACE solved_pose fit;
+    if (GROUP_ITEM == 0) fit.pose = about;
+    group_barrier();
+    pose_solved(&fit, all, subsets, trials, steps, min_scale, rank_tolerance, room);
 
     const pose_outputs outputs = {pose,   deformation, placement, covariance, residuals, weights,
                                   scale,  residual_scale,      condition, rank,       inliers,   status,     etch,
                                   inlier_fraction, leverage};
     const pose_limits limits = {min_inlier_fraction, max_leverage, max_shift, max_turn};
-    store_pose(fit, all, frame, all_finite, item, count, limits, place_x, place_y, outputs);
+    store_pose(&fit, all, frame, all_finite, item, count, limits, place_x, place_y, outputs);
 }

@@ -1,17 +1,9 @@
-// Frame of the rows in which a pose is solved, and output of a solved pose in metres about the artwork's origin.
-//
-// In the frame of the rows their centre is 0 and their root-mean-square distance from it is 1: p' = (p - centre) /
-// size, e' = e / size, sigma' = sigma / size. A translation t of the frame is t size metres.
+// Output of a solved pose in metres about the artwork's origin: the pose was solved in the frame of the rows (pose_frame).
 #ifndef POSE_RESULT_H
 #define POSE_RESULT_H
 
 #include "pose/pose.h"
 #include "common/status.h"
-
-// Centre [m], size [m] and 1 / size of the rows.
-typedef struct {
-    real x, y, size, per_size;
-} pose_frame;
 
 // Output arrays of the kernels, in the order of the fields of BoardPose (pose.py); deformation and placement may be null.
 typedef struct {
@@ -38,28 +30,6 @@ typedef struct {
     real inlier_fraction, leverage, shift, turn;
 } pose_limits;
 
-// Transform rows to their frame, in place: shifts and turns then have the same unit, and places have no large offset
-// that costs digits. `sum` is the number of rows, (sum_x, sum_y) the sum of their places.
-static inline pose_frame centre_rows(private pose_rows *all, real sum, real sum_x, real sum_y) {
-    private real *px = (private real *)all->px, *py = (private real *)all->py;
-    private real *ex = (private real *)all->ex, *ey = (private real *)all->ey;
-    private real *certainty = (private real *)all->certainty;
-    const real x = sum_x / max(sum, (real)1), y = sum_y / max(sum, (real)1);
-    real square = 0;
-    for (int i = 0; i < all->count; i++) {
-        px[i] = certainty[i] > 0 ? px[i] - x : 0;
-        py[i] = certainty[i] > 0 ? py[i] - y : 0;
-        square += px[i] * px[i] + py[i] * py[i];
-    }
-    const real size = square > 0 ? sqrt(square / sum) : 1, per_size = 1 / size;
-    for (int i = 0; i < all->count; i++) {
-        px[i] *= per_size, py[i] *= per_size, ex[i] *= per_size, ey[i] *= per_size;
-        certainty[i] *= size;
-    }
-    all->etch *= size;
-    return (pose_frame){x, y, size, per_size};
-}
-
 // Return the pose (x, y, turn) about the artwork's origin as a pose in the frame of the rows.
 // cos(turn) - 1 = -2 sin^2(turn / 2) avoids cancellation for small turns.
 static inline laned_pose pose_in_frame(real x, real y, real turn, pose_frame frame) {
@@ -69,30 +39,70 @@ static inline laned_pose pose_in_frame(real x, real y, real turn, pose_frame fra
                         (reals)((y + sine * frame.x + less * frame.y) * frame.per_size), 0};
 }
 
+// Store residuals [m] and weights of the rows; each item of a group stores other rows.
+static inline void store_rows(GROUP_SPACE const solved_pose *fit, pose_rows all, real size, int bad, int count, global real *residuals,
+                              global real *weights) {
+    const laned_pose pose = fit->pose;
+    for (int i = GROUP_ITEM * LANES; i < count; i += GROUP_ITEMS * LANES) {
+        const laned_row at = row_of(all, i);
+        const masks gone = bad ? (masks)-1 : mask_of(!(at.certainty > (reals)0));
+        const reals z = residual_of(pose, at);
+        const reals left = nan_where(gone, z * (reals)size);
+        const reals weight = kept_where(~gone, loss_weight(z * at.certainty * (reals)(1 / fit->scale)));
+        for (int lane = 0; lane < LANES && i + lane < count; lane++) {
+            residuals[i + lane] = LANE(left, lane);
+            weights[i + lane] = LANE(weight, lane);
+        }
+    }
+}
+
+// Store the covariance of the placement point (at_x, at_y) in the frame of the rows: `lever` is the Jacobian of its x, y,
+// and of the other parameters, with respect to the step d; C' = lever C lever^T.
+BETWEEN_BARRIERS void store_covariance(GROUP_SPACE const solved_pose *fit, pose_frame frame, real at_x, real at_y, int bad, global real *to) {
+    const real axx = 1 + FIRST(fit->pose.dxx), axy = FIRST(fit->pose.dxy), ayx = FIRST(fit->pose.dyx),
+               ayy = 1 + FIRST(fit->pose.dyy);
+    real lever[POSE_PARAMETERS][POSE_PARAMETERS];
+    for (int i = 0; i < POSE_PARAMETERS; i++) {
+        const real along_x = i == 0 ? 1 : i == 2 ? -at_y : 0, along_y = i == 1 ? 1 : i == 2 ? at_x : 0;
+        const real more_x = POSE_PARAMETERS == 6 ? (i == 3 ? at_x : i == 5 ? at_y : 0) : i == 3 ? at_x : 0;
+        const real more_y = POSE_PARAMETERS == 6 ? (i == 4 ? at_y : 0) : i == 3 ? at_y : 0;
+        lever[0][i] = (axx * (along_x + more_x) + axy * (along_y + more_y)) * frame.size;
+        lever[1][i] = (ayx * (along_x + more_x) + ayy * (along_y + more_y)) * frame.size;
+        for (int k = 2; k < POSE_PARAMETERS; k++) lever[k][i] = k == i;
+    }
+    for (int i = 0; i < POSE_PARAMETERS; i++)
+        for (int j = 0; j < POSE_PARAMETERS; j++) {
+            real total = 0;
+            for (int k = 0; k < POSE_PARAMETERS; k++)
+                for (int l = 0; l < POSE_PARAMETERS; l++) total += lever[i][k] * fit->covariance[k][l] * lever[j][l];
+            to[i * POSE_PARAMETERS + j] = bad ? REAL_NAN : total * fit->covariance_factor;
+        }
+}
+
 // Check a pose against the limits and store it; a refused pose is stored as NaN.
 //
 // Translation about the origin: T(p) = c + (I + D) (p - c) + t gives t - D c for the centre c of the rows. Deformation:
-// I + D = R(theta) ((1 + kx, shear), (0, 1 + ky)), kx and theta from its first column. Covariance of the placement
-// point: `lever` is the Jacobian of its x, y, and of the other parameters, with respect to the step d; C' = lever C
-// lever^T.
-static inline void store_pose(solved_pose fit, pose_rows all, pose_frame frame, int all_finite, long item, int count,
+// I + D = R(theta) ((1 + kx, shear), (0, 1 + ky)), kx and theta from its first column.
+static inline void store_pose(GROUP_SPACE const solved_pose *fit, pose_rows all, pose_frame frame, int all_finite, long item, int count,
                               pose_limits limits, real place_x, real place_y, pose_outputs to) {
-    const int few = fit.present < POSE_PARAMETERS;
+    const int few = fit->present < POSE_PARAMETERS;
     // Below an inlier fraction of 0.75 two outliers may agree by chance. Half the leverage limit then requires that two
     // other rows check each row.
-    const real leverage = fit.inlier_fraction > 0.75f ? limits.leverage : limits.leverage / 2;
-    const int refused = fit.rank < POSE_PARAMETERS || fit.inliers < POSE_PARAMETERS ||
-                        !(fit.inlier_fraction >= limits.inlier_fraction) || !(fit.leverage < leverage) ||
-                        !(fit.covariance_factor < (real)INFINITY);
-    const real axx = 1 + FIRST(fit.pose.dxx), axy = FIRST(fit.pose.dxy), ayx = FIRST(fit.pose.dyx),
-               ayy = 1 + FIRST(fit.pose.dyy), length = sqrt(axx * axx + ayx * ayx), c = axx / length, s = ayx / length;
-    const real move_x = FIRST(fit.pose.x) * frame.size, move_y = FIRST(fit.pose.y) * frame.size;
+    const real leverage = fit->inlier_fraction > 0.75f ? limits.leverage : limits.leverage / 2;
+    const int refused = fit->rank < POSE_PARAMETERS || fit->inliers < POSE_PARAMETERS ||
+                        !(fit->inlier_fraction >= limits.inlier_fraction) || !(fit->leverage < leverage) ||
+                        !(fit->covariance_factor < (real)INFINITY);
+    const real axx = 1 + FIRST(fit->pose.dxx), axy = FIRST(fit->pose.dxy), ayx = FIRST(fit->pose.dyx),
+               ayy = 1 + FIRST(fit->pose.dyy), length = sqrt(axx * axx + ayx * ayx), c = axx / length, s = ayx / length;
+    const real move_x = FIRST(fit->pose.x) * frame.size, move_y = FIRST(fit->pose.y) * frame.size;
     // Placement point in the frame of the rows, and its shift [m].
     const real at_x = (place_x - frame.x) * frame.per_size, at_y = (place_y - frame.y) * frame.per_size;
     const real shift_x = move_x + ((axx - 1) * at_x + axy * at_y) * frame.size;
     const real shift_y = move_y + (ayx * at_x + (ayy - 1) * at_y) * frame.size, turn = atan2(ayx, axx);
     const int away = !(sqrt(shift_x * shift_x + shift_y * shift_y) <= limits.shift) || !(fabs(turn) <= limits.turn);
     const int bad = few || refused || away || !all_finite;
+    store_rows(fit, all, frame.size, bad, count, to.residuals + item * count, to.weights + item * count);
+    if (GROUP_ITEM) return;
     to.status[item] = !all_finite ? STATUS_NOT_FINITE
                       : few       ? STATUS_NO_DATA
                       : refused   ? STATUS_AMBIGUOUS
@@ -110,42 +120,15 @@ static inline void store_pose(solved_pose fit, pose_rows all, pose_frame frame, 
         to.placement[2 * item] = bad ? REAL_NAN : place_x + shift_x;
         to.placement[2 * item + 1] = bad ? REAL_NAN : place_y + shift_y;
     }
-    real lever[POSE_PARAMETERS][POSE_PARAMETERS];
-    for (int i = 0; i < POSE_PARAMETERS; i++) {
-        const real along_x = i == 0 ? 1 : i == 2 ? -at_y : 0, along_y = i == 1 ? 1 : i == 2 ? at_x : 0;
-        const real more_x = POSE_PARAMETERS == 6 ? (i == 3 ? at_x : i == 5 ? at_y : 0) : i == 3 ? at_x : 0;
-        const real more_y = POSE_PARAMETERS == 6 ? (i == 4 ? at_y : 0) : i == 3 ? at_y : 0;
-        lever[0][i] = (axx * (along_x + more_x) + axy * (along_y + more_y)) * frame.size;
-        lever[1][i] = (ayx * (along_x + more_x) + ayy * (along_y + more_y)) * frame.size;
-        for (int k = 2; k < POSE_PARAMETERS; k++) lever[k][i] = k == i;
-    }
-    for (int i = 0; i < POSE_PARAMETERS; i++)
-        for (int j = 0; j < POSE_PARAMETERS; j++) {
-            real total = 0;
-            for (int k = 0; k < POSE_PARAMETERS; k++)
-                for (int l = 0; l < POSE_PARAMETERS; l++) total += lever[i][k] * fit.covariance[k][l] * lever[j][l];
-            to.covariance[(item * POSE_PARAMETERS + i) * POSE_PARAMETERS + j] =
-                bad ? REAL_NAN : total * fit.covariance_factor;
-        }
-    for (int i = 0; i < count; i += LANES) {
-        const laned_row at = row_of(all, i);
-        const masks gone = bad ? (masks)-1 : mask_of(!(at.certainty > (reals)0));
-        const reals z = residual_of(fit.pose, at);
-        const reals left = nan_where(gone, z * (reals)frame.size);
-        const reals weight = kept_where(~gone, loss_weight(z * at.certainty * (reals)(1 / fit.scale)));
-        for (int lane = 0; lane < LANES && i + lane < count; lane++) {
-            to.residuals[item * count + i + lane] = LANE(left, lane);
-            to.weights[item * count + i + lane] = LANE(weight, lane);
-        }
-    }
-    to.etch[item] = bad ? REAL_NAN : FIRST(fit.pose.etch) * frame.size;
-    to.scale[item] = bad ? REAL_NAN : fit.scale;
-    to.residual_scale[item] = bad ? REAL_NAN : fit.residual_scale;
-    to.condition[item] = few || !all_finite ? REAL_NAN : fit.condition;
-    to.inlier_fraction[item] = few || !all_finite ? REAL_NAN : fit.inlier_fraction;
-    to.leverage[item] = few || !all_finite ? REAL_NAN : fit.leverage;
-    to.rank[item] = few ? min(fit.rank, fit.present) : fit.rank;
-    to.inliers[item] = fit.inliers;
+    store_covariance(fit, frame, at_x, at_y, bad, to.covariance + item * POSE_PARAMETERS * POSE_PARAMETERS);
+    to.etch[item] = bad ? REAL_NAN : FIRST(fit->pose.etch) * frame.size;
+    to.scale[item] = bad ? REAL_NAN : fit->scale;
+    to.residual_scale[item] = bad ? REAL_NAN : fit->residual_scale;
+    to.condition[item] = few || !all_finite ? REAL_NAN : fit->condition;
+    to.inlier_fraction[item] = few || !all_finite ? REAL_NAN : fit->inlier_fraction;
+    to.leverage[item] = few || !all_finite ? REAL_NAN : fit->leverage;
+    to.rank[item] = few ? min(fit->rank, fit->present) : fit->rank;
+    to.inliers[item] = fit->inliers;
 }
 
 #endif

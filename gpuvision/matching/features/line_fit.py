@@ -25,7 +25,7 @@ from gpuvision.matching.robust import Loss, efficiency, loss_defines, resolve_tu
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite, integer
 
-_LANES, _GROUP = 16, 64
+_LANES, _GROUP = 16, 64  # _GROUP: up to PARTS of common/group.h
 _LARGEST_SET = 1024
 _MIN_CAPACITY = 64  # of the point arrays on CPUs, so that sets of many sizes share programs; on GPUs it costs memory
 
@@ -102,7 +102,7 @@ class FitLines(VisionOperation[LineFits]):
     precision : {None, "single", "double"}
         Precision of the arithmetic and of the results; None follows the input.
     variant : {"auto", "vector", "work_item"}
-        Kernel variant: "vector" fits 16 lines at once (CPU runtimes), "work_item" one line per work-item (GPUs).
+        Kernel variant: "vector" fits 16 lines at once (CPU runtimes), "work_item" one line per work-group (GPUs).
 
     Raises
     ------
@@ -156,7 +156,7 @@ class FitLines(VisionOperation[LineFits]):
         build.check_shape(is_valid, f"points (..., 2 to {_LARGEST_SET}, 2)")
         batch, count = shape[:-2], shape[-2]
         lines, pairs = math.prod(batch), sample_subsets(count, 2, self.max_trials)
-        work = build.work(lines, each=_LANES, group=_GROUP)
+        work = build.work(lines, each=_LANES, group=_GROUP, grouping="per_element")
         assert self.tuning_constant is not None
         shapes = {
             "normal": (*batch, 2),

@@ -40,7 +40,7 @@ Float64 = npt.NDArray[np.float64]
 
 TRANSFORM_PARAMETERS = {"rigid": 3, "similarity": 4, "affine": 6}
 ROW = ("normal_x", "normal_y", "x", "y", "displacement_x", "displacement_y", "sigma")
-_LANES, _GROUP = 16, 64
+_LANES, _GROUP = 16, 64  # _GROUP: up to PARTS of common/group.h
 _MOST_ROWS = 1024
 _MIN_CAPACITY = 128  # of the row arrays on CPUs, so that poses of many sizes share programs; on GPUs it costs memory
 _START_STEPS = 3  # Gauss-Newton iterations for the pose through a few features
@@ -251,7 +251,7 @@ class SolvePose(VisionOperation[BoardPose]):
     precision : {None, "single", "double"}
         Precision of the arithmetic and of the results; None follows the input.
     variant : {"auto", "vector", "work_item"}
-        Kernel variant: "vector" computes 16 rows at once (CPU runtimes), "work_item" one pose per work-item (GPUs).
+        Kernel variant: "vector" computes 16 rows at once (CPU runtimes), "work_item" one pose per work-group (GPUs).
 
     Raises
     ------
@@ -331,7 +331,7 @@ class SolvePose(VisionOperation[BoardPose]):
         build.check_shape(is_valid, f"rows (..., {self.unknowns} to {_MOST_ROWS}, {numbers_of_row})")
         batch, count = shape[:-2], shape[-2]
         poses = math.prod(batch)
-        work = build.work(poses, each=1, group=_GROUP)
+        work = build.work(poses, each=1, group=_GROUP, grouping="per_element")
         limits = (self.min_scale, *self.limits, *self.placement, self.etch_bias_certainty)
         return build.launch(
             "pose/pose.cl",

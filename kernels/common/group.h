@@ -1,0 +1,162 @@
+// One problem per work-item, or one problem per work-group: sums, maxima and order statistics over the rows of a problem.
+//
+// Without GROUP_PER_PROBLEM, and in the vector variant, one work-item solves a problem, and the functions below keep its
+// values as they are. With GROUP_PER_PROBLEM the work-item variant solves a problem with a work-group of up to PARTS
+// items. Rows are then summed in PARTS parts: part p has the rows p, p + PARTS, ... An item sums whole parts, and one
+// item adds up the parts of a sum in a fixed order. The results therefore do not depend on the size of the group.
+//
+//     EACH_PART(part) {
+//         ... sum the rows part * LANES, part * LANES + PARTS * LANES, ... in `values` (one row in each lane)
+//         group_put(values, count, part, sums);
+//     }
+//     GROUP_SPACE const reals *totals = group_total(values, count, sums);
+//
+// `sums` is local memory for ROOM_FOR(count) numbers: the totals, then the parts of each sum. All items of the group call
+// the functions, and all of them read the totals, which stay until the next call. A call may follow another one without a
+// barrier: group_put writes the parts, which group_total last reads before its second barrier, and group_total writes the
+// totals after its first barrier.
+//
+// Functions that call them are INLINE: PoCL 3.1 ends the process where its own inliner meets several levels of functions
+// with barriers; Clang inlines these before.
+//
+// State of a problem that outlives a barrier is in GROUP_SPACE, where item 0 writes it. Private arrays and structures that
+// outlive a barrier take registers of every item on a GPU, and got wrong values in PoCL 3.1.
+#ifndef GROUP_H
+#define GROUP_H
+#include "common/least_squares.h"
+#include "common/robust.h"
+
+#if defined(GROUP_PER_PROBLEM) && !defined(VECTOR_VARIANT)
+#define IN_GROUP
+#define GROUP_SPACE local
+#define GROUP_ITEM ((int)get_local_id(0))
+#define GROUP_ITEMS ((int)get_local_size(0))
+#define PARTS 64
+#define PART_PITCH (PARTS + 1) // an odd pitch: items that add up different sums read different memory banks
+#define TOTALS 64              // most sums
+#define ROOM_FOR(count) (TOTALS + (count) * PART_PITCH)
+#else
+#define GROUP_SPACE private
+#define GROUP_ITEM 0
+#define GROUP_ITEMS 1
+#define PARTS 1
+#endif
+
+// Function without barriers, on private memory, in which an item computes alone. PoCL 3.1 computes wrong values of its
+// private arrays where it is inlined into a kernel with barriers (seen in the eigenvalues of a pose).
+#if defined(IN_GROUP) && defined(POCL_DEVICE_ADDRESS_BITS)
+#define BETWEEN_BARRIERS static __attribute__((noinline))
+#else
+#define BETWEEN_BARRIERS static inline
+#endif
+
+#define EACH_PART(part) for (int part = GROUP_ITEM; part < PARTS; part += GROUP_ITEMS)
+
+#ifdef IN_GROUP
+#define group_barrier() barrier(CLK_LOCAL_MEM_FENCE)
+
+INLINE void group_put(private const real *values, int count, int part, local real *sums) {
+    for (int k = 0; k < count; k++) sums[TOTALS + k * PART_PITCH + part] = values[k];
+}
+
+// Four chains of additions: the loads of local memory overlap.
+INLINE local const real *group_total(private const real *values, int count, local real *sums) {
+    group_barrier();
+    for (int k = GROUP_ITEM; k < count; k += GROUP_ITEMS) {
+        local const real *parts = sums + TOTALS + k * PART_PITCH;
+        real a = 0, b = 0, c = 0, d = 0;
+        for (int part = 0; part < PARTS; part += 4) {
+            a += parts[part];
+            b += parts[part + 1];
+            c += parts[part + 2];
+            d += parts[part + 3];
+        }
+        sums[k] = (a + b) + (c + d);
+    }
+    group_barrier();
+    return sums;
+}
+
+// Return the largest of the values that group_put stored, one for each part.
+INLINE real group_largest(local real *sums) {
+    group_barrier();
+    real largest = sums[TOTALS];
+    for (int part = 1; part < PARTS; part++) largest = max(largest, sums[TOTALS + part]);
+    group_barrier();
+    return largest;
+}
+
+// Return the item with the least score; of equal scores, the item with the first trial. Items without a score give INFINITY
+// and the trial INT_MAX. `sums` has room for two sums.
+INLINE int group_best(real score, int trial, local real *sums) {
+    local real *scores = sums + TOTALS, *trials = scores + PARTS;
+    group_barrier();
+    scores[GROUP_ITEM] = score;
+    trials[GROUP_ITEM] = as_real((bits)trial);
+    group_barrier();
+    int best = 0;
+    for (int item = 1; item < GROUP_ITEMS; item++) {
+        const int is_first = scores[item] == scores[best] && as_bits(trials[item]) < as_bits(trials[best]);
+        best = scores[item] < scores[best] || is_first ? item : best;
+    }
+    group_barrier();
+    return best;
+}
+
+// Return the order statistic as ranked_of (common/robust.h) of `count` values in local memory; `sums` has room for
+// DIGITS sums.
+//
+// Three bits at a time: the counts below seven patterns decide them with one sum over the group.
+#define DIGITS 7
+// Count a value where it is below the pattern of a digit; read the digit from the counts.
+INLINE void count_below(bits value, bits found, int shift, private int *below) {
+    for (int k = 0; k < DIGITS; k++) below[k] += value < (found | ((bits)(k + 1) << shift));
+}
+INLINE int digit_of(private const int *below, int rank) {
+    int digit = 0;
+    for (int k = 0; k < DIGITS; k++) digit += below[k] < rank;
+    return digit;
+}
+
+INLINE real group_ranked(local const real *values, int count, int rank, int lowest, local real *sums) {
+    bits found = 0;
+    for (int bit = BITS_BELOW_SIGN - 3; bit > lowest - 3; bit -= 3) {
+        const int shift = max(bit, lowest);
+        EACH_PART(part) {
+            int below[DIGITS];
+            for (int k = 0; k < DIGITS; k++) below[k] = 0;
+            for (int i = part; i < count; i += PARTS) count_below(as_bits(values[i]), found, shift, below);
+            real counts[DIGITS];
+            for (int k = 0; k < DIGITS; k++) counts[k] = below[k];
+            group_put(counts, DIGITS, part, sums);
+        }
+        local const real *below = group_total(0, DIGITS, sums);
+        // The last digit has fewer bits where the number of bits is no multiple of three.
+        const int digits = (1 << (bit + 3 - shift)) - 1;
+        int digit = 0;
+        for (int k = 0; k < digits; k++) digit += below[k] < rank;
+        found |= (bits)digit << shift;
+    }
+    return as_real(found);
+}
+#else
+#define group_barrier()
+INLINE void group_put(private const reals *values, int count, int part, private real *sums) {}
+INLINE private const reals *group_total(private const reals *values, int count, private real *sums) {
+    return values;
+}
+
+// The same of `count` values, padded with infinity to whole vectors; bit by bit, with LANES values at once.
+INLINE real group_ranked(private const real *values, int count, int rank, int lowest, private real *sums) {
+    bits found = 0;
+    for (int bit = BITS_BELOW_SIGN - 1; bit >= lowest; bit--) {
+        const bits next = found | ((bits)1 << bit);
+        masks below = 0;
+        for (int i = 0; i < count; i += LANES) below -= mask_of(as_masks(READ(values, i)) < (masks)next);
+        found = (int)sum_of(LANED(convert_real)(below)) >= rank ? found : next;
+    }
+    return as_real(found);
+}
+#endif
+
+#endif

@@ -1,0 +1,74 @@
+"""Kernels that solve a problem with a work-group: the result does not depend on the size of the group."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from field_maps import large
+from gpuvision.host import Device, to_numpy
+from gpuvision.matching.features import line_fit
+from gpuvision.matching.features.line_fit import FitLines
+from gpuvision.matching.field import field_pose
+from gpuvision.matching.field.field_pose import FieldPoseRefinement
+from gpuvision.matching.pose import pose
+from gpuvision.matching.pose.pose import SolvePose
+from gpuvision.reference import field as reference
+
+Case = tuple[Any, Any, tuple[np.ndarray, ...]]
+
+
+def lines(_: Device, rng: np.random.Generator, **options: Any) -> Case:
+    """Return a fit of three lines through 137 points each, a third of them gross errors, and one missing."""
+    u, v = rng.uniform(-30.0, 30.0, (3, 137)), rng.normal(0.0, 0.05, (3, 137))
+    v[:, :45] += 7.0
+    points = np.stack([500.0 + 0.8 * u - 0.6 * v, 300.0 + 0.6 * u + 0.8 * v], axis=-1).astype(np.float32)
+    points[1, 0] = np.nan
+    return line_fit, FitLines(variant="work_item", with_weights=True, **options), (points,)
+
+
+def poses(_: Device, rng: np.random.Generator, **options: Any) -> Case:
+    """Return three poses from 67 edges each, a fifth of them gross errors, and one missing."""
+    angle, place = rng.uniform(0.0, 2.0 * np.pi, (3, 67)), rng.uniform(-0.05, 0.05, (3, 67, 2))
+    moved = np.array([3e-5, -2e-5]) + 4e-3 * place[..., ::-1] * [-1.0, 1.0] + rng.normal(0.0, 2e-6, place.shape)
+    moved[:, :13] += 1e-4
+    normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    rows = np.concatenate([normal, place, moved, np.full((3, 67, 1), 2e-6)], axis=-1).astype(np.float32)
+    rows[1, 0, 6] = -1.0
+    return pose, SolvePose(variant="work_item", **options), (rows,)
+
+
+def robots(device: Device, rng: np.random.Generator) -> Case:
+    """Return the refinement of three starts near a pose from 97 points on lines, one of them missing."""
+    field_map, pose_of_robot = large(device), np.array([3.1, -2.2, 0.7])
+    points = reference.draw_line_points(field_map.field, pose_of_robot, rng, 97, 5.0, 0.03).astype(np.float32)
+    points[5] = np.nan
+    starts = (pose_of_robot + rng.uniform(-0.05, 0.05, (3, 3))).astype(np.float32)
+    return field_pose, FieldPoseRefinement(map=field_map, count=3, variant="work_item"), (points, starts)
+
+
+CASES: dict[str, Callable[[Device, np.random.Generator], Case]] = {
+    "pose": poses,
+    "pose, free scale": lambda device, rng: poses(device, rng, scale=None),
+    "lines": lambda device, rng: lines(device, rng, scale=0.05),
+    "lines, free scale": lines,
+    "robots": robots,
+}
+SLOW = {"pose", "lines, free scale"}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES])
+def test_results_do_not_depend_on_the_group(
+    device: Device, name: str, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A group of eight items sums the 64 parts in the same order as a group of 64."""
+    module, operation, inputs = CASES[name](device, rng)
+    expected = operation(*inputs, device=device)
+    assert not to_numpy(expected.status).any()
+    monkeypatch.setattr(module, "_GROUP", 8)
+    assert operation.launch(device, inputs[0].shape, inputs[0].dtype).local_size == (8,)
+    for field, ours, found in zip(expected._fields, expected, operation(*inputs, device=device), strict=True):
+        np.testing.assert_array_equal(found, ours, err_msg=field)

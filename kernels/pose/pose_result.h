@@ -58,7 +58,8 @@ static inline void store_rows(GROUP_SPACE const solved_pose *fit, pose_rows all,
 
 // Store the covariance of the placement point (at_x, at_y) in the frame of the rows: `lever` is the Jacobian of its x, y,
 // and of the other parameters, with respect to the step d; C' = lever C lever^T.
-BETWEEN_BARRIERS void store_covariance(GROUP_SPACE const solved_pose *fit, pose_frame frame, real at_x, real at_y, int bad, global real *to) {
+BETWEEN_BARRIERS void store_covariance(private const solved_pose *fit, pose_frame frame, real at_x, real at_y, int bad,
+                                       global real *to) {
     const real axx = 1 + FIRST(fit->pose.dxx), axy = FIRST(fit->pose.dxy), ayx = FIRST(fit->pose.dyx),
                ayy = 1 + FIRST(fit->pose.dyy);
     real lever[POSE_PARAMETERS][POSE_PARAMETERS];
@@ -120,7 +121,8 @@ static inline void store_pose(GROUP_SPACE const solved_pose *fit, pose_rows all,
         to.placement[2 * item] = bad ? REAL_NAN : place_x + shift_x;
         to.placement[2 * item + 1] = bad ? REAL_NAN : place_y + shift_y;
     }
-    store_covariance(fit, frame, at_x, at_y, bad, to.covariance + item * POSE_PARAMETERS * POSE_PARAMETERS);
+    const solved_pose own = *fit;
+    store_covariance(&own, frame, at_x, at_y, bad, to.covariance + item * POSE_PARAMETERS * POSE_PARAMETERS);
     to.etch[item] = bad ? REAL_NAN : FIRST(fit->pose.etch) * frame.size;
     to.scale[item] = bad ? REAL_NAN : fit->scale;
     to.residual_scale[item] = bad ? REAL_NAN : fit->residual_scale;

@@ -72,7 +72,7 @@ typedef struct {
     private const reals *certainty;
     private reals *distances; // scratch space for `count` values
     int count;
-    private reals *sums; // not used
+    private real *sums; // not used
 } laned_points;
 
 static inline laned_point point_at(laned_points all, int i) {

@@ -24,7 +24,7 @@ from gpuvision.host import Device
 from scanning import currents
 
 MAIN = "from gpuvision.cli.main import main; main()"
-# Lines that shorten a job before the command: the demonstration to four profiles, the profile to its smallest case.
+# Lines before the command that shorten a job: the demonstration to four profiles, the profile to one short call.
 SHORTER = {
     "demo": """
 import functools, gpuvision.workflows.demo as demo
@@ -33,7 +33,7 @@ demo.make_scan_task = functools.partial(demo.make_scan_task, profiles=4)
     "profile": """
 import itertools, gpuvision.profiling.psd as psd
 all_cases = psd.cases
-psd.cases = lambda device: itertools.islice(all_cases(device), 1)
+psd.cases = lambda device: itertools.islice(all_cases(device), 1, 2)
 """,
 }
 LAYER_WORDS = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]

@@ -314,15 +314,15 @@ ODD = 1_000_003  # a prime: without padding, no group of more than one work-item
 
 
 @pytest.mark.parametrize(
-    ("operation", "shape", "dtype"),
+    ("operation", "shape", "dtype", "items"),
     [
-        (PsdReadout(strip_length=6e-3), (ODD, 2), np.float32),
-        (LineReadout(threshold=20), (64, ODD), np.uint8),
+        (PsdReadout(strip_length=6e-3), (ODD, 2), np.float32, 0.25),  # a work-item reads 4 samples
+        (LineReadout(threshold=20), (64, ODD), np.uint8, 4),  # 4 work-items read a profile
     ],
 )
-def test_odd_sizes_run_in_whole_groups(operation: Any, shape: tuple[int, ...], dtype: Any) -> None:
+def test_odd_sizes_run_in_whole_groups(operation: Any, shape: tuple[int, ...], dtype: Any, items: float) -> None:
     launch = operation.launch(Machine(is_cpu=False), shape, np.dtype(dtype))
     assert launch.local_size is not None
     assert math.prod(launch.local_size) >= 32
     assert all(each % group == 0 for each, group in zip(launch.global_size, launch.local_size, strict=True))
-    assert math.prod(launch.global_size) < 1.001 * ODD
+    assert 1.0 <= math.prod(launch.global_size) / (items * ODD) < 1.001

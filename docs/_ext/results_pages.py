@@ -97,6 +97,7 @@ _LIMITS = {
     "spills": "spilled registers on NVIDIA [bytes]",
     "spills_amd": "spilled registers on AMD [bytes]",
     "spills_double": "spilled registers of builds in double precision [bytes]",
+    "stack": "stack of a work-item [bytes]",
     "local": "local memory of a work-group [bytes]",
 }
 

@@ -61,8 +61,8 @@ def profile(
 
     With --offline nothing is measured: the kernels are compiled for GPUs by Clang and NVIDIA's ptxas. The table shows
     the registers, stack, spilled registers and local memory of each kernel. The exit code is 1 if a kernel does not
-    compile, calls a function without a body, spills more registers than the limit, or takes more than 32 KiB of local
-    memory.
+    compile, calls a function without a body, spills more registers than the limit, or takes more than 5 KiB of stack
+    or 32 KiB of local memory.
     """
     if offline:
         from gpuvision.cli.profile_offline import profile_offline

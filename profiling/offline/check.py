@@ -1,4 +1,4 @@
-"""Check of the compiled kernels: unresolved functions, spilled registers, local memory. Results are cached."""
+"""Check of the compiled kernels: unresolved functions, spilled registers, stack, local memory. Results are cached."""
 
 from __future__ import annotations
 
@@ -43,6 +43,10 @@ class ResourceLimits:
     spills_double : int
         Spilled registers of a build in double precision [bytes]. A double takes two of the 255 registers that a
         work-item of NVIDIA has; the measurement of deposits spills 552 bytes on sm_90. Choose single for speed.
+    stack : int
+        Private memory of a work-item beside the registers [bytes], chosen: above the largest of
+        ``profiling/results/offline-gpus.json`` (4736 bytes for ``blob.cl`` with 64 spokes), and below kernels that keep
+        1024 rows or points in private arrays (16 to 29 KB: ``line_fit.cl`` and ``pose.cl`` before their work-groups).
     local : int
         Local memory of a work-group [bytes]: OpenCL guarantees 32 KiB (``CL_DEVICE_LOCAL_MEM_SIZE``), and Mesa's
         llvmpipe has no more.
@@ -51,6 +55,7 @@ class ResourceLimits:
     spills: int = 0
     spills_amd: int = 256
     spills_double: int = 768
+    stack: int = 5 << 10
     local: int = 32 << 10
 
 
@@ -160,6 +165,8 @@ def fault_of(usage: Usage, build: KernelBuild, target: Target, limits: ResourceL
         most = limits.spills_double
     if usage.spills > most:
         return f"spills {usage.spills} bytes, limit {most}"
+    if usage.stack > limits.stack:
+        return f"takes {usage.stack} bytes of stack, limit {limits.stack}"
     if usage.local > limits.local:
         return f"takes {usage.local} bytes of local memory, limit {limits.local}"
     return ""

@@ -129,6 +129,17 @@ def test_table_in_the_repository_has_every_build() -> None:
     assert [row for row in rows if "fault" in row] == []
 
 
+def test_kernels_of_the_table_keep_the_limits() -> None:
+    rows = json.loads((ROOT / "profiling" / "results" / "offline-gpus.json").read_text())["rows"]
+    builds = {(each.source, each.name): each for each in known_builds()}
+    found = []
+    for row in rows:
+        usage = Usage(*(row[key] for key in ("kernel", "registers", "stack", "spills", "local")))
+        fault = fault_of(usage, builds[row["source"], row["case"]], TARGETS[row["target"]])
+        found += [f"{row['target']}: {row['source']} ({row['case']}) {fault}"] if fault else []
+    assert found == []
+
+
 def test_model_of_a_gpu_has_the_properties_that_launches_read() -> None:
     device, model = Device.best(), GpuModel()
     needs_a_handle = {"handle", "context", "queue", "inline_device"}
@@ -163,6 +174,8 @@ def test_limits() -> None:
     assert fault_of(replace(usage, spills=260), single, amd) == "spills 260 bytes, limit 256"
     assert fault_of(replace(usage, spills=768), double, nvidia) == ""
     assert fault_of(replace(usage, spills=769), double, nvidia) == "spills 769 bytes, limit 768"
+    assert fault_of(replace(usage, stack=5120), single, amd) == ""
+    assert fault_of(replace(usage, stack=5124), single, nvidia) == "takes 5124 bytes of stack, limit 5120"
     assert fault_of(replace(usage, local=32772), double, amd) == "takes 32772 bytes of local memory, limit 32768"
 
 

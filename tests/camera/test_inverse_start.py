@@ -63,6 +63,7 @@ def _largest_errors(device: Device, camera: Camera, points: np.ndarray, back: np
     return found
 
 
+@pytest.mark.double
 @pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
 @pytest.mark.parametrize(("coefficients", "first"), [(RADIAL, 1e-10), (DECENTRED, 1e-3)], ids=["radial", "decentred"])
 def test_each_step_is_as_exact_as_the_host_says(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 import json
-import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -31,12 +31,33 @@ from gpuvision.ranging.psd import PsdReadout
 from streams import READOUT, currents_of
 
 
-class SlowCalls(PsdReadout):
-    """Operation with a long launch on the devices named "gpu"."""
+class Clock:
+    """Clock of `device_choice` that only `run` advances: measured times do not depend on the load of the machine."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def run(self, seconds: float) -> None:
+        """Pretend to compute for some seconds."""
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Measure with a clock that only the test advances."""
+    clock = Clock()
+    monkeypatch.setattr(device_choice, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+    return clock
+
+
+class TimedCalls(PsdReadout):
+    """Operation whose calls take the seconds of the device, by its label."""
+
+    clock: ClassVar[Clock]
+    seconds: ClassVar[dict[str, float]]
 
     def __call__(self, *inputs: Any, device: Any = None, out: Any = None) -> Any:
-        if device.label == "gpu":
-            time.sleep(3e-2)  # longer than the pauses of a busy machine
+        self.clock.run(self.seconds[device.label])
         return super().__call__(*inputs, device=device, out=out)
 
 
@@ -51,13 +72,15 @@ def gpu(device: Device, monkeypatch: pytest.MonkeyPatch) -> Device:
     return gpu
 
 
-def test_small_work_runs_on_the_cpu_beside_a_gpu(gpu: Device, device: Device) -> None:
-    found = fastest_device(SlowCalls(strip_length=6e-3), currents_of(3))
+def test_small_work_runs_on_the_cpu_beside_a_gpu(
+    gpu: Device, device: Device, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(TimedCalls, "clock", clock, raising=False)
+    monkeypatch.setattr(TimedCalls, "seconds", {"gpu": 3e-2, device.label: 1e-3}, raising=False)
+    found = fastest_device(TimedCalls(strip_length=6e-3), currents_of(3))
     assert found.device is device
-    assert set(found.seconds) == {"gpu", device.label}
-    assert found.seconds["gpu"] > 3e-2 > found.seconds[device.label]
-    assert str(found).startswith(f"SlowCalls on {device.label}, ")
-    assert str(found).endswith(f" us (gpu {1e6 * found.seconds['gpu']:.3g} us)")
+    assert found.seconds == pytest.approx({"gpu": 3e-2, device.label: 1e-3}, rel=1e-9)
+    assert str(found) == f"TimedCalls on {device.label}, 1e+03 us (gpu 3e+04 us)"
 
 
 def test_named_device_is_the_only_one(gpu: Device, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,14 +195,14 @@ def kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path / "step_seconds.json"
 
 
-def test_each_step_runs_where_it_is_fastest(gpu: Device, device: Device, kept: Path) -> None:
+def test_each_step_runs_where_it_is_fastest(gpu: Device, device: Device, kept: Path, clock: Clock) -> None:
     """Two steps on a device that pretends to be a GPU: one is slow there, the other one on the CPU."""
     runs: list[tuple[str, str]] = []
 
     def slow_on(label: str, step: str) -> Any:
         def run(on: Device) -> None:
             runs.append((step, on.label))
-            time.sleep(3e-2 if on.label == label else 0.0)
+            clock.run(3e-2 if on.label == label else 1e-3)
 
         return run
 
@@ -190,7 +213,7 @@ def test_each_step_runs_where_it_is_fastest(gpu: Device, device: Device, kept: P
         assert set(runs) == {(step, on) for step in ("rulers", "undistort") for on in ("gpu", device.label)}
         counted = len(runs)
         assert json.loads(json.dumps(devices.report()))["rulers"]["device"] == device.label
-        assert devices.choices["rulers"].seconds["gpu"] > 3e-2 > devices.choices["rulers"].seconds[device.label]
+        assert devices.choices["rulers"].seconds == pytest.approx({"gpu": 3e-2, device.label: 1e-3}, rel=1e-9)
     assert len(runs) == counted
     assert len(json.loads(kept.read_text())) == 4
     StepDevices(None).choose("rulers", slow_on("gpu", "rulers"), (48, 64), "u1")
@@ -215,9 +238,9 @@ def test_a_step_leaves_out_a_device_that_cannot_run_it(gpu: Device, device: Devi
     assert devices.report()["rulers"]["unusable"] == {"gpu": "no"}
 
 
-def test_a_damaged_file_of_kept_times_is_replaced(gpu: Device, device: Device, kept: Path) -> None:
+def test_a_damaged_file_of_kept_times_is_replaced(gpu: Device, device: Device, kept: Path, clock: Clock) -> None:
     for damage in ("", "[]", "{", '{"k": "fast", "l": -1, "m": 1e999}'):
         kept.write_text(damage)
         kept.chmod(0o600)
-        assert StepDevices(None).choose("rulers", lambda on: time.sleep(1e-2 * (on is gpu))) is device
+        assert StepDevices(None).choose("rulers", lambda on: clock.run(1e-2 if on is gpu else 1e-3)) is device
         assert len(json.loads(kept.read_text())) == 2

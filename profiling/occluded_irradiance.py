@@ -127,7 +127,10 @@ def _adaptive_case(device: Device, board: Board, limit: float, name: str) -> Cas
         return adaptive.irradiance_by_adaptive_rays(form, receivers, table, free, setting, CLEARANCE)
 
     of_setting = {each: error_of(peer(adaptive.NUMBA, each), truth, 0.95) for each in adaptive.SETTINGS}
-    setting = next(each for each, p95 in of_setting.items() if p95 <= limit)
+    setting = next((each for each, p95 in of_setting.items() if p95 <= limit), None)
+    if setting is None:
+        best = min(of_setting.values())
+        raise ValueError(f"the 95th percentile of the adaptive peer is {best:.1e} at least, expected {limit:.0e}")
     metadata = {
         **_sizes(board),
         **setting._asdict(),

@@ -120,8 +120,8 @@ def _time(seconds: float) -> str:
 
 
 def _digits(value: float) -> str:
-    """Return a number with two significant digits, from 100 on rounded to a whole number."""
-    return f"{value:.0f}" if value >= 100.0 else f"{value:#.2g}".removesuffix(".")
+    """Return a number with two significant digits, or rounded to a whole number where this has more."""
+    return f"{value:.0f}" if value >= 99.5 else f"{value:#.2g}".removesuffix(".")
 
 
 def _error(comparison: Comparison, rows: Sequence[Mapping[str, Any]]) -> str:

@@ -32,7 +32,15 @@ def test_readme_has_the_table_of_the_committed_results() -> None:
 
 @pytest.mark.parametrize(
     ("seconds", "text"),
-    [(2.5, "2.5 s"), (0.0282, "28 ms"), (1.36e-4, "136 µs"), (3.75e-6, "3.8 µs"), (5e-7, "0.50 µs")],
+    [
+        (2.5, "2.5 s"),
+        (0.0282, "28 ms"),
+        (1.36e-4, "136 µs"),
+        (9.97e-5, "100 µs"),
+        (9.94e-5, "99 µs"),
+        (3.75e-6, "3.8 µs"),
+        (5e-7, "0.50 µs"),
+    ],
 )
 def test_times_have_a_unit_and_two_digits(seconds: float, text: str, tmp_path: Path) -> None:
     line = tables.comparison_table(_results(tmp_path, seconds=seconds)).splitlines()[2]

@@ -75,14 +75,6 @@ FAULTS = (
         r"a_real_board|what_was_applied|what_leaves)_",
         "Mesa 22.3 finds no pose of a board in an image: LOW_SIGNAL; passes with Mesa 25.0.7",
     ),
-    DriverFault(
-        "rusticl",
-        "22.3",
-        r"test_extremes\.py::test_(a_picture_that_shows_a_part|glare)\[|test_predicted_errors\.py::test_"
-        r"(errors_are_those_promised|no_wrong_pose_of_a_disturbed_board|a_real_board_s_errors_are_those_promised)\[",
-        "Mesa 22.3 refuses the poses of boards with many lines in the fused estimator: AMBIGUOUS, as the rank of the "
-        "equations is 0 or 1; `SolvePose` of 512 rows fails in the same way, of 128 rows it agrees with PoCL",
-    ),
 )
 
 

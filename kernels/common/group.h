@@ -1,7 +1,7 @@
-// One problem per work-item, or one problem per work-group: sums, maxima and order statistics over the rows of a problem.
+// Sums, maxima and order statistics over the rows of a problem that a work-item or a work-group solves.
 //
-// Without GROUP_PER_PROBLEM, and in the vector variant, one work-item solves a problem, and the functions below keep its
-// values as they are. With GROUP_PER_PROBLEM the work-item variant solves a problem with a work-group of up to PARTS
+// Without GROUP_PER_PROBLEM, and in the vector variant, one work-item solves a problem, and the functions below return
+// its values unchanged. With GROUP_PER_PROBLEM the work-item variant solves a problem with a work-group of up to PARTS
 // items. Rows are then summed in PARTS parts: part p has the rows p, p + PARTS, ... An item sums whole parts, and one
 // item adds up the parts of a sum in a fixed order. The results therefore do not depend on the size of the group.
 //
@@ -11,16 +11,17 @@
 //     }
 //     GROUP_SPACE const reals *totals = group_total(values, count, sums);
 //
-// `sums` is local memory for ROOM_FOR(count) numbers: the totals, then the parts of each sum. All items of the group call
-// the functions, and all of them read the totals, which stay until the next call. A call may follow another one without a
-// barrier: group_put writes the parts, which group_total last reads before its second barrier, and group_total writes the
-// totals after its first barrier.
+// `sums` is local memory for ROOM_FOR(count) numbers: the totals, then the parts of each sum. All items of the group
+// call the functions, and all items read the totals, which are valid until the next call. A call may follow another one
+// without a barrier: group_put writes the parts, which group_total last reads before its second barrier, and
+// group_total writes the totals after its first barrier.
 //
-// Functions that call them are INLINE: PoCL 3.1 ends the process where its own inliner meets several levels of functions
-// with barriers; Clang inlines these before.
+// Functions that call them are INLINE. Without the attribute always_inline, PoCL 3.1 ended the process (segmentation
+// fault) at the first use of pose.cl in a group, and ran line_fit.cl with equal results. The cause is not known.
 //
-// State of a problem that outlives a barrier is in GROUP_SPACE, where item 0 writes it. Private arrays and structures that
-// outlive a barrier take registers of every item on a GPU, and got wrong values in PoCL 3.1.
+// Large state that is used on both sides of a barrier (solved_pose) is in GROUP_SPACE, where item 0 writes it: in
+// private memory it would take registers of every item on a GPU. Each item computes small state (a line, a pose of a
+// robot) from the totals; it is equal in all items.
 #ifndef GROUP_H
 #define GROUP_H
 #include "common/least_squares.h"
@@ -42,8 +43,9 @@
 #define PARTS 1
 #endif
 
-// Function without barriers, on private memory, in which an item computes alone. PoCL 3.1 computes wrong values of its
-// private arrays where it is inlined into a kernel with barriers (seen in the eigenvalues of a pose).
+// Function without barriers, on private memory, in which an item computes alone. It is not inlined on PoCL: inlined,
+// the eigenvalues of a pose came out wrong while pose.h was written. With its present state PoCL 3.1 passes the tests
+// of test_pose.py in both cases.
 #if defined(IN_GROUP) && defined(POCL_DEVICE_ADDRESS_BITS)
 #define BETWEEN_BARRIERS static __attribute__((noinline))
 #else
@@ -86,8 +88,8 @@ INLINE real group_largest(local real *sums) {
     return largest;
 }
 
-// Return the item with the least score; of equal scores, the item with the first trial. Items without a score give INFINITY
-// and the trial INT_MAX. `sums` has room for two sums.
+// Return the item with the least score; of equal scores, the item with the first trial. Items without a score give
+// INFINITY and the trial INT_MAX. `sums` has room for two sums.
 INLINE int group_best(real score, int trial, local real *sums) {
     local real *scores = sums + TOTALS, *trials = scores + PARTS;
     group_barrier();

@@ -76,8 +76,8 @@ kernel void field_pose_search(global const float *restrict points, global float 
 //          of the points within c of a line; status (starts,).
 // Options: MIN_EIGENVALUE_RATIO: least ratio of eigenvalues of a determined pose; PRIOR_POINTS: see the covariance.
 //
-// Variants: vector: a work-item per start, one point after the other; work-item: a group of up to 64 items per start, the
-//          points divided over the items. The results do not depend on the size of the group (common/group.h).
+// Variants: vector: a work-item per start, one point after the other; work-item: a group of up to 64 items per start,
+//          the points divided over the items. The results do not depend on the size of the group (common/group.h).
 #ifndef VECTOR_VARIANT
 #define GROUP_PER_PROBLEM
 #endif

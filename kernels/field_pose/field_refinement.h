@@ -58,7 +58,8 @@ typedef struct {
     GROUP_SPACE float *sums;
 } field_view;
 
-// Replace the numbers that the items of a group summed by their sums; a work-item that is alone has them already.
+// Replace the partial sums of the items of a group by the totals. A work-item that solves a problem alone has the
+// totals.
 #ifdef IN_GROUP
 #define NUMBERS(of) (int)(sizeof(*(of)) / sizeof(float))
 #define put_numbers(of, part, view) group_put((private const float *)(of), NUMBERS(of), part, (view).sums)
@@ -108,7 +109,8 @@ INLINE normal_equations equations_at(field_view view, float3 pose) {
             const float2 point = (float2)(view.points[2 * i], view.points[2 * i + 1]);
             if (!point_counts(point, view.max_range_squared)) continue;
             const field_row at = row_of(point, pose, turn, view.shapes, view.nearest, view.grid);
-            const float share = scale_squared / (scale_squared + at.r * at.r), weight = share * share, psi = weight * at.r;
+            const float share = scale_squared / (scale_squared + at.r * at.r), weight = share * share;
+            const float psi = weight * at.r;
             sum.cost += 1.0f - share;
             sum.xx += weight * at.x * at.x;
             sum.xy += weight * at.x * at.y;

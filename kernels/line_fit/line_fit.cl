@@ -8,10 +8,10 @@
 //          (lines,); inliers (lines,); status (lines,); with WITH_WEIGHTS also weights (lines, count), 0 to 1.
 // Options: INPUT, REAL_IS_DOUBLE, WITH_SIGMA, WITH_WEIGHTS, CAPACITY (size of the point arrays), GIVEN_SCALE,
 //          EFFICIENCY (line_fit.h), loss options (common/robust.h).
-// Variants: vector: 16 lines per work-item, a line per lane; the last lanes of the last vector repeat the last line, and
-//          are not stored. work-item: a group of up to 64 items per line, the points, and the start candidates, divided
-//          over the items. The points are read from global memory wherever they are needed (line_fit_points.h). The
-//          results do not depend on the size of the group (common/group.h).
+// Variants: vector: 16 lines per work-item, a line per lane; the last lanes of the last vector repeat the last line,
+//          and are not stored. work-item: a group of up to 64 items per line; the items share the points and the start
+//          candidates. Each pass reads the points from global memory (line_fit_points.h). The results do not depend on
+//          the size of the group (common/group.h).
 #ifndef VECTOR_VARIANT
 #define GROUP_PER_PROBLEM
 #endif

@@ -43,8 +43,8 @@ static inline reals line_sigmas(laned_line line, laned_point at) {
 // Return the score of a line, least is best: the loss where the scale is given, otherwise the distance of the given
 // rank (median) to 1 %.
 //
-// A work-group has no room for the distances of every candidate: it computes them anew for every three bits of the order
-// statistic.
+// Local memory has no room for the distances of every candidate: a work-group computes them again for every three bits
+// of the order statistic.
 BETWEEN_BARRIERS reals line_score(laned_line line, laned_points all, masks rank) {
 #ifdef SCALE
     reals sum = 0;
@@ -58,7 +58,8 @@ BETWEEN_BARRIERS reals line_score(laned_line line, laned_points all, masks rank)
     for (int shift = BITS_BELOW_SIGN - 3; shift >= BITS_TO_ONE_PERCENT; shift -= 3) {
         int below[DIGITS];
         for (int k = 0; k < DIGITS; k++) below[k] = 0;
-        for (int i = 0; i < all.count; i++) count_below(as_bits(line_sigmas(line, point_at(all, i))), found, shift, below);
+        for (int i = 0; i < all.count; i++)
+            count_below(as_bits(line_sigmas(line, point_at(all, i))), found, shift, below);
         found |= (bits)digit_of(below, rank) << shift;
     }
     return as_real(found);
@@ -86,8 +87,8 @@ INLINE laned_line line_middle(laned_points all) {
     return (laned_line){totals[1] * per, totals[2] * per, 1, 0};
 }
 
-// Find the line through a pair of points with the least score. A pair of coinciding or missing points is skipped. The items
-// of a group take different pairs.
+// Find the line through a pair of points with the least score. A pair of coinciding or missing points is skipped. The
+// items of a group take different pairs.
 INLINE laned_line line_start(laned_points all, constant const int *pairs, int trials, masks rank) {
     laned_line best = line_middle(all);
     reals least = INFINITY;

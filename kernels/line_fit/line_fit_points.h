@@ -39,8 +39,8 @@ static inline laned_point point_at(laned_points all, int i) {
     return (laned_point){good ? x - all.origin_x : 0, good ? y - all.origin_y : 0, good ? certainty : 0};
 }
 
-// Return the points relative to the first valid one: coordinates of a large image leave few digits for distances. `reach`
-// gets the largest |x| + |y| in sigmas.
+// Return the points relative to the first valid one: coordinates of a large image leave few digits for distances.
+// `reach` gets the largest |x| + |y| in sigmas.
 INLINE laned_points about_first_point(const laned_points given, private real *reach) {
     laned_points all = given;
     EACH_PART(part) {

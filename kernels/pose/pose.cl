@@ -11,9 +11,9 @@
 //          inliers, status, inlier_fraction, leverage. Refused poses are NaN.
 // Options: INPUT, REAL_IS_DOUBLE, WITH_INITIAL_POSE (initial pose; otherwise no motion), POSE_PARAMETERS, FREEDOMS,
 //          WITH_ETCH_BIAS, CAPACITY, START_STEPS, GIVEN_SCALE, EFFICIENCY (pose.h), loss options (common/robust.h).
-// Variants: vector: a work-item per pose, 16 rows or 16 start candidates in a vector; work-item: a group of up to 64 items
-//          per pose, the rows, and the start candidates, divided over the items. The rows are read from global memory
-//          wherever they are needed (pose_input.h). The results do not depend on the size of the group (common/group.h).
+// Variants: vector: a work-item per pose, 16 rows or 16 start candidates in a vector; work-item: a group of up to 64
+//          items per pose; the items share the rows and the start candidates. Each pass reads the rows from global
+//          memory (pose_input.h). The results do not depend on the size of the group (common/group.h).
 #ifndef VECTOR_VARIANT
 #define GROUP_PER_PROBLEM
 #endif

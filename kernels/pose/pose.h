@@ -11,14 +11,15 @@
 // (x, y) and h = (n_x, n_y, n_y x - n_x y, ...). The further terms are n . p' for a common scale, or
 // (n_x x, n_y y, n_x y) for two scales and the shear.
 //
-// Etch bias (WITH_ETCH_BIAS): copper reaches beyond its drawn edges by one unknown distance, with a given standard deviation
-// around 0. An edge moves along its normal by g times this distance (g: etch factor), so that h has the further term g.
+// Etch bias (WITH_ETCH_BIAS): copper reaches beyond its drawn edges by one unknown distance, with a given standard
+// deviation around 0. An edge moves along its normal by g times this distance (g: etch factor), so that h has the
+// further term g.
 //
-// Options: POSE_PARAMETERS: number of pose parameters, 3 (rigid), 4 (common scale) or 6 (two scales and shear). FREEDOMS:
-//          number of unknowns, POSE_PARAMETERS and the etch bias. WITH_ETCH_BIAS: solve for the etch bias. CAPACITY: size of the row
-//          arrays. START_STEPS: Gauss-Newton steps of a start candidate. GIVEN_SCALE: known scale of the residuals in
-//          sigmas; otherwise it is estimated from their median. EFFICIENCY: of the loss for normal residuals, for the
-//          covariance at a known scale.
+// Options: POSE_PARAMETERS: number of pose parameters, 3 (rigid), 4 (common scale) or 6 (two scales and shear).
+//          FREEDOMS: number of unknowns, POSE_PARAMETERS and the etch bias. WITH_ETCH_BIAS: solve for the etch bias.
+//          CAPACITY: size of the row arrays. START_STEPS: Gauss-Newton steps of a start candidate. GIVEN_SCALE: known
+//          scale of the residuals in sigmas; otherwise it is estimated from their median. EFFICIENCY: of the loss for
+//          normal residuals, for the covariance at a known scale.
 #ifndef POSE_H
 #define POSE_H
 
@@ -55,8 +56,8 @@ INLINE real pose_scale(laned_pose pose, pose_rows all, pose_room room, real reac
 #endif
 }
 
-// Normal equations over all rows at a pose, number of inliers, and the sums of psi'(z) and psi(z)^2 over the inliers for
-// the covariance.
+// Normal equations over all rows at a pose, number of inliers, and the sums of psi'(z) and psi(z)^2 over the inliers
+// for the covariance.
 typedef struct {
     reals matrix[TRIANGLE], right[FREEDOMS], inliers, slopes, squares;
 } pose_sums;
@@ -76,7 +77,7 @@ typedef struct {
 
 // Sum over all rows; return POSE_SUMS sums. Padding rows have certainty 0 and do not contribute.
 INLINE GROUP_SPACE const reals *pose_summed(GROUP_SPACE const laned_pose *at_pose, pose_rows all, real per_scale,
-                                                   int how, pose_room room, private pose_sums *sums) {
+                                            int how, pose_room room, private pose_sums *sums) {
     const laned_pose pose = *at_pose;
     private reals *values = (private reals *)sums;
     EACH_PART(part) {
@@ -122,8 +123,8 @@ typedef struct {
     int is_singular; // normal equations of the last step
 } solved_pose;
 
-// Least variance of the residuals that is multiplied into the covariance: above the smallest normal number by the square
-// of a sigma of 1e-9 of the size of the rows.
+// Least variance of the residuals that is multiplied into the covariance: above the smallest normal number by the
+// square of a sigma of 1e-9 of the size of the rows.
 #ifdef REAL_IS_DOUBLE
 #define LEAST_VARIANCE ((real)1e-280)
 #else
@@ -143,8 +144,8 @@ static inline void pose_quality(private solved_pose *fit, pose_matrix inlier_mat
 //
 // Covariance of an M-estimator (Huber, 1981): variance * A^-1, A = sum of h h^T / sigma^2 over the inliers. With a
 // given scale, variance = scale^2 / EFFICIENCY. Otherwise it is estimated from the residuals z in units of the scale:
-// variance = scale^2 (sum psi(z)^2 / (n - FREEDOMS)) / (mean psi'(z))^2; without degrees of freedom residual_scale is NaN
-// and the sigmas are trusted, variance = 1.
+// variance = scale^2 (sum psi(z)^2 / (n - FREEDOMS)) / (mean psi'(z))^2; without degrees of freedom residual_scale is
+// NaN and the sigmas are trusted, variance = 1.
 static inline void pose_covariance(private solved_pose *fit, private const pose_sums *sums) {
     reals factor[TRIANGLE];
     for (int i = 0; i < TRIANGLE; i++) factor[i] = sums->matrix[i];
@@ -202,7 +203,8 @@ INLINE real pose_leverage(GROUP_SPACE const solved_pose *fit, pose_rows all, pos
 }
 
 // Return the pose after the Gauss-Newton step of the normal equations; no step where they are singular.
-BETWEEN_BARRIERS laned_pose pose_stepped(laned_pose pose, private pose_sums *sums, real etch, private int *is_singular) {
+BETWEEN_BARRIERS laned_pose pose_stepped(laned_pose pose, private pose_sums *sums, real etch,
+                                         private int *is_singular) {
     reals change[FREEDOMS];
     add_etch(pose, etch, sums->matrix, sums->right);
     *is_singular = any_lane(factored(sums->matrix));
@@ -234,13 +236,13 @@ INLINE int rows_present(pose_rows all, pose_room room) {
 }
 
 // Solve one pose. With a robust loss: start candidates, then `steps` reweighted Gauss-Newton steps; the scale is
-// estimated again before the step RESCALED_AT. Rows must be centred and scaled to size 1 (pose_frame), so that shifts and
-// turns have the same unit for `condition` and the rank. `fit` holds the initial pose, and gets the solution. In a group
-// item 0 computes what follows from the sums.
+// estimated again before the step RESCALED_AT. Rows must be centred and scaled to size 1 (pose_frame), so that shifts
+// and turns have the same unit for `condition` and the rank. `fit` holds the initial pose, and gets the solution. In a
+// group item 0 computes steps, covariance and quality from the sums.
 //
-// Not inlined where an item solves a pose alone: PoCL 3.1 computes wrong weights in the work-item variant of board_pose.cl
-// when this function is inlined behind the kernel's last barrier (bisected; the vector variant and Intel's runtime are not
-// affected).
+// Not inlined where an item solves a pose alone: with PoCL 3.1 the work-item variant of board_pose.cl, when it was one
+// kernel with barriers, gave wrong weights with this function inlined, and right ones without. The vector variant and
+// Intel's runtime gave right weights in both cases.
 #ifdef IN_GROUP
 INLINE
 #else

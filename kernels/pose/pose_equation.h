@@ -5,9 +5,9 @@
 
 // Frame of the rows: centre [m], size [m] and 1 / size.
 //
-// In this frame the centre of the rows is 0, and their root-mean-square distance from it is 1: p' = (p - centre) / size,
-// e' = e / size, sigma' = sigma / size. Shifts and turns then have the same unit, and places have no large offset that
-// costs digits. A translation t of the frame is t size metres.
+// In this frame the centre of the rows is 0, and their root-mean-square distance from it is 1:
+// p' = (p - centre) / size, e' = e / size, sigma' = sigma / size. Shifts and turns then have the same unit, and places
+// have no large offset that costs digits. A translation t of the frame is t size metres.
 typedef struct {
     real x, y, size, per_size;
 } pose_frame;

@@ -1,8 +1,8 @@
 // Feature rows as pose.cl takes them.
 //
-// The work-group of a pose (IN_GROUP, common/group.h) reads the rows again from global memory wherever it needs them, and
-// transforms them to their frame on the way: many rows do not fit in local memory, and adjacent items read adjacent rows.
-// A work-item that solves a pose alone copies them to columns (pose_rows.h).
+// The work-group of a pose (IN_GROUP, common/group.h) reads the rows from global memory in each pass, and transforms
+// them to their frame: many rows do not fit in local memory, and adjacent items read adjacent rows. A work-item that
+// solves a pose alone copies the rows to columns (pose_rows.h).
 #ifndef POSE_INPUT_H
 #define POSE_INPUT_H
 #include "common/group.h"

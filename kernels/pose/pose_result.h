@@ -1,11 +1,13 @@
-// Output of a solved pose in metres about the artwork's origin: the pose was solved in the frame of the rows (pose_frame).
+// Output of a solved pose in metres about the artwork's origin; the pose was solved in the frame of the rows
+// (pose_frame).
 #ifndef POSE_RESULT_H
 #define POSE_RESULT_H
 
 #include "pose/pose.h"
 #include "common/status.h"
 
-// Output arrays of the kernels, in the order of the fields of BoardPose (pose.py); deformation and placement may be null.
+// Output arrays of the kernels, in the order of the fields of BoardPose (pose.py); deformation and placement may be
+// null.
 typedef struct {
     global real *pose;
     global real *deformation;
@@ -40,8 +42,8 @@ static inline laned_pose pose_in_frame(real x, real y, real turn, pose_frame fra
 }
 
 // Store residuals [m] and weights of the rows; each item of a group stores other rows.
-static inline void store_rows(GROUP_SPACE const solved_pose *fit, pose_rows all, real size, int bad, int count, global real *residuals,
-                              global real *weights) {
+static inline void store_rows(GROUP_SPACE const solved_pose *fit, pose_rows all, real size, int bad, int count,
+                              global real *residuals, global real *weights) {
     const laned_pose pose = fit->pose;
     for (int i = GROUP_ITEM * LANES; i < count; i += GROUP_ITEMS * LANES) {
         const laned_row at = row_of(all, i);
@@ -56,8 +58,8 @@ static inline void store_rows(GROUP_SPACE const solved_pose *fit, pose_rows all,
     }
 }
 
-// Store the covariance of the placement point (at_x, at_y) in the frame of the rows: `lever` is the Jacobian of its x, y,
-// and of the other parameters, with respect to the step d; C' = lever C lever^T.
+// Store the covariance of the placement point (at_x, at_y) in the frame of the rows: `lever` is the Jacobian of its x,
+// y, and of the other parameters, with respect to the step d; C' = lever C lever^T.
 BETWEEN_BARRIERS void store_covariance(private const solved_pose *fit, pose_frame frame, real at_x, real at_y, int bad,
                                        global real *to) {
     const real axx = 1 + FIRST(fit->pose.dxx), axy = FIRST(fit->pose.dxy), ayx = FIRST(fit->pose.dyx),
@@ -84,8 +86,8 @@ BETWEEN_BARRIERS void store_covariance(private const solved_pose *fit, pose_fram
 //
 // Translation about the origin: T(p) = c + (I + D) (p - c) + t gives t - D c for the centre c of the rows. Deformation:
 // I + D = R(theta) ((1 + kx, shear), (0, 1 + ky)), kx and theta from its first column.
-static inline void store_pose(GROUP_SPACE const solved_pose *fit, pose_rows all, pose_frame frame, int all_finite, long item, int count,
-                              pose_limits limits, real place_x, real place_y, pose_outputs to) {
+static inline void store_pose(GROUP_SPACE const solved_pose *fit, pose_rows all, pose_frame frame, int all_finite,
+                              long item, int count, pose_limits limits, real place_x, real place_y, pose_outputs to) {
     const int few = fit->present < POSE_PARAMETERS;
     // Below an inlier fraction of 0.75 two outliers may agree by chance. Half the leverage limit then requires that two
     // other rows check each row.

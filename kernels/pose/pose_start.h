@@ -26,8 +26,8 @@ static inline reals row_sigmas(laned_pose pose, laned_row at) {
 // otherwise the absolute residual of rank (n + FREEDOMS + 1) / 2 in sigmas, to 1 % (least median of squares, Rousseeuw
 // and Leroy, 1987).
 //
-// A work-group has no room for the residuals of every candidate: it computes them anew for every three bits of the order
-// statistic (common/group.h has the same for one array of a whole group).
+// Local memory has no room for the residuals of every candidate: a work-group computes them again for every three bits
+// of the order statistic (group_ranked of common/group.h ranks an array that is in local memory).
 BETWEEN_BARRIERS reals pose_score(laned_pose pose, pose_rows all, pose_room room, int present) {
 #ifdef GIVEN_SCALE
 #ifdef WITH_ETCH_BIAS
@@ -60,13 +60,12 @@ BETWEEN_BARRIERS reals pose_score(laned_pose pose, pose_rows all, pose_room room
 #endif
 }
 
-// Return the pose through FREEDOMS rows in each lane, from START_STEPS Gauss-Newton steps; `bad` gets the lanes whose rows
-// do not determine a pose.
+// Return the pose through FREEDOMS rows in each lane, from START_STEPS Gauss-Newton steps; `bad` gets the lanes whose
+// rows do not determine a pose.
 BETWEEN_BARRIERS laned_pose pose_through(laned_pose start, pose_rows all, constant const int *subset,
                                          private masks *bad) {
     laned_row of[FREEDOMS];
-    for (int k = 0; k < FREEDOMS; k++)
-        of[k] = gather_rows(all, subset + k * LANES);
+    for (int k = 0; k < FREEDOMS; k++) of[k] = gather_rows(all, subset + k * LANES);
     laned_pose candidate = start;
     *bad = 0;
     for (int step = 0; step < START_STEPS; step++) {
@@ -92,10 +91,10 @@ BETWEEN_BARRIERS laned_pose pose_through(laned_pose start, pose_rows all, consta
 // Find the start pose: the candidate with the least score.
 //
 // A candidate is the pose through FREEDOMS rows, from START_STEPS Gauss-Newton steps from `pose`. `subsets` holds the
-// rows of LANES candidates side by side, (trials / LANES, FREEDOMS, LANES): each lane solves one candidate. The items of a
-// group solve different candidates; the item of the best one computes it again and stores it.
+// rows of LANES candidates side by side, (trials / LANES, FREEDOMS, LANES): each lane solves one candidate. The items
+// of a group solve different candidates; the item of the best candidate computes its pose again and stores it.
 INLINE void pose_start(GROUP_SPACE laned_pose *pose, pose_rows all, constant const int *subsets, int trials,
-                              pose_room room, int present) {
+                       pose_room room, int present) {
     const laned_pose start = *pose;
     real least = INFINITY;
 #ifdef IN_GROUP

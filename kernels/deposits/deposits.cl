@@ -123,7 +123,7 @@ kernel AS_IT_IS void deposits(global const INPUT *restrict z, global const INPUT
     if (item >= apertures) return;
     const Map map = {z, sigma, owner, columns, cells};
     const Surface surface = surfaces[item];
-    const int4 box = *((global const int4 *)boxes + item);
+    const int4 box = vload4(item, boxes); // a caller's array is aligned to an element only
     const int number = item + 1;
 
     // Weights of the valid cells of the core and of the margin.

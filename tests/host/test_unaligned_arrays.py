@@ -16,9 +16,18 @@ from gpuvision.ranging.psd import PsdReadout
 from sanitize import small
 
 OPERATIONS = (
-    *("AnyHit", "BoardPoseEstimator", "CellMeans", "ClosestHit", "DistanceMapBuilder", "EdgeCostMap", "EdgeSearch"),
-    *("FieldPoseRefinement", "FieldPoseSearch", "FindBlobs", "FitLines", "FormFactors", "LineIrradiance"),
-    *("LineReadout", "MeasureDeposits", "MergeHeights", "MirrorFacets", "MirrorPoints", "OccludedIrradiance"),
+    *("AnyHit", "CellMeans", "ClosestHit", "DistanceMapBuilder", "EdgeCostMap", "EdgeSearch"),
+    *("FieldPoseRefinement", "FieldPoseSearch", "FindBlobs", "FitBoardLines", "FitLines", "FormFactors"),
+    *(
+        "LineIrradiance",
+        "LineReadout",
+        "MeasureBoardEdges",
+        "MeasureDeposits",
+        "MergeHeights",
+        "MirrorFacets",
+        "MirrorPoints",
+        "OccludedIrradiance",
+    ),
     *("PatchLight", "PlaceFeatures", "PsdReadout", "RangeImage", "Reflectance", "RenderBoard", "RulerEdges"),
     *("SolveFeatures", "SolvePose", "Triangulation", "UndistortImage", "UndistortPoints", "VisibleIntervals"),
     *("_AlongProfiles", "_AlongSamples", "_SelectLights"),

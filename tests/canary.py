@@ -28,3 +28,14 @@ class Guarded:
         for guarded in self._whole:
             assert (guarded[:_GUARD] == _BYTE).all()
             assert (guarded[-_GUARD:] == _BYTE).all()
+
+
+def shifted(like: Any, shift: int) -> Any:
+    """Return output arrays for ``out=`` that begin `shift` elements after an address that is a multiple of 64."""
+    return type(like)(*(None if each is None else _shifted(each, shift) for each in like))
+
+
+def _shifted(like: NDArray[Any], shift: int) -> NDArray[Any]:
+    whole = np.zeros(like.size + 64 + shift, like.dtype)
+    begin = -whole.ctypes.data % 64 // like.itemsize + shift
+    return whole[begin : begin + like.size].reshape(like.shape)

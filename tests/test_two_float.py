@@ -48,10 +48,11 @@ def numbers(rng: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
     return values
 
 
-def computed(device: Device, lanes: int, a: Any, b: Any, folder: Path) -> npt.NDArray[np.float32]:
+def computed(device: Device, variant: str, a: Any, b: Any, folder: Path) -> npt.NDArray[np.float32]:
     """Return high and low parts (2, operations, count) from the device for pairs (count, 2)."""
     (folder / "two_float.cl").write_text(SOURCE)
-    defines: dict[str, Any] = {"VECTOR_VARIANT": None} if lanes == 16 else {}
+    lanes = 16 if variant == "vector" else 1
+    defines: dict[str, Any] = {"VECTOR_VARIANT": None} if variant == "vector" else {}
     program = build(device, folder, "two_float.cl", defines, include_folders=(KERNEL_FOLDER,))
     count = len(a)
     inputs = [cl.array.to_device(device.queue, np.ascontiguousarray(each.T)) for each in (a, b)]
@@ -62,17 +63,15 @@ def computed(device: Device, lanes: int, a: Any, b: Any, folder: Path) -> npt.ND
     return np.stack([each.get() for each in outputs])
 
 
-@pytest.mark.parametrize("lanes", [16, 1])
+@pytest.mark.parametrize("variant", ["vector", "work_item"])
 def test_errors_are_below_the_stated_bounds(
-    device: Device, lanes: int, tmp_path: Path, rng: np.random.Generator
+    device: Device, variant: str, tmp_path: Path, rng: np.random.Generator
 ) -> None:
     """Half of the pairs cancel in their first 24 to 40 bits."""
-    if lanes == 16 and not device.takes_vectors:
-        pytest.skip("no vectors on this device")
     first, second = numbers(rng, 512), numbers(rng, 512)
     second[::2] = -first[::2] * (1.0 + 2.0 ** rng.uniform(-40.0, -24.0, 256))
     a, b = two_floats(first), two_floats(second)
-    high, low = computed(device, lanes, a, b, tmp_path)
+    high, low = computed(device, variant, a, b, tmp_path)
     one, other = ([(Fraction(float(x)), Fraction(float(y))) for x, y in each] for each in (a, b))
     for n, ((x, x_low), (y, y_low)) in enumerate(zip(one, other, strict=True)):
         a_whole, b_whole = x + x_low, y + y_low
@@ -87,7 +86,7 @@ def test_errors_are_below_the_stated_bounds(
 @pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan])
 def test_no_result_from_numbers_that_are_not_finite(device: Device, bad: float, tmp_path: Path) -> None:
     a = np.array([[bad, 0.0], [1.0, 0.0]], np.float32)
-    high, _ = computed(device, 1, a, a[::-1].copy(), tmp_path)
+    high, _ = computed(device, "work_item", a, a[::-1].copy(), tmp_path)
     assert not np.any(np.isfinite(high))
 
 

@@ -82,6 +82,27 @@ def test_fit_to_eight_points() -> None:
         fitted.covariance_at(sensor)
 
 
+def test_covariance_is_that_of_a_numerical_jacobian() -> None:
+    """The fit is linear in the plane coordinates: one fit for each changed coordinate gives the Jacobian."""
+    sensor, places, sigma = grid(4, 4), np.array([[640.0, 500.0], [30.0, 1000.0], [1279.0, 0.0]]), 20e-6
+    noise = sigma * np.sin(37.0 * np.arange(2.0 * len(sensor)) ** 2).reshape(-1, 2)
+    plane = POLYNOMIAL.to_plane(sensor) + noise
+    known, estimated = (PlanePolynomial.fit(sensor, plane, sigma=each, region=REGION) for each in (sigma, None))
+    expected = np.zeros((3, 2, 2))
+    for index in np.ndindex(plane.shape):
+        changed = plane.copy()
+        changed[index] += 1e-3
+        fitted = PlanePolynomial.fit(sensor, changed, sigma=sigma, region=REGION)
+        slope = (fitted.to_plane(places) - known.to_plane(places)) / 1e-3
+        expected += sigma**2 * slope[:, :, None] * slope[:, None, :]
+    np.testing.assert_allclose(known.covariance_at(places), expected, rtol=1e-8, atol=1e-8 * expected.max())
+    residuals = plane - known.to_plane(sensor)
+    ratio = np.sum(residuals**2, axis=0) / (len(sensor) - 8) / sigma**2  # eight coefficients of each coordinate
+    np.testing.assert_allclose(
+        estimated.covariance_at(places), expected * np.diag(ratio), rtol=1e-8, atol=1e-8 * expected.max()
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [None, 20e-6])
 def test_covariance_covers_the_truth(sigma: float | None, rng: np.random.Generator) -> None:

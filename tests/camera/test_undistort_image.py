@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from canary import Guarded
+from canary import Guarded, shifted
 from designs import covering
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.image_map import RUN, PackedMap, Packer, PixelMap, Taps
@@ -398,6 +399,21 @@ def test_device_arrays_bound_and_no_frames(device: Device, rng: np.random.Genera
     np.testing.assert_array_equal(bound.run().image.get(), expected.image)
     assert expected.status.shape == (41, 61)
     assert op(image[:0], device=device).image.shape == (0, 41, 61)
+
+
+@pytest.mark.parametrize("columns", [96, 91])
+def test_stores_past_small_caches(device: Device, columns: int, rng: np.random.Generator) -> None:
+    """A device with caches of 1 KiB writes past them: rows at aligned addresses and at other addresses."""
+    image = pixels(rng, (40, columns), np.float32)
+    small = copy.copy(device)
+    small.cache_bytes = 1024
+    op = UndistortImage(model=Lens(k1=3e-6, centre=(50.0, 20.0)))
+    defines = op.launch(small, image.shape, image.dtype).defines
+    assert ("PAST_CACHES" in defines) == ("VECTOR_VARIANT" in defines and device.is_cpu)
+    usual = op(image, device=device)
+    past = op(image, device=small, out=shifted(usual, columns % 2))
+    np.testing.assert_array_equal(past.status, usual.status)
+    np.testing.assert_array_equal(past.image, usual.image)
 
 
 @pytest.mark.slow

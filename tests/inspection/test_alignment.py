@@ -82,6 +82,23 @@ def test_a_map_without_paste_is_refused(rng):
         align_apertures(np.full(grid.shape, np.nan), grid, apertures, SETTINGS, initial=here, search_range=(1e-4, 0.0))
 
 
+@pytest.mark.parametrize("count", [4, 12])
+def test_the_covariance_of_equal_residuals_has_a_closed_form(count):
+    """Deposits on a circle have radial offsets of alternate signs, which no shift or rotation reduces."""
+    here, radius, length = BoardPlacement(x=0.0, y=0.0, theta=0.0), 1e-3, 3e-6
+    angle = 2 * math.pi * np.arange(count) / count
+    outward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    offset = length * (-1.0) ** np.arange(count)[:, None] * outward
+    fit = _fit_rigid(SimpleNamespace(offset=offset, centre=radius * outward), here)
+    median = math.sqrt(2 * math.log(2))  # of the length of two normal coordinates [sigma]
+    weight = (1 - (median / 4.685) ** 2) ** 2  # Tukey
+    shrinkage = (2 * count * weight - 3) / (2 * count * weight)
+    variance = (length / median) ** 2 / shrinkage / (count * weight)
+    np.testing.assert_allclose(
+        fit.covariance, np.diag([variance, variance, variance / radius**2]), rtol=1e-3, atol=1e-6 * variance
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [4, 12])
 def test_the_covariance_of_few_deposits_is_their_variance(rng, count):

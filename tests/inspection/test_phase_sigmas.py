@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gpuvision.inspection.aperture_cells import Window
 from gpuvision.inspection.apertures import BoardPlacement
 from gpuvision.inspection.coplanarity import measure_coplanarity
 from gpuvision.inspection.paste import PasteSettings, measure_deposits
+from gpuvision.inspection.phase_sigmas import phase_sigmas
 from paste_maps import Cap, board_grid, circle, paste_map
 
 HERE = BoardPlacement(x=0.0, y=0.0, theta=0.0)
@@ -24,6 +26,36 @@ def _with_curve(clean: Any, rng: np.random.Generator, period: int, place: float)
     """Return heights with noise and an S-curve of a period [cells], a sine that all rows share."""
     turns = np.arange(clean.shape[1]) / period + place
     return clean + rng.normal(0.0, NOISE, clean.shape) + math.sqrt(2.0) * PHASE * np.sin(2.0 * math.pi * turns)
+
+
+def test_sigmas_are_those_of_a_numerical_jacobian() -> None:
+    """A common error of the deposit and another one of the board change the volume and the mean height."""
+    height, phase = np.full((6, 8), 100e-6), np.full((6, 8), PHASE)
+    grid, cells = board_grid(8, 6), np.zeros((6, 8), bool)
+    cells[1:5, 2:7] = True
+    window = Window(slice(0, 6), slice(0, 8), cells, cells)
+    area = grid.cell_x * grid.cell_y
+    places = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)[cells]
+
+    def measured(of_deposit: float, of_board: float) -> np.ndarray:
+        above = (height + of_deposit - of_board)[cells]
+        return np.array([above.sum() * area, above.mean(), above.max()])
+
+    step = 1e-6
+    slopes = np.stack([measured(step, 0.0), measured(0.0, step)]) - measured(0.0, 0.0)
+    expected = PHASE * np.hypot(*(slopes / step))
+    volume = measured(0.0, 0.0)[0]
+    found = phase_sigmas(
+        height, phase, grid, window, HERE, threshold=100e-6, volume=volume, centroid=places.mean(axis=0)
+    )
+    np.testing.assert_allclose([found.volume, found.height_mean, found.height_max], expected, rtol=1e-6)
+    # The worst error is proportional to the distance from the centroid along an axis, with the root mean square of the
+    # two phases; the area changes by half of the cells at the threshold.
+    for axis in (0, 1):
+        away = places[:, axis] - places[:, axis].mean()
+        worst = math.sqrt(2.0) * PHASE * away / np.sqrt(np.mean(away**2))
+        assert found.offset[axis] == pytest.approx(np.sum(worst * away) * area / volume, rel=1e-9)
+    assert found.area == pytest.approx(0.5 * 20 * area, rel=1e-12)
 
 
 @pytest.mark.slow

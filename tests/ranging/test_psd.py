@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 import gpuvision as gv
-from canary import Guarded
+from canary import Guarded, shifted
 from gpuvision.host import host_view
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
@@ -61,6 +62,22 @@ def test_like_float64(device, rng, variant, dtype, layout, batch):
     reading = readout(given_, device=device)
     assert reading.position.shape == batch
     assert_like_reference(readout, reading, *values)
+
+
+@pytest.mark.parametrize("shift", [0, 1])
+def test_stores_past_small_caches(device, rng, shift):
+    """A device with caches of 1 KiB writes past them: all outputs, at aligned addresses and at other addresses."""
+    samples = 4003
+    small = copy.copy(device)
+    small.cache_bytes = 1024
+    readout = PsdReadout(strip_length=LENGTH, layout="planar")  # shares the usual build with `test_like_float64`
+    defines = readout.launch(small, (2, samples), np.dtype(np.float32)).defines
+    assert ("PAST_CACHES" in defines) == ("VECTOR_VARIANT" in defines and device.is_cpu)
+    values = currents(rng, (2, samples))
+    complete = readout(values, device=device)
+    for mine, theirs in zip(readout(values, device=small, out=shifted(complete, shift)), complete, strict=True):
+        if mine is not None:
+            np.testing.assert_array_equal(mine, theirs)
 
 
 @pytest.mark.slow

@@ -497,10 +497,13 @@ def test_results_do_not_depend_on_the_size_of_the_group(
         assert usual.status[k] == (Status.AMBIGUOUS if is_rivalled else 0)
     monkeypatch.setattr("gpuvision.matching.features.ruler._GROUP", group)
     clear_cache()  # a kept instance has the usual group
-    for mine, theirs in zip(operation(image, rulers, device=device), usual, strict=True):
+    try:
+        found = operation(image, rulers, device=device)
+    finally:
+        clear_cache()  # the instance of this group
+    for mine, theirs in zip(found, usual, strict=True):
         if mine is not None:
             np.testing.assert_array_equal(mine, theirs)
-    clear_cache()
 
 
 def test_no_rulers(device: Device) -> None:

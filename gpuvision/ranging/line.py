@@ -166,7 +166,7 @@ class LineReadout(VisionOperation[LineReading]):
         Precision of the arithmetic and of the outputs; ``None`` is single.
     variant : {"auto", "vector", "work_item"}
         Kernel variant: wide vectors on strips of profiles (CPU runtimes), or work-groups that read profiles together
-        (GPUs). ``"auto"`` follows the device. Frames narrower than a vector use the work-item variant.
+        (GPUs). ``"auto"`` follows the device. On CPU runtimes, narrower frames than a vector use an item per profile.
 
     Raises
     ------
@@ -321,10 +321,11 @@ class LineReadout(VisionOperation[LineReading]):
                 f"LineReadout takes profiles of up to {LONGEST_PROFILE} samples in frames below 2**31, got {shape}"
             )
         frames = math.prod(batch)
-        if build.uses_vectors and self._fits_strip(rows, columns, dtype):
+        is_narrow = build.uses_vectors and not self._fits_strip(rows, columns, dtype)
+        if build.uses_vectors and not is_narrow:
             work = WorkSize((self._items(device, frames, samples), frames), (1, 1), vectors=True)
         else:
-            work = self._groups(frames, samples, dtype)
+            work = self._groups(frames, samples, dtype, item_per_profile=is_narrow)
         chosen, of_samples = self.outputs or (), (*batch, samples)
         profiles = None
         if self.triangulation is not None:
@@ -335,7 +336,8 @@ class LineReadout(VisionOperation[LineReading]):
             work=work,
             more_inputs=[(of_samples, build.real)] if self.peak_selection == "nearest" else [],
             outputs=build.outputs({name: of_samples if name in chosen else None for name in LineReading._fields}),
-            defines=self._defines(dtype, length, build.real, profiles) | flags(PREFETCH=device.prefers_vectors),
+            defines=self._defines(dtype, length, build.real, profiles)
+            | flags(PREFETCH=device.prefers_vectors, ITEM_PER_PROFILE=is_narrow and not self._has_candidates),
             arguments=[
                 np.int32(rows),
                 np.int32(columns),
@@ -353,9 +355,9 @@ class LineReadout(VisionOperation[LineReading]):
             return self.along == "columns" and columns >= _LANES
         return columns >= _WIDE_BYTES // dtype.itemsize and (self.along == "columns" or rows >= _LANES)
 
-    def _groups(self, frames: int, samples: int, dtype: np.dtype[Any]) -> WorkSize:
+    def _groups(self, frames: int, samples: int, dtype: np.dtype[Any], *, item_per_profile: bool) -> WorkSize:
         """Return the work size of the work-item variant."""
-        if self._has_candidates:
+        if self._has_candidates or item_per_profile:
             return WorkSize((round_up(samples, _GROUP), frames), (_GROUP, 1))
         # GROUP and PROFILES in line_group.h
         if self.method == "ml":

@@ -21,6 +21,7 @@
 // Build options: CODE, CODE4, CODE8, CODE16, CODE_BITS (type of the samples), REAL_IS_DOUBLE, ALONG_ROWS, RADIUS and
 //          REACH (window that counts, and window that is read), FIR_HALF, CANDIDATES with SELECT_... (line_peak.h), AMBIGUITY,
 //          WIDTH_LIMITS, COUNT_WIDTH, LONG_MOMENT, PREFETCH, NOISE (compute variances: any of the sigmas is an output),
+//          ITEM_PER_PROFILE (line_group.h),
 //          WITH_POSITION/PEAK/WIDTH/TOTAL/STATUS/SHEET/G/H/SIGMA/SIGMA_G/SIGMA_H/SYSTEMATIC_G/SYSTEMATIC_H, LENS,
 //          LENS_K2, LENS_K3, LENS_K4, CAMERA, CAMERA_PROFILES (terms of the table of corrections), PAST_CACHES,
 //          VECTOR_VARIANT.

@@ -8,13 +8,16 @@
 // the profile. The joined result does not depend on the order of the parts, but for rounding of float sums: integer sums
 // are exact, and of equally large samples the first one is the peak.
 //
+// ITEM_PER_PROFILE, for narrow frames on CPU runtimes: a work-item reads a whole profile, sample by sample (SLICES and
+// HELD are 1). The runtime computes neighbouring work-items as the elements of a vector.
+//
 // A group keeps its registers until its last work-item ends. The fit of METHOD_ML takes longer than the search, so that
 // its groups have a work-item to finish each profile; along rows, 8 work-items then read 32 bytes of a row.
 #ifndef LINE_GROUP_H
 #define LINE_GROUP_H
 
 // Work-items and profiles of a group: LineReadout._groups in gpuvision/ranging/line.py has the same numbers.
-#ifdef METHOD_ML
+#if defined(METHOD_ML) || defined(ITEM_PER_PROFILE)
 #define GROUP 64
 #define PROFILES 64
 #else
@@ -25,8 +28,12 @@
 #define PROFILES 32
 #endif
 #endif
+#ifdef ITEM_PER_PROFILE
+#define PER 1  // samples of a load
+#else
 #define PER (32 / CODE_BITS)  // samples of a load of 4 bytes
-#ifdef ALONG_ROWS
+#endif
+#if defined(ALONG_ROWS) && !defined(ITEM_PER_PROFILE)
 #define HELD (GROUP == 64 ? 8 : 4)
 #define HELD_STEP (PROFILES / HELD)  // from one profile of a work-item to its next one
 #else
@@ -160,7 +167,7 @@ static inline int has_aligned_rows(const Profiles *frame, int columns) {
 
 // Load PER neighbouring samples of a row, the first `count` of them if the row ends before; the rest repeats the last.
 static inline void load_row_part(global const CODE *at, int is_aligned, int count, CODE *x) {
-#if CODE_BITS == 32
+#if PER == 1
     x[0] = *at;
 #else
     if (is_aligned) {

@@ -535,3 +535,15 @@ def test_colour_frames_are_refused(device: Device) -> None:
     ):
         LineReadout()(np.zeros((16, 40, 3), np.uint8), device=device)
     assert LineReadout()(np.zeros((15, 40, 3), np.uint8), device=device).position.shape == (15, 3)
+
+
+@pytest.mark.vectors
+def test_narrow_frames_on_cpu_runtimes_have_a_work_item_per_profile(device: Device, rng: np.random.Generator) -> None:
+    """Frames narrower than a vector: the shape of work that is fast on CPU runtimes, with the same results."""
+    frames = rng.integers(0, 40, (90, 13)).astype(np.uint8)
+    frames[43:46] += np.array([[90], [200], [120]], np.uint8)
+    cpu, gpu = LineReadout(threshold=30, variant="vector"), LineReadout(threshold=30, variant="work_item")
+    launches = [each.launch(device, frames.shape, frames.dtype) for each in (cpu, gpu)]
+    assert [each.local_size for each in launches] == [(64, 1), (256, 1)]
+    for name, ours in cpu(frames, device=device)._asdict().items():
+        np.testing.assert_array_equal(ours, getattr(gpu(frames, device=device), name), err_msg=name)

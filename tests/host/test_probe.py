@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import sys
 
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
 import pytest
 
 from gpuvision.host import Device, discovery, probe
@@ -12,6 +15,25 @@ from gpuvision.host import Device, discovery, probe
 
 def test_working_device_passes(device: Device) -> None:
     assert probe.probe_device(device.handle) == ""
+
+
+def test_long_loops_run_to_their_end(device: Device) -> None:
+    """A work-item may take more than 65535 iterations: Mesa 22.3 (llvmpipe) ends all loops there, without an error."""
+    source = """
+    kernel void iterate(global const int *limit, global int *found) {
+        uint number = 1;
+        int count = 0;
+        while (count < limit[0]) {
+            number = number * 1664525u + 1013904223u; // no closed form that a compiler knows
+            count += number == (uint)limit[0] ? 2 : 1;
+        }
+        found[0] = count;
+    }"""
+    iterate = cl.Program(device.context, source).build().iterate
+    limit = cl.array.to_device(device.queue, np.array([100_000], np.int32))
+    found = cl.array.zeros(device.queue, 1, np.int32)
+    iterate(device.queue, (1,), None, limit.data, found.data)
+    assert found.get()[0] in (100_000, 100_001)
 
 
 def test_compiler_that_fails(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -207,7 +207,11 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print the number of passed tests for every device, which CI reads, and of the tests that do not run."""
+    """Print the number of passed tests for every device, which CI reads, and of the tests that do not run.
+
+    Tests that pass although they are marked as expected failures are listed by name: their fault in `driver_faults` is
+    gone.
+    """
     config = terminalreporter.config
     passed = terminalreporter.getreports("passed")
     labels = Counter(label for each in passed for name, label in each.user_properties if name == "device")
@@ -219,6 +223,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     refused = config.stash.get(REFUSED_COUNTS, {})
     if refused:
         terminalreporter.write_line(f"left to no tier, because the device refuses them: {_counts(refused)}")
+    for each in sorted(terminalreporter.getreports("xpassed"), key=lambda each: each.nodeid):
+        terminalreporter.write_line(f"expected to fail, passed: {each.nodeid} ({each.wasxfail})", yellow=True)
     for line in table_of_files(each for each in terminalreporter.getreports("") if each.when == "teardown"):
         terminalreporter.write_line(line)
     if config.getoption("strict_skips"):

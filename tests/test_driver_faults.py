@@ -23,12 +23,13 @@ AFFECTED = {
     "blob kernel": ("tests/matching/features/test_blob.py::test_any[rusticl-uint8]", False),
     "accuracy of blobs": ("tests/matching/features/test_blob_accuracy.py::test_any[rusticl]", False),
     "pose of features": ("tests/a/test_feature_pose.py::test_one_kind_of_features_is_enough[rusticl-rulers]", True),
-    "affine pose": ("tests/a/test_registration_pairs.py::test_copper_of_another_width_does_not_move[rusticl-2]", True),
-    "many lines": ("tests/a/test_extremes.py::test_glare[rusticl]", True),
-    "disturbed board": ("tests/a/test_predicted_errors.py::test_no_wrong_pose_of_a_disturbed_board[rusticl-x]", True),
+    "affine pose": ("tests/a/test_registration_pairs.py::test_a_scale_is_not_hidden_in_a_rigid_pose[rusticl]", True),
     "board in an image": ("tests/a/test_registration.py::test_real_boards_are_found[rusticl-upverter]", True),
 }
 UNAFFECTED = (
+    "tests/a/test_extremes.py::test_glare[rusticl]",
+    "tests/a/test_predicted_errors.py::test_no_wrong_pose_of_a_disturbed_board[rusticl-x]",
+    "tests/a/test_registration_pairs.py::test_copper_of_another_width_does_not_move[rusticl-2]",
     "tests/a/test_field_pose.py::test_scores_are_sums_over_the_map[rusticl-1-work_item]",
     "tests/matching/features/test_ruler.py::test_any[rusticl]",
     "tests/ranging/test_line.py::test_not_finite[rusticl-centroid]",

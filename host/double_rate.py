@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,10 @@ from gpuvision.host.kept_numbers import driver_key, kept_number
 # of two floats (kernels/common/two_float.h) takes 8 to 20 operations. GPUs have doubles at 1/2 to 1/16 or at 1/32 to
 # 1/64 of the float rate: the limit lies between.
 SLOW_RATIO = 22.0
-# Work-items and multiply-adds of each (chosen): 0.3e9 multiply-adds take 10 us to 3 ms in single precision, longer than
+# Work-items and multiply-adds of each in each of 8 chains (chosen): 0.3e9 multiply-adds take 10 us to 3 ms in single precision, longer than
 # the launch of the kernel, and less than 0.1 s in slow doubles.
-_ITEMS, _ROUNDS, _CHAINS = 1 << 17, 256, 8
-_LAUNCHES = 3  # timed launches, of which the fastest counts; one more comes first
+_ITEMS, _ROUNDS = 1 << 17, 256
+_LAUNCHES = 3  # timed launches of each precision, of which the fastest counts; one more of each comes first
 
 # Independent chains hide the latency of a multiply-add. The factors keep the numbers finite.
 _SOURCE = """
@@ -48,27 +49,38 @@ def double_ratio(handle: Any) -> float:
     Returns
     -------
     float
-        Infinite on a device without doubles. On a CPU 2, from the number of lanes in a vector register: a measurement
-        would be of the load of the machine.
+        Infinite on a device without doubles, and where the measurement fails. On a CPU 2, from the number of lanes in a
+        vector register: a measurement would be of the load of the machine.
 
     Notes
     -----
     OpenCL has no query for the rate: ``CL_DEVICE_NATIVE_VECTOR_WIDTH_DOUBLE`` is 1 on GPUs of any rate. The measured
-    ratio is kept for the device and the version of its driver. The first call takes some tenths of a second.
+    ratio is kept for the device and the version of its driver; a failure is not kept. The first call takes some tenths
+    of a second.
     """
     if not handle.double_fp_config:
         return math.inf
     if handle.type & cl.device_type.CPU:
         return 2.0
-    return kept_number(
-        "double_rates.json",
-        (*driver_key(handle), _SOURCE),
-        lambda: _seconds(handle, np.float64) / _seconds(handle, np.float32),
-    )
+    try:
+        return kept_number("double_rates.json", (*driver_key(handle), _SOURCE), lambda: _measured_ratio(handle))
+    except cl.Error:  # for example no memory; kernels without doubles run on such a device
+        return math.inf
 
 
-def _seconds(handle: Any, real: type[np.floating[Any]]) -> float:
-    """Return the time of the fastest launch [s]."""
+def _measured_ratio(handle: Any) -> float:
+    """Return the time of the fastest launch in double precision over the time of the fastest in single precision.
+
+    The launches alternate, so that a change of the clock frequency meets both precisions.
+    """
+    launches = [_timed_launch(handle, real) for real in (np.float64, np.float32)]
+    times = [[launch() for launch in launches] for _ in range(1 + _LAUNCHES)]
+    double, single = (min(each) for each in zip(*times[1:], strict=True))
+    return double / single
+
+
+def _timed_launch(handle: Any, real: type[np.floating[Any]]) -> Callable[[], float]:
+    """Return a function that launches the kernel and returns the time of the launch [s]."""
     context = cl.Context([handle])
     queue = cl.CommandQueue(context, handle, properties=cl.command_queue_properties.PROFILING_ENABLE)
     options = ["-DREAL_IS_DOUBLE"] if real is np.float64 else []
@@ -76,7 +88,10 @@ def _seconds(handle: Any, real: type[np.floating[Any]]) -> float:
         warnings.simplefilter("ignore", cl.CompilerWarning)  # some runtimes report success as compiler output
         kernel = cl.Kernel(cl.Program(context, _SOURCE).build(options), "chains")
     out = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, _ITEMS * np.dtype(real).itemsize)
-    kernel.set_args(out, real(0.5), real(1.0), np.int32(_ROUNDS))
-    events = [cl.enqueue_nd_range_kernel(queue, kernel, (_ITEMS,), None) for _ in range(1 + _LAUNCHES)]
-    queue.finish()
-    return min(1e-9 * max(event.profile.end - event.profile.start, 1) for event in events[1:])
+
+    def launch() -> float:
+        event = kernel(queue, (_ITEMS,), None, out, real(0.5), real(1.0), np.int32(_ROUNDS))
+        event.wait()
+        return 1e-9 * max(event.profile.end - event.profile.start, 1)
+
+    return launch

@@ -180,7 +180,7 @@ class LaunchBuilder:
             Work-group size of the other variant.
         least : int
             Fewest elements for the vector variant. Default 0.
-        grouping : {"padded", "fitted", "per_element"}
+        grouping : {"padded", "fitted", "strided", "per_element"}
             Work-groups of the other variant: `padded_groups`, `fitted_groups`, `strided_groups` or
             `group_per_element`.
         """

@@ -3,8 +3,9 @@
 // At 1e-6 of a segment's length from the segment a difference of two single-precision positions has no digit left.
 // Differences are taken in `place`, the rest is computed in `real`.
 //
-// Options: DOUBLE_POSITIONS: doubles, on devices with fast doubles; TWO_FLOAT_POSITIONS: two floats (two_float.h), on
-// other devices; neither: floats.
+// Options: DOUBLE_POSITIONS: doubles; TWO_FLOAT_POSITIONS: two floats (two_float.h); neither: floats. Line irradiance and
+// ray queries take doubles on devices with fast doubles and two floats on other devices. Occluded irradiance takes
+// doubles on every device that has them and floats on other devices.
 #ifndef PLACES_H
 #define PLACES_H
 #include "common/lanes.h"

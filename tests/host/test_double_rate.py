@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -31,12 +32,12 @@ def measured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     drivers: list[str] = []
 
-    def seconds(handle: Any, real: type[Any]) -> float:
+    def timed_launch(handle: Any, real: type[Any]) -> Callable[[], float]:
         drivers.append(handle.driver_version)
         slow = 32.0 if handle.driver_version == "1" else 2.0
-        return slow if real is np.float64 else 1.0
+        return lambda: slow if real is np.float64 else 1.0
 
-    monkeypatch.setattr(double_rate, "_seconds", seconds)
+    monkeypatch.setattr(double_rate, "_timed_launch", timed_launch)
     return drivers
 
 
@@ -62,8 +63,39 @@ def test_a_cpu_and_a_device_without_doubles_are_not_measured(measured: list[str]
 
 
 def test_the_kernel_of_the_measurement_runs(device: Device) -> None:
-    times = [double_rate._seconds(device.handle, real) for real in (np.float32, np.float64)[: 1 + device.has_double]]
-    assert all(1e-6 < seconds < 10.0 for seconds in times)
+    reals = (np.float32, np.float64)[: 1 + device.has_double]
+    launches = [double_rate._timed_launch(device.handle, real) for real in reals]
+    assert all(1e-6 < launch() < 10.0 for launch in launches)
+
+
+def test_launches_of_both_precisions_alternate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first launch of each precision does not count, and of the others the fastest."""
+    order: list[Any] = []
+    times = {np.float64: [0.1, 9.0, 8.0, 10.0], np.float32: [0.1, 2.0, 3.0, 4.0]}
+
+    def timed_launch(handle: Any, real: Any) -> Callable[[], float]:
+        def launch() -> float:
+            order.append(real)
+            return times[real].pop(0)
+
+        return launch
+
+    monkeypatch.setattr(double_rate, "_timed_launch", timed_launch)
+    assert double_rate._measured_ratio(handle_of()) == 4.0
+    assert order == 4 * [np.float64, np.float32]
+
+
+def test_a_failed_measurement_means_slow_doubles_and_is_not_kept(
+    measured: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(handle: Any, real: Any) -> Any:
+        raise cl.RuntimeError("build failed\nlog")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(double_rate, "_timed_launch", refuse)
+        assert double_rate.double_ratio(handle_of()) == math.inf
+    assert not (tmp_path / "gpuvision" / "double_rates.json").exists()
+    assert double_rate.double_ratio(handle_of()) == 32.0
 
 
 def test_cpu_runtimes_with_doubles_have_fast_doubles(device: Device) -> None:

@@ -10,13 +10,13 @@ import functools
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
 from gpuvision.host.arrays import HostArray
 from gpuvision.host.device import Device, requested_device
-from gpuvision.host.errors import GpuVisionError
+from gpuvision.host.errors import DeviceLostError, DeviceMemoryError, GpuVisionError
 from gpuvision.host.kept_numbers import driver_key, kept_number
 from gpuvision.host.operation import Operation
 
@@ -24,7 +24,12 @@ from gpuvision.host.operation import Operation
 # shared machine hit a few calls.
 _WARM_UP, _CALLS = 3, 15
 # The same of a step of a job, and the time after which no more runs start [s] (chosen): a step takes up to a second.
+# The first run does not count even where it takes longer: it compiles kernels.
 _STEP_WARM_UP, _STEP_CALLS, _STEP_SECONDS = 1, 5, 0.2
+# Age at which the times of steps are measured again (chosen): a machine changes, for example by cooling or other users.
+_MAX_DAYS = 30
+# First lines of the errors of devices that cannot run a step, by the key of the step's times; see `StepDevices.choose`.
+_failures: dict[str, str] = {}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,17 +161,21 @@ class StepDevices:
             Runs the step on a device. It is called only to measure: where there are two devices to choose from, and
             their times for this step and size are not kept from an earlier measurement.
         *size : object
-            What determines the cost of the step, such as shape and dtype of an image.
+            What determines the cost of the step, such as shape and dtype of an image. Floats are rounded to powers of
+            two: numbers that are nearly equal share their times.
 
         Notes
         -----
-        Times are kept in the cache folder for the version of gpuvision and of the driver. A measurement takes some
-        runs of the step, or about 0.2 s.
+        Times are kept in the file ``step_seconds.json`` of the cache folder, for the version of gpuvision and of the
+        driver, and for 30 days at most; delete the file to measure again. A measurement runs the step at least twice
+        on each device, and up to 6 times where the runs take less than 0.2 s together; then the job runs the step. A
+        device that fails while another one runs the step is left out until the process ends, for this size of the step.
+        A full memory and a lost device are tried again in the next call.
         """
         if len(self._candidates) == 1:
             self.choices[step] = DeviceChoice(operation=step, device=self.first, seconds={})
         else:
-            self.choices[step] = _choose(step, self._candidates, lambda device: _kept_seconds(step, run, size, device))
+            self.choices[step] = _choose_for_step(step, run, size, self._candidates)
         return self.choices[step].device
 
     def report(self) -> dict[str, Any]:
@@ -177,29 +186,54 @@ class StepDevices:
         }
 
 
+def _choose_for_step(
+    step: str, run: Callable[[Device], object], size: tuple[object, ...], candidates: Sequence[Device]
+) -> DeviceChoice:
+    """Return the device of a step; leave out the devices that failed before in this process, and note new failures."""
+    keys = {each: repr(_key_of(step, size, each)) for each in candidates}
+    usable = [each for each in candidates if keys[each] not in _failures] or candidates
+    errors: dict[Device, Exception] = {}
+    choice = _choose(step, usable, lambda device: _kept_seconds(step, run, size, device), errors)
+    for device, error in errors.items():
+        if not isinstance(error, DeviceLostError | DeviceMemoryError):
+            _failures[keys[device]] = choice.unusable[device.label]
+    known = {each.label: _failures[keys[each]] for each in candidates if each not in usable}
+    return replace(choice, unusable={**known, **choice.unusable})
+
+
+def _key_of(step: str, size: tuple[object, ...], device: Device) -> tuple[object, ...]:
+    """Return the key of the kept time of a step on a device; floats as powers of two."""
+    rounded = [math.frexp(each)[1] if isinstance(each, float) and each != 0.0 else each for each in size]
+    return (version("gpuvision"), device.label, *driver_key(device.handle), step, *rounded)
+
+
 def _kept_seconds(step: str, run: Callable[[Device], object], size: tuple[object, ...], device: Device) -> float:
     """Return the median time of a step on a device [s], measured now or before."""
-    key = (version("gpuvision"), device.label, *driver_key(device.handle), step, *size)
     measure = functools.partial(_median_seconds, lambda: run(device), _STEP_WARM_UP, _STEP_CALLS, _STEP_SECONDS)
-    return kept_number("step_seconds.json", key, measure)
+    return kept_number("step_seconds.json", _key_of(step, size, device), measure, max_days=_MAX_DAYS)
 
 
-def _choose(name: str, devices: Sequence[Device], seconds: Callable[[Device], float]) -> DeviceChoice:
-    """Return the device with the least time; leave out the devices that cannot run the operation."""
+def _choose(
+    name: str,
+    devices: Sequence[Device],
+    seconds: Callable[[Device], float],
+    failures: dict[Device, Exception] | None = None,
+) -> DeviceChoice:
+    """Return the device with the least time; leave out devices that cannot run the operation (add to `failures`)."""
     measured: dict[Device, float] = {}
-    failures: dict[str, Exception] = {}
+    failures = {} if failures is None else failures
     for each in devices:
         try:
             measured[each] = seconds(each)
         except (GpuVisionError, ValueError) as error:
-            failures[each.label] = error
+            failures[each] = error
     if not measured:
         raise next(iter(failures.values()))
     return DeviceChoice(
         operation=name,
         device=min(measured, key=measured.__getitem__),
         seconds={each.label: s for each, s in measured.items()},
-        unusable={label: str(error).partition("\n")[0] for label, error in failures.items()},
+        unusable={each.label: str(error).partition("\n")[0] for each, error in failures.items()},
     )
 
 

@@ -16,8 +16,8 @@ from gpuvision.host.kept_numbers import driver_key, kept_number
 # of two floats (kernels/common/two_float.h) takes 8 to 20 operations. GPUs have doubles at 1/2 to 1/16 or at 1/32 to
 # 1/64 of the float rate: the limit lies between.
 SLOW_RATIO = 22.0
-# Work-items and multiply-adds of each in each of 8 chains (chosen): 0.3e9 multiply-adds take 10 us to 3 ms in single precision, longer than
-# the launch of the kernel, and less than 0.1 s in slow doubles.
+# Work-items, and multiply-adds of each in each of 8 chains (chosen): 0.3e9 multiply-adds take 10 us to 3 ms in single
+# precision, longer than the launch of the kernel, and less than 0.1 s in slow doubles.
 _ITEMS, _ROUNDS = 1 << 17, 256
 _LAUNCHES = 3  # timed launches of each precision, of which the fastest counts; one more of each comes first
 

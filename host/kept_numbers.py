@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ def driver_key(handle: Any) -> tuple[str, ...]:
     return (handle.platform.name, handle.platform.version, handle.name, handle.driver_version)
 
 
-def kept_number(file: str, key: object, measure: Callable[[], float]) -> float:
+def kept_number(file: str, key: object, measure: Callable[[], float], *, max_days: int = 0) -> float:
     """Return a number that was kept under a key; measure and keep it where there is none.
 
     Parameters
@@ -32,7 +33,15 @@ def kept_number(file: str, key: object, measure: Callable[[], float]) -> float:
         Key, told apart by its ``repr``.
     measure : function
         Returns the number, positive and finite.
+    max_days : int
+        Number of days after which a kept number is measured again. Default 0: never.
+
+    Notes
+    -----
+    The count of whole periods of ``max_days`` since 1970 is part of the key: a number is kept for this time or less.
     """
+    if max_days:
+        key = (key, int(time.time() // (86400 * max_days)))
     digest = hashlib.sha256(repr(key).encode()).hexdigest()[:24]
     path = cache_folder() / file
     kept = _read(path).get(digest)

@@ -231,6 +231,11 @@ class _Clock:
         now = time.perf_counter()
         self.seconds[step], self._last = now - self._last, now
 
+    def record_apart(self, step: str, seconds: float) -> None:
+        """Add a time to a step, and leave it out of the step that is recorded next."""
+        self.seconds[step] = self.seconds.get(step, 0.0) + seconds
+        self._last += seconds
+
 
 @dataclass(frozen=True)
 class _Job:
@@ -263,7 +268,8 @@ class _Job:
         )
         self.clock.record("prepare registration")
         image = self._undistorted(view.model)
-        device = self._device_of("registration", lambda device: search(image, device=device), *reach)
+        size = (reach[0] / view.scale, reach[1], float(len(search.search.point)), float(len(search.rulers.point)))
+        device = self._device_of("registration", lambda device: search(image, device=device), *size)
         found = search(image, device=device)
         self.clock.record("registration")
         shift = max(limits.registered_range[0], limits.registered_range_px * view.scale)
@@ -285,12 +291,15 @@ class _Job:
         if model is None:
             return self.grey
         undistort = UndistortImage(model=model, border="replicate")
-        device = self._device_of("undistort", lambda device: undistort(self.grey, device=device))
+        device = self._device_of("undistort", lambda device: undistort(self.grey, device=device), type(model).__name__)
         return np.asarray(to_numpy(undistort(self.grey, device=device).image))
 
     def _device_of(self, step: str, run: Callable[[Device], object], *size: object) -> Device:
         """Return the device of a step on this image; `size`: what else determines its cost."""
-        return self.devices.choose(step, run, self.grey.shape, self.grey.dtype.str, *size)
+        start = time.perf_counter()
+        device = self.devices.choose(step, run, self.grey.shape, self.grey.dtype.str, *size)
+        self.clock.record_apart("choose device", time.perf_counter() - start)
+        return device
 
     def select_features(self, expected: _ExpectedPose, budget: int) -> FeatureSet:
         """Select the features of the view at the expected pose."""
@@ -318,7 +327,10 @@ class _Job:
         def measure_on(device: Device) -> BoardMeasurement:
             return measurer_on(device).measure(expected.view, kinds[0])
 
-        measurer = measurer_on(self._device_of("rulers", measure_on, len(features.length)))
+        length, spacing = (float(np.sum(each)) / expected.view.scale for each in (features.length, features.spacing))
+        rulers, fiducials = float(len(features.length)), float(len(features.fiducials.radius))
+        size = (rulers, fiducials, length, spacing, features.imaging.width_px)
+        measurer = measurer_on(self._device_of("rulers", measure_on, *size))
         measurements = [(kind, measurer.measure(expected.view, kind)) for kind in kinds]
         kind, measurement = max(measurements, key=lambda each: (not each[1].reason, each[1].agreeing))
         reason = expected.reason or measurement.reason

@@ -150,8 +150,9 @@ def locate_robot(
     def search(device: Device) -> tuple[PoseCandidate, ...]:
         return find_pose_candidates(field_map, used, initial_pose=initial_pose, max_candidates=most, device=device)
 
-    size = (field_map.cells.level.shape, len(used), initial_pose is None, most)
+    size = (field_map.cells.level.shape, float(len(used)), initial_pose is None, most)
     kept["device"] = devices.choose("search", search, *size)
+    chosen = time.perf_counter()
     found = search(kept["device"])
     paths, wide = (None, default_line_width(field)) if scan is None else (scan.paths, scan.line_width)
     how: dict[str, Any] = {
@@ -168,7 +169,7 @@ def locate_robot(
         evidence=weights[0] if weights else None,
         reason=reason,
         steps=devices.report(),
-        seconds={"map": mapped - start, "search": time.perf_counter() - mapped},
+        seconds={"map": mapped - start, "choose device": chosen - mapped, "search": time.perf_counter() - chosen},
         **kept,
     )
 

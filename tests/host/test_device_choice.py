@@ -190,7 +190,8 @@ def test_plan_takes_the_device_that_keeps_up(gpu: Device, device: Device, measur
 
 @pytest.fixture
 def kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """File of the kept times of steps."""
+    """File of the kept times of steps; without failures that other tests left in the process."""
+    monkeypatch.setattr(device_choice, "_failures", {})
     monkeypatch.setattr(kept_numbers, "cache_folder", lambda: tmp_path)
     return tmp_path / "step_seconds.json"
 
@@ -236,6 +237,66 @@ def test_a_step_leaves_out_a_device_that_cannot_run_it(gpu: Device, device: Devi
     devices = StepDevices(None)
     assert devices.choose("rulers", run) is device
     assert devices.report()["rulers"]["unusable"] == {"gpu": "no"}
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda each: type(each).__name__)
+def test_a_step_that_failed_on_a_device_is_not_run_there_again(
+    gpu: Device, device: Device, kept: Path, clock: Clock, error: Exception
+) -> None:
+    """A full memory and a lost device may be over in the next job: the step is run there again."""
+    failed: list[Device] = []
+    failing = [gpu]
+
+    def run(on: Device) -> None:
+        if on in failing:
+            failed.append(on)
+            raise error
+        clock.run(1e-3)
+
+    for _ in range(3):
+        devices = StepDevices(None)
+        assert devices.choose("rulers", run, 3) is device
+        assert devices.report()["rulers"]["unusable"] == {"gpu": "no"}
+    passes = isinstance(error, DeviceLostError | DeviceMemoryError)
+    assert failed == [gpu] * (3 if passes else 1)
+    failing.append(device)  # a new size: an error of all devices, for example a wrong image, is not kept
+    for _ in range(2):
+        with pytest.raises(type(error), match="no"):
+            StepDevices(None).choose("rulers", run, 4)
+    failing.clear()
+    assert StepDevices(None).choose("rulers", run, 4) is gpu
+
+
+def test_a_step_is_measured_for_each_power_of_two_of_a_float(gpu: Device, device: Device, kept: Path) -> None:
+    runs: list[float] = []
+    for number in (0.5, 0.7, 0.99, 1.0, 1.9, 0.0):
+        StepDevices(None).choose("rulers", lambda on, number=number: runs.append(number), number)
+    assert set(runs) == {0.5, 1.0, 0.0}
+
+
+def test_times_of_steps_are_kept_for_thirty_days(
+    gpu: Device, device: Device, kept: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs: list[float] = []
+    for day in (0.1, 29.9, 30.1):
+        monkeypatch.setattr(kept_numbers, "time", SimpleNamespace(time=lambda day=day: 86400.0 * (3000 + day)))
+        StepDevices(None).choose("rulers", lambda on, day=day: runs.append(day))
+    assert set(runs) == {0.1, 30.1}
+
+
+@pytest.mark.parametrize(("seconds", "runs"), [(1e-3, 6), (0.06, 4), (0.5, 2)])
+def test_runs_of_a_measurement(
+    gpu: Device, device: Device, kept: Path, clock: Clock, seconds: float, runs: int
+) -> None:
+    """Runs start on each device until 0.2 s have passed: two at least, six at most."""
+    ran: list[Device] = []
+
+    def run(on: Device) -> None:
+        ran.append(on)
+        clock.run(seconds)
+
+    StepDevices(None).choose("rulers", run)
+    assert (ran.count(gpu), ran.count(device)) == (runs, runs)
 
 
 def test_a_damaged_file_of_kept_times_is_replaced(gpu: Device, device: Device, kept: Path, clock: Clock) -> None:

@@ -6,6 +6,7 @@ import functools
 import json
 import math
 import re
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +28,7 @@ from gpuvision.cli import main as cli
 from gpuvision.cli.arguments import quantities
 from gpuvision.formats.camera_file import write_lens
 from gpuvision.formats.field_file import read_field
-from gpuvision.host import Device
+from gpuvision.host import Device, StepDevices
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.board.edge_measurement import BoardMeasurer
 from gpuvision.matching.board.located_board import LocatedBoard
@@ -318,7 +319,25 @@ def test_each_step_runs_on_its_fastest_device(
     alone = locate_board(image, artwork, **how, device=device)
     assert alone.report()["steps"]["rulers"] == {"device": device.label, "seconds": {}, "unusable": {}}
     list_gpu(device, costs, monkeypatch)
+    choose = StepDevices.choose
+
+    sizes: dict[str, Any] = {}
+
+    def slow_choice(self: StepDevices, step: str, run: Any, *size: Any) -> Device:
+        time.sleep(0.3)
+        sizes[step] = size
+        return choose(self, step, run, *size)
+
+    monkeypatch.setattr(StepDevices, "choose", slow_choice)
+    begun = time.perf_counter()
     located = locate_board(image, artwork, **how)
+    spent = time.perf_counter() - begun
+    apart = located.seconds["choose device"]
+    assert apart > 0.6  # two steps
+    assert sizes["registration"][2:4] == (2e-3 / PIXEL, 0.09)  # the same range takes more time on small pixels
+    assert sizes["rulers"][2] == len(located.features.length)
+    assert sizes["rulers"][4] == np.sum(located.features.length) / PIXEL
+    assert sum(located.seconds.values()) <= spent
     assert located.device is device
     assert (located.reason, located.pose) == ("", alone.pose)
     chosen = {"registration": "gpu", "rulers": device.label}

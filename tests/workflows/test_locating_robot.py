@@ -166,6 +166,7 @@ def test_the_search_runs_on_its_fastest_device(
     assert located.device is gpu
     seconds = {"gpu": 1e-3, device.label: 2e-3}
     assert located.report()["steps"] == {"search": {"device": "gpu", "seconds": seconds, "unusable": {}}}
+    assert set(located.seconds) == {"map", "choose device", "search"}
 
 
 def replaced(scan: FloorScan, share: float, rng: np.random.Generator) -> FloorScan:

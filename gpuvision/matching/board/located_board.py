@@ -65,7 +65,7 @@ class LocatedBoard:
         Device of each step, and the measured times of the devices that it was chosen from, by name; see
         `StepDevices.report`.
     seconds
-        Duration of each step, by name [s].
+        Duration of each step, by name [s]. "choose device" is the time of `StepDevices.choose`, with its measurements.
     warnings
         What may be wrong although a pose was found: layers of the board that are missing, a wrong scale.
     """

@@ -43,7 +43,7 @@ class LocatedRobot:
     device
         Device of the search.
     seconds
-        Duration of each step, by name [s].
+        Duration of each step, by name [s]. "choose device" is the time of `StepDevices.choose`, with its measurements.
     steps
         Device of each step, and the measured times of the devices that it was chosen from, by name; see
         `StepDevices.report`.

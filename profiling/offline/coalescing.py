@@ -74,7 +74,8 @@ def trace(
     groups : iterable of int, optional
         Numbers of the work-groups to run. Default: all.
     group_size : int, optional
-        Work-items of a group along the first axis. Default: as the operation launches it.
+        Work-items of a group along the first axis. Default: as the operation launches it. The size is not
+        checked: a kernel with a fixed group size gives wrong results with another one.
     offset : int
         Elements between an aligned address and the first element of every input and output, default 0.
 
@@ -83,7 +84,10 @@ def trace(
     CompilerError
         The kernel does not compile.
     IndexError, ValueError
-        The kernel reads or writes beyond an array, or at an address that is not aligned to the access.
+        The kernel reads or writes beyond an array of global or local memory, or at an address that is not aligned to
+        the access, or not all work-items of a group reach a barrier.
+    NotImplementedError
+        The operation leaves the group size to the runtime, or the interpreter does not know an instruction.
     """
     launch = operation.launch(GpuModel(), inputs[0].shape, inputs[0].dtype)
     kernel = parse_kernel(_assembly(launch), launch.kernel)
@@ -112,7 +116,8 @@ def _run(
     groups: Iterable[int] | None,
     group_size: int | None,
 ) -> None:
-    assert launch.local_size is not None
+    if launch.local_size is None:
+        raise NotImplementedError(f"{launch.kernel} leaves the group size to the runtime")
     wide, high, deep, *_ = (group_size or launch.local_size[0], *launch.local_size[1:], 1, 1)
     columns, rows, layers, *_ = (*launch.global_size, 1, 1)
     x, y, z = -(-columns // wide), -(-rows // high), -(-layers // deep)

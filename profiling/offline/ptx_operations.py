@@ -121,9 +121,15 @@ def compute(words: tuple[str, ...], given: list[Values]) -> Values:
     Raises
     ------
     NotImplementedError
-        The interpreter does not know the opcode.
+        The interpreter does not know the opcode, or the instruction saturates (``.sat``).
+
+    Notes
+    -----
+    A fused multiply-add of floats is computed in double, one of doubles rounds the product and the sum.
     """
     name, a = words[0], given[0]
+    if "sat" in words:
+        raise NotImplementedError(f"PTX instruction {'.'.join(words)}")
     if name == "cvt":
         return convert(words, a)
     if name in ("shl", "shr"):

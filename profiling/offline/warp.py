@@ -3,6 +3,11 @@
 All work-items of a group run in step: the instruction with the smallest index among the next ones of all items runs for
 the items that are there. In code that a compiler wrote in the order of its blocks, the items of a warp that part at a
 branch meet again where its paths meet.
+
+The interpreter checks that each access lies within one array of global or local memory, its alignment, and that all
+work-items of the group reach the same barrier. The compiler joins the private arrays of a kernel to one block: an
+access beyond one of them that stays within the block is not found. Because the items run in step, neither a data race
+nor a missing barrier shows. The fused multiply-add of doubles rounds twice.
 """
 
 from __future__ import annotations
@@ -61,6 +66,46 @@ class Requests:
             self.least + other.least,
             self.nbytes + other.nbytes,
         )
+
+
+class Blocks:
+    """Local or private memory of a group: blocks with gaps between them.
+
+    Parameters
+    ----------
+    start : int
+        Address of the memory.
+    sizes : dict of str to int
+        Bytes of each block.
+    shape : tuple of int
+        Axes before the bytes: the number of work-items for private memory.
+    """
+
+    def __init__(self, start: int, sizes: dict[str, int], shape: tuple[int, ...] = ()) -> None:
+        self.start = start
+        self.places: dict[str, int] = {}
+        self._bounds: list[tuple[int, int]] = []
+        end = start
+        for name, nbytes in sizes.items():
+            self.places[name] = end
+            self._bounds.append((end, end + nbytes))
+            end = (-(-(end + nbytes) // _ALIGNED) + 1) * _ALIGNED
+        self.data: Values = np.zeros((*shape, end - start), np.uint8)
+
+    def check(self, addresses: Values, size: int) -> None:
+        """Check that each access lies within one block.
+
+        Raises
+        ------
+        IndexError
+            A block ends before `size` bytes at one of the addresses.
+        """
+        inside = np.zeros(addresses.size, bool)
+        for begin, end in self._bounds:
+            inside |= (addresses >= begin) & (addresses + size <= end)
+        if not inside.all():
+            wrong = int(addresses[~inside][0]) - self.start
+            raise IndexError(f"access of {size} bytes at {wrong}, beyond the arrays {sorted(self.places)}")
 
 
 class Memory:
@@ -145,16 +190,9 @@ class Group:
                 f"%{name}.{axis}": np.full(x.size, each) for axis, each in zip(axes, numbers, strict=True)
             }
         self._registers: dict[str, Values] = {}
-        self._places: dict[str, int] = {}
-        used = stack = 0
-        for name, nbytes in kernel.shared.items():
-            self._places[name] = _SHARED + used
-            used += -(-nbytes // 16) * 16
-        self._shared: Values = np.zeros(used, np.uint8)
-        for name, nbytes in kernel.stack.items():
-            self._places[name] = _STACK + stack
-            stack += -(-nbytes // 16) * 16
-        self._stack: Values = np.zeros((x.size, stack), np.uint8)
+        self._shared = Blocks(_SHARED, kernel.shared)
+        self._stack = Blocks(_STACK, kernel.stack, (x.size,))
+        self._places = self._shared.places | self._stack.places
 
     def run(self) -> None:
         """Run all work-items to their end.
@@ -162,7 +200,8 @@ class Group:
         Raises
         ------
         IndexError, ValueError
-            An access beyond the arrays, or at an address that is not aligned to its size: a GPU stops there.
+            An access beyond the arrays, or at an address that is not aligned to its size: a GPU stops there. Or a
+            barrier that not all work-items reach.
         NotImplementedError
             The interpreter does not know an instruction.
         """
@@ -174,6 +213,8 @@ class Group:
             if not ready.any():
                 if not waits.any():
                     return
+                if not waits.all() or np.unique(at).size > 1:
+                    raise ValueError(f"{self._kernel.name}: {int(waits.sum())} of {at.size} work-items reach a barrier")
                 waits[:] = False
                 continue
             index = int(at[ready].min())
@@ -283,7 +324,10 @@ class Group:
         names = re.findall(r"[%\w]+", step.operands[0])
         dtype = DTYPES[step.opcode[-1]]
         if step.opcode[1] == "param":
-            value, _ = self._arguments[step.operands[1].strip("[]").partition("+")[0]]
+            name, offset, _ = step.operands[1].strip("[]").partition("+")
+            if offset:
+                raise NotImplementedError(f"PTX instruction {'.'.join(step.opcode)} of a part of a parameter")
+            value, _ = self._arguments[name]
             self._assign(names[0], items, np.full(items.size, np.array(value).astype(dtype)))
             return
         size = dtype.itemsize * len(names)
@@ -304,10 +348,12 @@ class Group:
             raise ValueError(f"{'.'.join(step.opcode)}: address not aligned to {size} bytes")
         every = np.arange(size)
         if int(addresses[0]) >= _STACK:
+            self._stack.check(addresses, size)
             place: Any = (items[:, None], addresses[:, None] - _STACK + every)
-            memory: Values = self._stack
+            memory: Values = self._stack.data
         elif int(addresses[0]) >= _SHARED:
-            place, memory = addresses[:, None] - _SHARED + every, self._shared
+            self._shared.check(addresses, size)
+            place, memory = addresses[:, None] - _SHARED + every, self._shared.data
         else:
             name, start, memory = self._memory.find(int(addresses.min()), size)
             if int(addresses.max()) + size > start + memory.size:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,27 @@ kernel void turned(global const int *from, global int *to) {
     kept[i] = sum;
     barrier(CLK_LOCAL_MEM_FENCE);
     to[i] = kept[63 - i];
+}
+kernel void parted(global const int *from, global int *to, int count) {
+    local int kept[64];
+    const int i = get_local_id(0);
+    kept[i] = from[i];
+    if (i < count) barrier(CLK_LOCAL_MEM_FENCE);
+    to[i] = kept[63 - i];
+}
+kernel void beyond(global const int *from, global int *to, int shift) {
+    local int first[64], second[64];
+    const int i = get_local_id(0);
+    first[i] = from[i];
+    second[63 - i] = from[i];
+    barrier(CLK_LOCAL_MEM_FENCE);
+    to[i] = first[i + shift] - second[63 - i];
+}
+kernel void kept_alone(global const int *from, global int *to, int shift) {
+    int kept[8];
+    const int i = get_local_id(0);
+    for (int k = 0; k < 8; k++) kept[(k + i) & 7] = from[k];
+    to[i] = kept[(i & 7) + shift];
 }
 """
 
@@ -91,6 +113,36 @@ def test_access_that_stops_a_gpu_raises() -> None:
         interpreted("pairs", source, target[:-2])
 
 
+@needs_compilers
+@pytest.mark.parametrize(("kernel", "shift"), [("beyond", 1), ("beyond", -1), ("kept_alone", 1), ("kept_alone", -1)])
+def test_access_beyond_an_array_of_local_or_private_memory_raises(kernel: str, shift: int) -> None:
+    source, target = np.arange(64, dtype=np.int32), np.ones(64, np.int32)
+    interpreted(kernel, source, target, 0)
+    np.testing.assert_array_equal(target, 0 * source)
+    with pytest.raises(IndexError, match=r"access of 4 bytes at -?\d+, beyond the arrays"):
+        interpreted(kernel, source, target, shift)
+
+
+@needs_compilers
+@pytest.mark.parametrize("count", [1, 32, 63])
+def test_barrier_that_not_all_items_reach_raises(count: int) -> None:
+    source, target = np.arange(64, dtype=np.int32), np.zeros(64, np.int32)
+    interpreted("parted", source, target, 64)
+    np.testing.assert_array_equal(target, source[::-1])
+    with pytest.raises(ValueError, match=f"{count} of 64 work-items reach a barrier"):
+        interpreted("parted", source, target, count)
+
+
+@needs_compilers
+def test_part_of_a_parameter_is_not_known() -> None:
+    text = compile_assembly(PROGRAM, [], TARGETS["sm_90"])
+    kernel = parse_kernel(text.replace("strided_param_2]", "strided_param_2+4]"), "strided")
+    memory, array = Memory(), np.zeros(64, np.float32)
+    arguments = [memory.add("from", array), memory.add("to", array.copy()), 1, 64]
+    with pytest.raises(NotImplementedError, match="part of a parameter"):
+        Group(kernel, memory, arguments, group=(0, 0, 0), groups=(1, 1, 1), size=(64, 1, 1)).run()
+
+
 def test_arithmetic_of_ptx() -> None:
     a, b = np.array([-7, 7, -7, 1 << 30], np.int32), np.array([2, -2, -2, 4], np.int32)
     assert compute(("div", "s32"), [a, b]).tolist() == [-3, -3, 3, 1 << 28]
@@ -106,6 +158,8 @@ def test_arithmetic_of_ptx() -> None:
     assert compute(("setp", "ge", "f32"), [x, np.float32(2) + np.zeros_like(x)]).tolist() == [False, True, False, True]
     with pytest.raises(NotImplementedError, match="PTX instruction tanh"):
         compute(("tanh", "approx", "f32"), [x])
+    with pytest.raises(NotImplementedError, match=r"PTX instruction add\.sat\.f32"):
+        compute(("add", "sat", "f32"), [x, x])
 
 
 RNG = np.random.default_rng(3)
@@ -140,36 +194,64 @@ _PLANE = gv.Triangulation(homography=_TO_SHEET, region=_REGION, sigma=(0.1, 0.1)
 _U, _V = (RNG.uniform(0.0, 500.0, _POINTS).astype(np.float32) for _ in range(2))
 _XY = RNG.uniform(10.0, 200.0, (_POINTS, 2)).astype(np.float32)
 _ROW = _frames(np.uint8, along="rows", samples=16, length=1024)
-# Name, operation, inputs, largest coalescing factor of the loads and of the stores.
-STREAMS: list[tuple[str, Any, list[NDArray[Any]], float, float]] = [
-    ("psd", gv.PsdReadout(strip_length=6e-3), [_currents(np.float32)], 1.0, 1.0),
-    ("psd codes", gv.PsdReadout(strip_length=6e-3), [_currents(np.uint16)], 1.0, 1.0),
-    ("psd double", gv.PsdReadout(strip_length=6e-3), [_currents(np.float64)], 1.0, 1.0),
-    ("psd planar", gv.PsdReadout(strip_length=6e-3, layout="planar"), [_currents(np.uint16, planar=True)], 1.0, 1.0),
-    ("triangulation", _PLANE, [_U, _V], 1.0, 1.0),
-    ("points", gv.UndistortPoints(model=_CAMERA), [_XY], 1.0, 1.0),
-    ("line, columns", gv.LineReadout(threshold=20), [_frames(np.uint8)], 1.87, 1.0),
-    ("line, columns, codes", gv.LineReadout(threshold=20), [_frames(np.uint16)], 1.41, 1.0),
-    ("line, columns, float", gv.LineReadout(threshold=20), [_frames(np.float32)], 1.22, 1.0),
-    ("line, columns, ambiguity", gv.LineReadout(threshold=20, ambiguity=0.5), [_frames(np.uint8)], 1.46, 1.0),
-    ("centroid, columns", gv.LineReadout(method="centroid", threshold=20), [_frames(np.uint8)], 1.0, 1.0),
-    ("line, rows", gv.LineReadout(threshold=20, along="rows"), [_ROW], 1.75, 1.0),
-    ("centroid, rows", gv.LineReadout(method="centroid", threshold=20, along="rows"), [_ROW], 1.06, 1.0),
-    ("image", gv.UndistortImage(model=_CAMERA), [_image(np.uint8)], 1.65, 1.0),
-    ("image, colour", gv.UndistortImage(model=_CAMERA, channels=3), [_image(np.uint8, 3)], 3.4, 2.5),
-    ("image, computed", gv.UndistortImage(model=_CAMERA, coordinates="computed"), [_image(np.uint8)], 1.65, 1.0),
+# Name, operation, inputs, coalescing factor of the loads and of the stores, requests, sectors.
+STREAMS: list[tuple[str, Any, list[NDArray[Any]], float, float, int, int]] = [
+    ("psd", gv.PsdReadout(strip_length=6e-3), [_currents(np.float32)], 1.0, 1.0, 128, 544),
+    ("psd codes", gv.PsdReadout(strip_length=6e-3), [_currents(np.uint16)], 1.0, 1.0, 128, 416),
+    ("psd double", gv.PsdReadout(strip_length=6e-3), [_currents(np.float64)], 1.0, 1.0, 128, 1056),
+    (
+        "psd planar",
+        gv.PsdReadout(strip_length=6e-3, layout="planar"),
+        [_currents(np.uint16, planar=True)],
+        1.0,
+        1.0,
+        160,
+        416,
+    ),
+    ("triangulation", _PLANE, [_U, _V], 1.0, 1.0, 224, 800),
+    ("points", gv.UndistortPoints(model=_CAMERA), [_XY], 1.0, 1.0, 96, 544),
+    ("line, columns", gv.LineReadout(threshold=20), [_frames(np.uint8)], 1.86, 1.0, 194, 1089),
+    ("line, columns, codes", gv.LineReadout(threshold=20), [_frames(np.uint16)], 1.41, 1.0, 324, 1631),
+    ("line, columns, float", gv.LineReadout(threshold=20), [_frames(np.float32)], 1.22, 1.0, 579, 2791),
+    (
+        "line, columns, ambiguity",
+        gv.LineReadout(threshold=20, ambiguity=0.5),
+        [_frames(np.uint8)],
+        1.45,
+        1.0,
+        323,
+        1606,
+    ),
+    ("centroid, columns", gv.LineReadout(method="centroid", threshold=20), [_frames(np.uint8)], 1.0, 1.0, 142, 550),
+    ("line, rows", gv.LineReadout(threshold=20, along="rows"), [_ROW], 1.75, 1.0, 161, 952),
+    ("centroid, rows", gv.LineReadout(method="centroid", threshold=20, along="rows"), [_ROW], 1.06, 1.0, 135, 553),
+    ("image", gv.UndistortImage(model=_CAMERA), [_image(np.uint8)], 1.31, 1.0, 704, 3520),
+    ("image, colour", gv.UndistortImage(model=_CAMERA, channels=3), [_image(np.uint8, 3)], 3.21, 2.5, 4865, 14900),
+    (
+        "image, computed",
+        gv.UndistortImage(model=_CAMERA, coordinates="computed"),
+        [_image(np.uint8)],
+        1.12,
+        1.0,
+        512,
+        2231,
+    ),
 ]
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "kernel_variants.md"
 
 
 @needs_compilers
 @pytest.mark.parametrize(
-    ("operation", "inputs", "loads", "stores"), [each[1:] for each in STREAMS], ids=[each[0] for each in STREAMS]
+    ("operation", "inputs", "loads", "stores", "requests", "sectors"),
+    [each[1:] for each in STREAMS],
+    ids=[each[0] for each in STREAMS],
 )
-def test_streams_are_coalesced(operation: Any, inputs: list[NDArray[Any]], loads: float, stores: float) -> None:
+def test_streams_are_coalesced(
+    operation: Any, inputs: list[NDArray[Any]], loads: float, stores: float, requests: int, sectors: int
+) -> None:
     traced: Trace = trace(operation, inputs)
-    assert traced.of("load").factor <= loads
-    assert traced.of("store").factor <= stores
-    assert traced.of("load").count > 0
+    factors = [round(traced.of(kind).factor, 2) for kind in ("load", "store")]
+    assert (*factors, traced.total.count, traced.total.sectors) == (loads, stores, requests, sectors)
     for field, value in traced.outputs.items():
         expected = getattr(operation(*inputs), field)
         if value.dtype.kind == "f":
@@ -177,6 +259,14 @@ def test_streams_are_coalesced(operation: Any, inputs: list[NDArray[Any]], loads
             np.testing.assert_allclose(value, expected, rtol=4e-6, atol=4e-6 * np.nanmax(np.abs(expected)))
         else:
             np.testing.assert_array_equal(value, expected)
+
+
+def test_numbers_of_the_page() -> None:
+    rows = [[cell.strip() for cell in line.strip("| ").split("|")] for line in PAGE.read_text().splitlines()]
+    begin = next(number for number, row in enumerate(rows) if row[0] == "kernel" and "requests, before" in row) + 2
+    now = [(row[0], row[3], row[5], row[7], row[9]) for row in rows[begin : begin + len(STREAMS)]]
+    assert now == [(each[0], f"{each[3]:.2f}", f"{each[4]:.2f}", str(each[5]), str(each[6])) for each in STREAMS]
+    assert len(rows[begin + len(STREAMS)]) == 1
 
 
 @needs_compilers

@@ -75,8 +75,8 @@ def _measured_ratio(handle: Any) -> float:
     """
     launches = [_timed_launch(handle, real) for real in (np.float64, np.float32)]
     times = [[launch() for launch in launches] for _ in range(1 + _LAUNCHES)]
-    double, single = (min(each) for each in zip(*times[1:], strict=True))
-    return double / single
+    double, single = np.min(times[1:], axis=0)
+    return float(double / single)
 
 
 def _timed_launch(handle: Any, real: type[np.floating[Any]]) -> Callable[[], float]:

@@ -66,7 +66,7 @@ def test_range_table_has_the_limits_and_the_fields_of_the_geometry() -> None:
     [
         ("board_pose/board_edge.h", "BoardRuler", board_pose.RULER),
         ("board_pose/board_line.h", "BoardLine", board_pose.LINE),
-        ("pose/pose.cl", "PoseRow", (*pose.ROW, "etch_factor")),
+        ("pose/pose_input.h", "PoseRow", (*pose.ROW, "etch_factor")),
         ("feature_pose/feature_view.h", "FeatureRuler", feature_pose.RULER_FEATURE),
         ("feature_pose/feature_view.h", "FeatureFiducial", feature_pose.FIDUCIAL_FEATURE),
         ("feature_pose/feature_view.h", "FeatureView", feature_pose.VIEW),

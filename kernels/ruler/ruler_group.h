@@ -30,6 +30,10 @@ typedef struct {
 #endif
     int flags[RULERS_PER_GROUP];
     int strength[RULERS_PER_GROUP], at[RULERS_PER_GROUP], rival[RULERS_PER_GROUP]; // of the chosen candidate
+#ifdef CHOOSE_STRONGEST
+    real best[RULER_GROUP], second[RULER_GROUP]; // strengths among the samples of each item
+    int best_at[RULER_GROUP];
+#endif
 } ruler_memory;
 
 // Ruler of this item in its group, and number of the item among the items of the ruler.
@@ -215,13 +219,20 @@ static inline void ruler_choose(private const ruler_place *place, constant real 
 #elif defined(CHOOSE_LAST)
     atomic_max(shared->at + ruler, at);
 #else
-    // The strongest edge, of equal ones the first.
+    // The strongest edge, of equal ones the first. PoCL 3.1 loses private values at a barrier if the caller measures in
+    // a loop (blob): each item keeps its choice in local memory.
+    const int item = (int)get_local_id(0);
+    shared->best[item] = best;
+    shared->second[item] = second;
+    shared->best_at[item] = at;
     if (at) atomic_max(shared->strength + ruler, as_int(best));
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (at && as_int(best) == shared->strength[ruler]) atomic_min(shared->at + ruler, at);
+    if (shared->best_at[item] && as_int(shared->best[item]) == shared->strength[ruler])
+        atomic_min(shared->at + ruler, shared->best_at[item]);
 #ifdef AMBIGUITY
     barrier(CLK_LOCAL_MEM_FENCE);
-    atomic_max(shared->rival + ruler, as_int(at == shared->at[ruler] ? second : best));
+    const real rival = shared->best_at[item] == shared->at[ruler] ? shared->second[item] : shared->best[item];
+    atomic_max(shared->rival + ruler, as_int(rival));
 #endif
 #endif
     barrier(CLK_LOCAL_MEM_FENCE);

@@ -64,15 +64,6 @@ FAULTS = (
     DriverFault(
         "rusticl",
         "22.3",
-        r"test_field_pose\.py::test_(kidnapped_robots_are_found|a_robot_outside_the_field|a_compass_tells_twins_apart|"
-        r"points_twice_are_the_same_pose|a_mirrored_view_is_a_mirrored_pose|a_wrong_scale_shows_in_the_scatter|"
-        r"poses_are_of_least_cost|every_field_of_a_pose_is|views_that_fix_a_part_only|poses_that_are_none)",
-        "Mesa 22.3 returns poses of zero from the refinement of a field pose in work-groups; cause unknown; with "
-        "PoCL the work-item and the vector variant agree",
-    ),
-    DriverFault(
-        "rusticl",
-        "22.3",
         r"test_feature_pose\.py::test_(pose_is|errors_are_as|a_region_of|a_mirrored_side|search_distance|results_must|"
         r"a_blob_of|one_kind_of)_",
         "Mesa 22.3 finds no pose from rulers and blobs in an image: NaN, AMBIGUOUS or NO_DATA; passes with Mesa 25.0.7",

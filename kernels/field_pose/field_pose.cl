@@ -76,14 +76,8 @@ kernel void field_pose_search(global const float *restrict points, global float 
 //          of the points within c of a line; status (starts,).
 // Options: MIN_EIGENVALUE_RATIO: least ratio of eigenvalues of a determined pose; PRIOR_POINTS: see the covariance.
 //
-// Variants: vector: a work-item per start, one point after the other; work-item: a group of up to 64 items per start,
-//          the points divided over the items. The results do not depend on the size of the group (common/group.h).
-#ifndef VECTOR_VARIANT
-#define GROUP_PER_PROBLEM
-#endif
+// One work-item refines one start.
 #include "field_pose/field_refinement.h"
-
-#define ROOM_FOR_SUMS ROOM_FOR(sizeof(field_scatter) / sizeof(float))
 
 kernel void field_pose_refinement(global const float *restrict points, global const float *restrict starts,
                                   global float *restrict poses, global float *restrict covariance,
@@ -93,26 +87,26 @@ kernel void field_pose_refinement(global const float *restrict points, global co
                                   global const uchar *restrict nearest, const int count, const int rows,
                                   const int columns, const float first_x, const float first_y, const float cell,
                                   const float scale_squared, const float max_range_squared, const int steps) {
-#ifdef IN_GROUP
-    const size_t i = get_group_id(0);
-    local float sums[ROOM_FOR_SUMS];
-#else
     const size_t i = get_global_id(0);
-    private float *sums = 0;
-#endif
     const field_grid grid = {first_x, first_y, 1.0f / cell, rows, columns};
-    const field_view view = {points, count, max_range_squared, scale_squared, shapes, nearest, grid, sums};
     float3 pose = (float3)(starts[3 * i], starts[3 * i + 1], starts[3 * i + 2]);
-    const field_range range = range_of(view);
-    const float used = range.used;
+    float sum_squares = 0, used = 0;
+    for (int k = 0; k < count; k++) {
+        const float2 point = (float2)(points[2 * k], points[2 * k + 1]);
+        if (!point_counts(point, max_range_squared)) continue;
+        sum_squares += point.x * point.x + point.y * point.y;
+        used += 1;
+    }
     const int finite = fabs(pose.x) + fabs(pose.y) + fabs(pose.z) < 1e6f;
-    const float lever = 1.0f / sqrt(range.squares / fmax(used, 1.0f) + 1e-12f);
-    normal_equations here = equations_at(view, pose);
+    const float lever = 1.0f / sqrt(sum_squares / fmax(used, 1.0f) + 1e-12f);
+    normal_equations here = {0};
+    if (finite) here = equations_at(points, count, pose, shapes, nearest, grid, scale_squared, max_range_squared);
     float damping = 1e-4f;
     for (int step = 0; finite && step < steps && damping < 1e6f; step++) {
         const float3 by = damped_step(here, damping, lever);
         const float3 next = pose + by;
-        const normal_equations there = equations_at(view, next);
+        const normal_equations there =
+            equations_at(points, count, next, shapes, nearest, grid, scale_squared, max_range_squared);
         // Accept a cost that is equal within the rounding of the sum: near the minimum the step is more accurate than
         // the difference of costs.
         const int better = there.cost <= here.cost * 1.000004f;
@@ -121,11 +115,38 @@ kernel void field_pose_refinement(global const float *restrict points, global co
         here = better ? there : here;
         if (fabs(by.x) + fabs(by.y) + fabs(by.z) / lever < 3e-6f) break;
     }
-    const field_scatter found = scatter_at(view, pose, lever);
-    if (GROUP_ITEM) return;
-    const normal_equations hessian = found.hessian;
-    normal_equations scatter = found.scatter;
-    const float sum_curvature = found.curvature, sum_psi_squared = found.psi_squared, inliers = found.inliers;
+    // Covariance of an M-estimator for residuals of unequal variance (Huber, 1981, section 6.3): H^-1 S H^-1 with
+    // H = sum psi'(r) h h^T, S = sum psi(r)^2 h h^T, psi(r) = r share^2 and psi'(r) = share^2 (4 share - 3), clipped at
+    // 0. Points near ends and crossings of lines, and far points on oblique lines, err more than others, and have more
+    // weight in the heading. For equal variances S is variance H, with variance = sum psi^2 / (sum psi' - 3); as many
+    // points as PRIOR_POINTS are taken to have it, so that few points do not give too small a covariance by chance.
+    // The heading is scaled by lever.
+    const float2 turn = (float2)(cos(pose.z), sin(pose.z));
+    normal_equations hessian = {0}, scatter = {0};
+    float sum_curvature = 0, sum_psi_squared = 0, inliers = 0;
+    for (int k = 0; finite && k < count; k++) {
+        const float2 point = (float2)(points[2 * k], points[2 * k + 1]);
+        if (!point_counts(point, max_range_squared)) continue;
+        const field_row at = row_of(point, pose, turn, shapes, nearest, grid);
+        const float part = scale_squared / (scale_squared + at.r * at.r), weight = part * part;
+        const float curvature = fmax(weight * (4.0f * part - 3.0f), 0.0f);
+        sum_curvature += curvature;
+        sum_psi_squared += weight * weight * at.r * at.r;
+        inliers += at.r * at.r < scale_squared;
+        hessian.xx += curvature * at.x * at.x;
+        hessian.xy += curvature * at.x * at.y;
+        hessian.yy += curvature * at.y * at.y;
+        hessian.xt += curvature * at.x * at.t * lever;
+        hessian.yt += curvature * at.y * at.t * lever;
+        hessian.tt += curvature * at.t * at.t * lever * lever;
+        const float square = weight * weight * at.r * at.r;
+        scatter.xx += square * at.x * at.x;
+        scatter.xy += square * at.x * at.y;
+        scatter.yy += square * at.y * at.y;
+        scatter.xt += square * at.x * at.t * lever;
+        scatter.yt += square * at.y * at.t * lever;
+        scatter.tt += square * at.t * at.t * lever * lever;
+    }
     normal_equations inverse = cofactors(hessian);
     const float determinant = hessian.xx * inverse.xx + hessian.xy * inverse.xy + hessian.xt * inverse.xt;
     const float minors = inverse.xx + inverse.yy + inverse.tt, all = hessian.xx + hessian.yy + hessian.tt;

@@ -3,7 +3,6 @@
 #ifndef FIELD_REFINEMENT_H
 #define FIELD_REFINEMENT_H
 
-#include "common/group.h"
 #include "distance_map/field.h"
 #include "common/status.h"
 
@@ -47,134 +46,33 @@ static inline int point_counts(float2 point, float max_range_squared) {
     return point.x * point.x + point.y * point.y <= max_range_squared;
 }
 
-// Points of a view, and the field to which they are compared; `sums`: room of a group (common/group.h), else null.
-typedef struct {
-    global const float *points;
-    int count;
-    float max_range_squared, scale_squared;
-    constant float *shapes;
-    global const uchar *nearest;
-    field_grid grid;
-    GROUP_SPACE float *sums;
-} field_view;
-
-// Replace the partial sums of the items of a group by the totals. A work-item that solves a problem alone has the
-// totals.
-#ifdef IN_GROUP
-#define NUMBERS(of) (int)(sizeof(*(of)) / sizeof(float))
-#define put_numbers(of, part, view) group_put((private const float *)(of), NUMBERS(of), part, (view).sums)
-#define total_numbers(of, view) group_numbers((private float *)(of), NUMBERS(of), (view).sums)
-INLINE void group_numbers(private float *numbers, int count, local float *sums) {
-    local const float *totals = group_total(0, count, sums);
-    for (int k = 0; k < count; k++) numbers[k] = totals[k];
-}
-#else
-#define put_numbers(of, part, view)
-#define total_numbers(of, view)
-#endif
-
-// Number of points within the largest range, and the sum of their squared distances [m2].
-typedef struct {
-    float used, squares;
-} field_range;
-
-INLINE field_range range_of(field_view view) {
-    field_range range;
-    EACH_PART(part) {
-        range = (field_range){0, 0};
-        for (int k = part; k < view.count; k += PARTS) {
-            const float2 point = (float2)(view.points[2 * k], view.points[2 * k + 1]);
-            if (!point_counts(point, view.max_range_squared)) continue;
-            range.squares += point.x * point.x + point.y * point.y;
-            range.used += 1;
-        }
-        put_numbers(&range, part, view);
-    }
-    total_numbers(&range, view);
-    return range;
-}
-
 // Sum cost and normal equations at a pose.
 //
 // With share = c^2 / (c^2 + r^2) the cost of a point is 1 - share, and its derivative by r is 2 r share^2 / c^2: the
 // weight of iteratively reweighted least squares is share^2. The factor 2 / c^2 is omitted: it does not change the
 // step.
-INLINE normal_equations equations_at(field_view view, float3 pose) {
+static inline normal_equations equations_at(global const float *points, int count, float3 pose, constant float *shapes,
+                                            global const uchar *nearest, field_grid grid, float scale_squared,
+                                            float max_range_squared) {
     const float2 turn = (float2)(cos(pose.z), sin(pose.z));
-    const float scale_squared = view.scale_squared;
-    normal_equations total;
-    EACH_PART(part) {
-        normal_equations sum = {0};
-        for (int i = part; i < view.count; i += PARTS) {
-            const float2 point = (float2)(view.points[2 * i], view.points[2 * i + 1]);
-            if (!point_counts(point, view.max_range_squared)) continue;
-            const field_row at = row_of(point, pose, turn, view.shapes, view.nearest, view.grid);
-            const float share = scale_squared / (scale_squared + at.r * at.r), weight = share * share;
-            const float psi = weight * at.r;
-            sum.cost += 1.0f - share;
-            sum.xx += weight * at.x * at.x;
-            sum.xy += weight * at.x * at.y;
-            sum.yy += weight * at.y * at.y;
-            sum.xt += weight * at.x * at.t;
-            sum.yt += weight * at.y * at.t;
-            sum.tt += weight * at.t * at.t;
-            sum.x += psi * at.x;
-            sum.y += psi * at.y;
-            sum.t += psi * at.t;
-        }
-        put_numbers(&sum, part, view);
-        total = sum;
+    normal_equations sum = {0};
+    for (int i = 0; i < count; i++) {
+        const float2 point = (float2)(points[2 * i], points[2 * i + 1]);
+        if (!point_counts(point, max_range_squared)) continue;
+        const field_row at = row_of(point, pose, turn, shapes, nearest, grid);
+        const float share = scale_squared / (scale_squared + at.r * at.r), weight = share * share, psi = weight * at.r;
+        sum.cost += 1.0f - share;
+        sum.xx += weight * at.x * at.x;
+        sum.xy += weight * at.x * at.y;
+        sum.yy += weight * at.y * at.y;
+        sum.xt += weight * at.x * at.t;
+        sum.yt += weight * at.y * at.t;
+        sum.tt += weight * at.t * at.t;
+        sum.x += psi * at.x;
+        sum.y += psi * at.y;
+        sum.t += psi * at.t;
     }
-    total_numbers(&total, view);
-    return total;
-}
-
-// Sums of the covariance: H and S below in the fields of matrices, and sums of psi'(r), psi(r)^2 and inliers.
-typedef struct {
-    normal_equations hessian, scatter;
-    float curvature, psi_squared, inliers;
-} field_scatter;
-
-// Covariance of an M-estimator for residuals of unequal variance (Huber, 1981, section 6.3): H^-1 S H^-1 with
-// H = sum psi'(r) h h^T, S = sum psi(r)^2 h h^T, psi(r) = r share^2 and psi'(r) = share^2 (4 share - 3), clipped at
-// 0. Points near ends and crossings of lines, and far points on oblique lines, err more than others, and have more
-// weight in the heading. For equal variances S is variance H, with variance = sum psi^2 / (sum psi' - 3); as many
-// points as PRIOR_POINTS are taken to have it, so that few points do not give too small a covariance by chance.
-// The heading is scaled by lever.
-INLINE field_scatter scatter_at(field_view view, float3 pose, float lever) {
-    const float2 turn = (float2)(cos(pose.z), sin(pose.z));
-    const float scale_squared = view.scale_squared;
-    field_scatter total;
-    EACH_PART(part) {
-        field_scatter sum = {{0}, {0}, 0, 0, 0};
-        for (int k = part; k < view.count; k += PARTS) {
-            const float2 point = (float2)(view.points[2 * k], view.points[2 * k + 1]);
-            if (!point_counts(point, view.max_range_squared)) continue;
-            const field_row at = row_of(point, pose, turn, view.shapes, view.nearest, view.grid);
-            const float part = scale_squared / (scale_squared + at.r * at.r), weight = part * part;
-            const float curvature = fmax(weight * (4.0f * part - 3.0f), 0.0f);
-            sum.curvature += curvature;
-            sum.psi_squared += weight * weight * at.r * at.r;
-            sum.inliers += at.r * at.r < scale_squared;
-            sum.hessian.xx += curvature * at.x * at.x;
-            sum.hessian.xy += curvature * at.x * at.y;
-            sum.hessian.yy += curvature * at.y * at.y;
-            sum.hessian.xt += curvature * at.x * at.t * lever;
-            sum.hessian.yt += curvature * at.y * at.t * lever;
-            sum.hessian.tt += curvature * at.t * at.t * lever * lever;
-            const float square = weight * weight * at.r * at.r;
-            sum.scatter.xx += square * at.x * at.x;
-            sum.scatter.xy += square * at.x * at.y;
-            sum.scatter.yy += square * at.y * at.y;
-            sum.scatter.xt += square * at.x * at.t * lever;
-            sum.scatter.yt += square * at.y * at.t * lever;
-            sum.scatter.tt += square * at.t * at.t * lever * lever;
-        }
-        put_numbers(&sum, part, view);
-        total = sum;
-    }
-    total_numbers(&total, view);
-    return total;
+    return sum;
 }
 
 // Return the cofactors of the symmetric matrix (xx, xy, yy, xt, yt, tt), in the same fields.

@@ -43,7 +43,6 @@ from gpuvision.status import Status
 from gpuvision.validation import finite
 
 _BLOCK, _MOST_POINTS = 64, 4096
-_GROUP = 64  # up to PARTS of common/group.h
 # The kernel reads cosine and sine of the headings from constant memory, of which OpenCL guarantees 64 KiB.
 _MOST_HEADINGS = (64 << 10) // (2 * 4)
 MIN_SHIFTS = 1024
@@ -275,9 +274,6 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
         Largest number of Levenberg-Marquardt steps, 1 or more, default 40.
     count : int, optional
         Number of starts. None takes the number from a call; `bind` needs a number.
-    variant : {"auto", "vector", "work_item"}
-        Kernel variant: "vector" refines one start per work-item (CPU runtimes), "work_item" one start per work-group
-        (GPUs).
 
     Raises
     ------
@@ -300,7 +296,6 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
     map: DistanceMap
     max_iterations: int = 40
     count: int | None = None
-    variant: Variant = "auto"
 
     def __post_init__(self) -> None:
         if not isinstance(self.map, DistanceMap):
@@ -316,7 +311,7 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        build = LaunchBuilder(self, device, shape, dtype, variant=self.variant)
+        build = LaunchBuilder(self, device, shape, dtype)
         points = _checked_points(build)
         if self.count is None:
             raise ValueError(
@@ -327,7 +322,7 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
         return build.launch(
             "field_pose/field_pose.cl",
             "field_pose_refinement",
-            work=build.work(self.count, each=1, group=_GROUP, grouping="per_element"),
+            work=WorkSize(starts, (1,)),
             more_inputs=[((self.count, 3), build.real)],
             outputs=build.outputs(
                 shapes | dict.fromkeys(("score", "residual_std", "inlier_fraction", "status"), starts)

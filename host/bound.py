@@ -17,7 +17,7 @@ from gpuvision.host.constant_memory import fitting_defines
 from gpuvision.host.device import Device
 from gpuvision.host.failure import launch_failure
 from gpuvision.host.launch import Launch, Launchable, Spec, describe_launch
-from gpuvision.host.limits import fit_group
+from gpuvision.host.limits import fit_work
 from gpuvision.host.process import after_fork, check_process
 from gpuvision.host.program import build
 
@@ -69,7 +69,7 @@ class Bound(Generic[R]):
         self._launch = launch
         self._computed_specs = {name: spec for name, spec in launch.outputs.items() if spec is not None}
         self._input_specs = launch.inputs
-        self._global, self._local = launch.global_size, launch.local_size  # `fit_group` may halve the groups
+        self._global, self._local = launch.global_size, launch.local_size  # `fit_work` may halve the groups
         # `Device.wait` with its branch on the runtime resolved here: a short call takes only a few microseconds in
         # total.
         self._wait: Callable[[Any], object] = device.wait if device.kind == "pocl" else cl.Event.wait
@@ -346,7 +346,7 @@ class Bound(Generic[R]):
         )
         kernel = cl.Kernel(program, launch.kernel)
         name = type(operation).__name__
-        self._local = fit_group(kernel, queue.device, launch.local_size, name=name, label=self.device.label)
+        self._global, self._local = fit_work(kernel, queue.device, launch, name=name, label=self.device.label)
         after_inputs = len(launch.inputs)
         after_outputs = after_inputs + len(launch.outputs)
         for place, spec in enumerate(launch.outputs.values(), after_inputs):

@@ -147,7 +147,7 @@ class StepDevices:
 
     @property
     def first(self) -> Device:
-        """Given device, or the best one."""
+        """Given device of all steps. Without a given device: the best one."""
         return self._candidates[0]
 
     def choose(self, step: str, run: Callable[[Device], object], *size: object) -> Device:

@@ -47,6 +47,10 @@ class Launch:
     passes_once : bool
         Whether the kernel does little more than read and write its memory once. Small launches of such kernels run in
         the calling thread, because waking a worker thread takes longer than the work. Default False.
+    problem_per_group : bool
+        Whether each work-group of the work-item variant solves one problem, with results that do not depend on the
+        size of the group. A device without registers for the groups then runs the same number of smaller groups.
+        Default False.
     """
 
     source: str
@@ -58,6 +62,7 @@ class Launch:
     defines: Mapping[str, Define] = field(default_factory=dict)
     arguments: Sequence[Any] = ()
     passes_once: bool = False
+    problem_per_group: bool = False
 
     @property
     def groups(self) -> int:

@@ -219,13 +219,14 @@ class LaunchBuilder:
         defines: Mapping[str, Define] | None = None,
         arguments: Sequence[Any] = (),
         passes_once: bool = False,
+        problem_per_group: bool = False,
         streams: bool = False,
     ) -> Launch:
         """Return the launch; add the macros of the real type and of the kernel variant.
 
         Parameters
         ----------
-        source, kernel, outputs, arguments, passes_once
+        source, kernel, outputs, arguments, passes_once, problem_per_group
             As in `Launch`.
         work : WorkSize
         more_inputs : sequence of (shape, dtype)
@@ -255,6 +256,7 @@ class LaunchBuilder:
             defines={**real_defines(self.device, self.real), **variant, **(defines or {})},
             arguments=arguments,
             passes_once=passes_once,
+            problem_per_group=problem_per_group,
         )
 
 

@@ -325,7 +325,7 @@ class LineReadout(VisionOperation[LineReading]):
         if build.uses_vectors and not is_narrow:
             work = WorkSize((self._items(device, frames, samples), frames), (1, 1), vectors=True)
         else:
-            work = self._groups(frames, samples, dtype, item_per_profile=is_narrow)
+            work = self._groups(frames, samples, dtype, build.real, item_per_profile=is_narrow)
         chosen, of_samples = self.outputs or (), (*batch, samples)
         profiles = None
         if self.triangulation is not None:
@@ -355,15 +355,20 @@ class LineReadout(VisionOperation[LineReading]):
             return self.along == "columns" and columns >= _LANES
         return columns >= _WIDE_BYTES // dtype.itemsize and (self.along == "columns" or rows >= _LANES)
 
-    def _groups(self, frames: int, samples: int, dtype: np.dtype[Any], *, item_per_profile: bool) -> WorkSize:
+    def _groups(
+        self, frames: int, samples: int, dtype: np.dtype[Any], real: np.dtype[Any], *, item_per_profile: bool
+    ) -> WorkSize:
         """Return the work size of the work-item variant."""
         if self._has_candidates or item_per_profile:
             return WorkSize((round_up(samples, _GROUP), frames), (_GROUP, 1))
         # GROUP and PROFILES in line_group.h
         if self.method == "ml":
             group, profiles = 64, 64
+        elif self.along == "columns":
+            group, profiles = 256, 64 if dtype.itemsize == 1 else 32
         else:
-            group, profiles = 256, 64 if dtype.itemsize == 1 and self.along == "columns" else 32
+            sums_in_double = self.method == "centroid" and dtype.kind == "f" and real == np.float64
+            group, profiles = 256, 16 if sums_in_double else 32
         return WorkSize((ceil_div(samples, profiles) * group, frames), (group, 1))
 
     def _items(self, device: Device, frames: int, samples: int) -> int:

@@ -8,6 +8,8 @@
 // the profile. The joined result does not depend on the order of the parts, but for rounding of float sums: integer sums
 // are exact, and of equally large samples the first one is the peak.
 //
+// Parts of double sums have 56 bytes: a group along rows reads 16 profiles, which takes 28 KiB of local memory.
+//
 // ITEM_PER_PROFILE, for narrow frames on CPU runtimes: a work-item reads a whole profile, sample by sample (SLICES and
 // HELD are 1). The runtime computes neighbouring work-items as the elements of a vector.
 //
@@ -24,6 +26,8 @@
 #define GROUP 256
 #if CODE_BITS == 8 && !defined(ALONG_ROWS)
 #define PROFILES 64
+#elif defined(METHOD_CENTROID) && CODE_BITS == 32 && defined(ALONG_ROWS) && defined(REAL_IS_DOUBLE)
+#define PROFILES 16
 #else
 #define PROFILES 32
 #endif
@@ -34,7 +38,7 @@
 #define PER (32 / CODE_BITS)  // samples of a load of 4 bytes
 #endif
 #if defined(ALONG_ROWS) && !defined(ITEM_PER_PROFILE)
-#define HELD (GROUP == 64 ? 8 : 4)
+#define HELD (GROUP == 64 ? 8 : PROFILES / 8)
 #define HELD_STEP (PROFILES / HELD)  // from one profile of a work-item to its next one
 #else
 #define HELD PER

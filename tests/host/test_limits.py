@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,8 @@ import pytest
 
 import gpuvision as gv
 from gpuvision.host import Device, DeviceLimitError, DeviceMemoryError, launch_builder
-from gpuvision.host.limits import fit_group
+from gpuvision.host.launch import Launch
+from gpuvision.host.limits import fit_group, fit_work
 from gpuvision.profiling.offline import ranging_builds, simulation_builds
 from gpuvision.profiling.offline.builds import Example, GpuModel
 
@@ -57,6 +59,18 @@ def test_groups_with_local_memory_are_not_divided() -> None:
     expected = r"^Sum: kernel centroid takes groups of 64, device gpu runs groups of up to 32; choose another device$"
     with pytest.raises(DeviceMemoryError, match=expected):
         fit_group(kernel(256, largest=32), handle(), (64,), name="Sum", label="gpu")
+
+
+def test_groups_that_solve_a_problem_each_are_halved() -> None:
+    """The number of groups stays: the kernel takes the number of its problem from the number of its group."""
+    of = Launch("sum.cl", "sum", (), {}, global_size=(192, 4), local_size=(64, 1), problem_per_group=True)
+    of_runtime = replace(of, local_size=None)
+    for needed in (0, 256):
+        assert fit_work(kernel(needed, 63), handle(), of, name="Sum", label="gpu") == ((96, 4), (32, 1))
+        assert fit_work(kernel(needed, 64), handle(), of, name="Sum", label="gpu") == ((192, 4), (64, 1))
+        assert fit_work(kernel(needed, 1), handle(), of_runtime, name="Sum", label="gpu") == ((192, 4), None)
+    one_of_many = replace(of, problem_per_group=False)
+    assert fit_work(kernel(0, 63), handle(), one_of_many, name="Sum", label="gpu") == ((192, 4), (32, 1))
 
 
 def test_wrong_numbers_of_mesa_are_corrected() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from gpuvision.host import Device, clear_cache, to_numpy
@@ -59,3 +60,25 @@ def test_results_do_not_depend_on_the_group(
     assert operation.launch(device, inputs[0].shape, inputs[0].dtype).local_size == (8,)
     for field, ours, found in zip(expected._fields, expected, operation(*inputs, device=device), strict=True):
         np.testing.assert_array_equal(found, ours, err_msg=field)
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES])
+def test_a_device_with_few_registers_runs_smaller_groups(
+    device: Device, name: str, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kernel that takes the registers of a group of 64 runs in as many groups of 8."""
+    if device.kind == "rusticl":
+        pytest.skip("Mesa's group limit of a kernel is not read (host/limits.py)")
+    _, operation, inputs = CASES[name](device, rng)
+    expected = operation(*inputs, device=device)
+    real = cl.Kernel.get_work_group_info
+
+    def limited(self: Any, key: Any, of: Any) -> Any:
+        return 8 if key == cl.kernel_work_group_info.WORK_GROUP_SIZE else real(self, key, of)
+
+    monkeypatch.setattr(cl.Kernel, "get_work_group_info", limited)
+    bound = operation.bind(device, inputs[0].shape, inputs[0].dtype)
+    found = bound.on_host(inputs)
+    assert bound.enqueue_arguments[2:] == ((24,), (8,))
+    for field, ours, theirs in zip(expected._fields, expected, found, strict=True):
+        np.testing.assert_array_equal(theirs, ours, err_msg=field)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from dataclasses import replace
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -355,6 +357,34 @@ def test_sums_beyond_the_largest_number(device, along, variant, peak_selection):
         reading = readout(frame if along == "columns" else np.ascontiguousarray(frame.T), device=device)
         np.testing.assert_array_equal(reading.status, NOT_FINITE)
         assert all(np.isnan(getattr(reading, name)).all() for name in ("position", "peak", "width", "total"))
+
+
+@pytest.mark.double
+def test_double_sums_along_rows_fit_into_local_memory(device, rng):
+    """OpenCL guarantees 32 KiB of local memory."""
+    frames = line_frames(rng, "float32", (2, 33, 130), "rows")
+    parameters = {"method": "centroid", "along": "rows", "threshold": 8.5}
+    readout = LineReadout(variant="work_item", precision="double", **parameters)
+    bound = readout.bind(device, frames.shape, frames.dtype)
+    assert_same(bound.on_host((frames,)), read_lines(frames, **parameters), np.float64, slack=10.0)
+    kernel = bound.enqueue_arguments[1]
+    needed = kernel.get_work_group_info(cl.kernel_work_group_info.LOCAL_MEM_SIZE, device.handle)
+    assert device.kind == "rusticl" or 0 < needed <= 32 << 10
+
+
+@pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
+def test_least_total_on_a_device_without_denormal_numbers(device, along, variant):
+    """The centroid needs length * 2**23 of the smallest normal number; a device that has denormals pretends not to."""
+    without = copy.copy(device)
+    without.has_denormals = False
+    # Two samples of half the total: both levels are exact.
+    least = 64 * 2.0**23 * float(np.finfo(np.float32).tiny)
+    readout = LineReadout(method="centroid", along=along, variant=variant, outputs=("total", "status"))
+    for total, status in ((least, 0), (least * (1.0 - 2.0**-22), LOW_SIGNAL), (least * (1.0 + 2.0**-22), 0)):
+        frame = column(*[0.0] * 20, total / 2, total / 2, *[0.0] * 42, dtype=np.float32)
+        reading = readout(frame if along == "columns" else np.ascontiguousarray(frame.T), device=without)
+        np.testing.assert_array_equal(reading.total, np.float32(total))
+        np.testing.assert_array_equal(reading.status, status)
 
 
 @pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))

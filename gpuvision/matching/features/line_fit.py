@@ -172,6 +172,7 @@ class FitLines(VisionOperation[LineFits]):
             "line_fit/line_fit.cl",
             "line_fit_sets",
             work=work,
+            problem_per_group=True,
             more_inputs=[(shape[:-1], dtype)] if self.weighted else [],
             outputs=build.outputs(shapes, inliers=np.int32),
             defines={

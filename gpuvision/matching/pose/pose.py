@@ -337,6 +337,7 @@ class SolvePose(VisionOperation[BoardPose]):
             "pose/pose.cl",
             "pose_sets",
             work=work,
+            problem_per_group=True,
             more_inputs=[((*batch, 3), dtype)] if self.with_initial_pose else [],
             outputs=build.outputs(self.shapes(batch, (*batch, count)), rank=np.int32, inliers=np.int32),
             defines={

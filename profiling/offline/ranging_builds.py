@@ -117,6 +117,8 @@ def _line() -> Iterator[Example]:
     yield Example("width limits", LineReadout(minimum_width=2, maximum_width=9), _FRAMES, np.uint8)
     yield Example("position along rows", LineReadout(along="rows", outputs=("position",)), _FRAMES, np.uint8)
     yield Example("centroid along rows, long", LineReadout(method="centroid", along="rows"), (4, 8, 9000), np.uint16)
+    in_double = LineReadout(method="centroid", along="rows", precision="double")
+    yield Example("centroid along rows, double", in_double, _FRAMES, np.float32)
     yield Example("double", LineReadout(method="ml", gain=0.1, precision="double"), _FRAMES, np.uint16)
     names = tuple(name for name in LineReading._fields if not name.startswith("systematic"))
     fused: dict[str, Triangulation] = {

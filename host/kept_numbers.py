@@ -18,19 +18,19 @@ _MAX_ENTRIES = 1000
 
 
 def driver_key(handle: Any) -> tuple[str, ...]:
-    """Return what identifies a device and its driver, for keys of kept numbers."""
+    """Return the names and versions of a device and its driver, for keys of kept numbers."""
     return (handle.platform.name, handle.platform.version, handle.name, handle.driver_version)
 
 
 def kept_number(file: str, key: object, measure: Callable[[], float], *, max_days: int = 0) -> float:
-    """Return a number that was kept under a key; measure and keep it where there is none.
+    """Return the number kept under a key. If no number is kept, measure it and keep it.
 
     Parameters
     ----------
     file : str
         Name of a JSON file of the cache folder.
     key : object
-        Key, told apart by its ``repr``.
+        Key. Two keys are the same if their ``repr`` is equal.
     measure : function
         Returns the number, positive and finite.
     max_days : int

@@ -86,7 +86,10 @@ FAULTS = (
 
 
 def mark_faults(items: list[pytest.Item], *, run: bool = True) -> None:
-    """Mark the tests that faults of drivers affect as expected failures; with `run`, run those that end."""
+    """Mark the tests that faults of drivers affect as expected failures.
+
+    With `run` the marked tests run, except tests that end the process or do not end.
+    """
     for item in items:
         device = device_of(item)
         for fault in FAULTS:

@@ -20,8 +20,8 @@
 // fault) at the first use of pose.cl in a group, and ran line_fit.cl with equal results. The cause is not known.
 //
 // Large state that is used on both sides of a barrier (solved_pose) is in GROUP_SPACE, where item 0 writes it: in
-// private memory it would take registers of every item on a GPU. Each item computes small state (a line, a pose of a
-// robot) from the totals; it is equal in all items.
+// private memory it would take registers of every item on a GPU. Each item computes small state (a line) from the
+// totals; it is equal in all items.
 #ifndef GROUP_H
 #define GROUP_H
 #include "common/least_squares.h"

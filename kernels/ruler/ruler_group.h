@@ -5,9 +5,9 @@
 // neighbouring items access neighbouring words, in different banks. The first RULERS_PER_GROUP items, neighbours in a
 // warp, compute the parameters of one edge each.
 //
-// The items search for edges together and find the edges of the sequential search (ruler_find in ruler.h). A single edge
-// is decided by its own gradient and the next ones, a pair also by the peak before it: the peaks are marked as bits, and
-// the peak before gradient i is the highest bit below i. Atomic minima and maxima of integers, whose results do not
+// The items search for edges together and find the edges of the sequential search (ruler_find in ruler.h). The
+// choice of a single edge depends on its gradient and the two neighbours. The choice of a pair also depends on the peak
+// before it: each peak is a bit, and the peak before gradient i is the highest bit below i. Atomic minima and maxima of integers, whose results do not
 // depend on the order of the items, join the choices. (The bits of a float above 0, read as an integer, have the order
 // of the float.)
 //
@@ -144,7 +144,7 @@ static inline void ruler_mark_peaks(private const ruler_place *place, constant r
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// Index of the peak before gradient i; 0, which is no peak, where there is none.
+// Index of the last peak before gradient i, or 0 if no peak lies before it (gradient 0 is never a peak).
 static inline int ruler_index_before(local const ruler_memory *shared, int i) {
     local const uint *peaks = shared->peaks + ruler_of_item();
     int index = 0;

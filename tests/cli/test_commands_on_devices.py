@@ -1,4 +1,4 @@
-"""The smallest job of each command in a process of its own, on each device: no job aborts the process."""
+"""Run a small job of each command in a separate process on each device: no job aborts the process."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_each_command_has_a_job() -> None:
 def test_a_command_does_its_job_or_gives_the_reason_in_one_line(job: str, label: str, tmp_path: Path) -> None:
     device = Device.named(label)
     words = [job.split()[0], *map(str, JOBS[job](tmp_path))]
-    if words[0] == "profile":  # measures all devices unless it is told which
+    if words[0] == "profile":  # without the option it measures all devices
         words += ["--device", label]
     code = SHORTER.get(job, "") + MAIN
     environment = os.environ | {"GPUVISION_DEVICE": label}

@@ -262,7 +262,7 @@ def test_pairs_have_the_middle_whatever_the_width(device: Device, variant: Any, 
     np.testing.assert_allclose(ours.spacing, spacing, rtol=0, atol=0.02)
     single = replace(operation, pairs=False)(image, rulers, device=device)
     np.testing.assert_allclose(ours.sigma, single.sigma / math.sqrt(2.0), rtol=0.05)
-    # All outputs are those of the two edges measured one by one.
+    # Each output of a pair equals the output of its two edges, measured as single edges.
     second = replace(operation, pairs=False, polarity="falling")(image, rulers, device=device)
     np.testing.assert_allclose(ours.position, 0.5 * (single.position + second.position), rtol=0, atol=1e-5)
     np.testing.assert_allclose(ours.spacing, second.position - single.position, rtol=0, atol=1e-5)
@@ -464,7 +464,7 @@ def test_canaries_and_bound_calls(device: Device, variant: Any, rng: np.random.G
 
 @pytest.mark.parametrize("count", [1, 3, 5])
 def test_a_group_may_have_fewer_rulers(device: Device, count: int, rng: np.random.Generator) -> None:
-    """Work-groups of four rulers: the last group computes what is there, and writes nothing beyond."""
+    """Work-groups of four rulers: the last group computes the remaining rulers, and writes nothing beyond them."""
     values, rulers = step(rng)
     image = image_of(values, np.uint8)
     operation = replace(STRONGEST, variant="work_item")  # shares programs with `test_against_the_reference`

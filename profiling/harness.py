@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpuvision.host import Device
 from gpuvision.host.outputs import Outputs
@@ -61,6 +62,12 @@ _WARM_UP = 1e-3  # duration of untimed calls before a timed one [s]
 _CALLS_PER_TURN = 3
 _STEADY = 0.2  # largest relative change of the FLOP rate during a valid section
 _ATTEMPTS = 4  # measurements of a section before the run is marked invalid
+_Call = tuple[str, str]  # names of a peer and of its form
+_OURS: _Call = ("", "")
+_CEILING: _Call = ("ceiling", "")
+
+# Function of a peer, or functions by the name of the form.
+Peer = Callable[[], object] | Mapping[str, Callable[[], object]]
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,9 @@ class Case:
     ours
         Function that does the work and waits until it is finished.
     peers
-        Functions by the name of the peer (``numba``, ``numpy``, ``opencv``, ``pyopencl``).
+        Functions by the name of the peer (``numba``, ``numpy``, ``opencv``, ``pyopencl``). ``numba`` is the form of an
+        expert, ``numba-plain`` the loop that a user writes first. Several forms of a peer are functions by the name
+        of the form: the row shows the fastest one.
     error
         Our largest error compared with float64 on the input of the case, in the unit of the output.
     traffic
@@ -91,7 +100,7 @@ class Case:
     operation: str
     name: str
     ours: Callable[[], object]
-    peers: Mapping[str, Callable[[], object]]
+    peers: Mapping[str, Peer]
     error: float
     traffic: tuple[int, int] | None = None
     repeats: int = 1
@@ -115,6 +124,8 @@ class Row:
         Our largest error, see `Case`.
     fraction
         Time of a copy with the same traffic over our time; None if the case gives no traffic.
+    form
+        Fastest form of the peer; empty if the peer has one form.
     metadata
         Additional columns.
     """
@@ -129,6 +140,7 @@ class Row:
     ratio: float
     error: float
     fraction: float | None
+    form: str = ""
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -198,13 +210,14 @@ class Run:
 
 def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:
     """Measure our function, the peers and the limit of the device interleaved, for about ``seconds`` [s]."""
-    calls: dict[str, Callable[[], object]] = {"": case.ours, **case.peers}
+    calls = {(name, form): call for name, peer in case.peers.items() for form, call in _forms(peer).items()}
+    calls[_OURS] = case.ours
     if case.traffic is not None:
-        calls["ceiling"] = ceiling.move(device, *case.traffic, case.repeats)
+        calls[_CEILING] = ceiling.move(device, *case.traffic, case.repeats)
     durations = _take_turns(calls, seconds)
-    times = {name: np.array(each) * (case.factors.get(name, 1.0) / case.repeats) for name, each in durations.items()}
-    ours = times.pop("")
-    limit = times.pop("ceiling", None)
+    times = {call: np.array(each) * (case.factors.get(call[0], 1.0) / case.repeats) for call, each in durations.items()}
+    ours = times.pop(_OURS)
+    limit = times.pop(_CEILING, None)
     fraction = None if limit is None else float(np.median(limit / ours))
     return [
         Row(
@@ -218,30 +231,46 @@ def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:
             ratio=float(np.median(theirs / ours)),
             error=case.error,
             fraction=fraction,
+            form=form,
             metadata=case.metadata,
         )
-        for peer, theirs in times.items()
+        for (peer, form), theirs in _fastest_forms(times).items()
     ]
 
 
-def _take_turns(calls: Mapping[str, Callable[[], object]], seconds: float) -> dict[str, list[float]]:
+def _forms(peer: Peer) -> Mapping[str, Callable[[], object]]:
+    return peer if isinstance(peer, Mapping) else {"": peer}
+
+
+def _fastest_forms(times: Mapping[_Call, NDArray[Any]]) -> dict[_Call, NDArray[Any]]:
+    """Return the times of the form of each peer that has the smallest median."""
+    best: dict[str, _Call] = {}
+    for call, durations in times.items():
+        rival = best.setdefault(call[0], call)
+        if np.median(durations) < np.median(times[rival]):
+            best[call[0]] = call
+    return {call: times[call] for call in best.values()}
+
+
+def _take_turns(calls: Mapping[_Call, Callable[[], object]], seconds: float) -> dict[_Call, list[float]]:
     for call in calls.values():  # compiles, allocates, warms the caches
         call()
     start = time.perf_counter()
     _round(calls, 0)
     rounds = int(seconds / max(time.perf_counter() - start, 1e-6))
     low, high = _ROUND_LIMITS
-    times: dict[str, list[float]] = {name: [] for name in calls}
+    times: dict[_Call, list[float]] = {name: [] for name in calls}
     for number in range(min(max(rounds, low), high)):
         for name, duration in _round(calls, number).items():
             times[name].append(duration)
     return times
 
 
-def _round(calls: Mapping[str, Callable[[], object]], number: int) -> dict[str, float]:
+def _round(calls: Mapping[_Call, Callable[[], object]], number: int) -> dict[_Call, float]:
     """Time each function once, in a different order each round: a predecessor that fills the caches costs time."""
-    order = np.random.default_rng(number).permutation(list(calls))
-    return {name: _turn(calls[name]) for name in order}
+    names = list(calls)
+    order = np.random.default_rng(number).permutation(len(names))
+    return {names[place]: _turn(calls[names[place]]) for place in order}
 
 
 def _turn(call: Callable[[], object]) -> float:
@@ -259,9 +288,10 @@ def _turn(call: Callable[[], object]) -> float:
 
 
 def peer_version(peer: str) -> str:
-    """Return the version of the package of a peer; "a+b" stands for two packages."""
+    """Return the version of the package of a peer; "a+b" stands for two packages, and "a-plain" for a form of "a"."""
     packages = {"opencv": "opencv-contrib-python-headless"}
-    return " + ".join(version(packages.get(each, each)) for each in peer.split("+") if each)
+    names = [each.removesuffix("-plain") for each in peer.split("+") if each]
+    return " + ".join(version(packages.get(name, name)) for name in names)
 
 
 def profile(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import types
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -55,6 +56,19 @@ def test_a_row_holds_a_peer_against_us(clock, device):
     assert (row.seconds, row.peer_seconds) == pytest.approx((1e-4, 4e-4))
     assert row.ratio == pytest.approx(4.0)
     assert row.fraction is None
+
+
+def test_a_row_shows_the_fastest_form_of_a_peer(clock, device):
+    peers = {
+        "numba": {"pairs": clock.work(7e-4), "words": clock.work(3e-4), "loop": clock.work(9e-4)},
+        "numba-plain": clock.work(15e-4),
+    }
+    strongest, plain = harness.measure(case(peers=peers, factors={"numba": 2.0}), device, seconds=0.01)
+    assert (strongest.peer, strongest.form) == ("numba", "words")
+    assert (plain.peer, plain.form) == ("numba-plain", "")
+    assert strongest.peer_version == plain.peer_version == version("numba")
+    assert (strongest.peer_seconds, plain.peer_seconds) == pytest.approx((8e-4, 16e-4))
+    assert strongest.to_dict()["form"] == "words"
 
 
 def test_the_ceiling_moves_the_bytes_of_the_case(clock, monkeypatch, device):

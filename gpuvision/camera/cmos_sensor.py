@@ -27,7 +27,7 @@ class CmosSensor:
     Parameters
     ----------
     rows, columns : int
-        Size of the pixel array.
+        Size of the pixel array. Range: 1 or more.
     pitch : float
         Distance between pixels [m], above 0.
     quantum_efficiency : float

@@ -44,6 +44,7 @@ class PasteSettings:
         Thickness of the stencil [m], above 0: the expected height of the paste.
     threshold : float, optional
         Height above the board [m] from which on a cell counts to the area. Default: half of the stencil.
+        Range: above 0.
     margin : float
         Distance from the aperture [m] up to which paste belongs to it. Default 50 um. Of two apertures, a cell belongs
         to the nearest. Range: 0 or more.

@@ -73,12 +73,13 @@ class Axis:
     Parameters
     ----------
     lag : float
-        Time constant with which the velocity follows the command [s]; 0 (default) follows at once, and then the axis
-        has no friction, no limit of the acceleration and no fine stage.
+        Time constant with which the velocity follows the command [s], 0 or more; 0 (default) follows at once, and then
+        the axis has no friction, no limit of the acceleration and no fine stage.
     viscous : float
-        Viscous friction over mass [1/s]. Default 0.
+        Viscous friction over mass [1/s], 0 or more. Default 0.
     coulomb : float
-        Coulomb friction over mass [m/s^2], also the force at which the resting axis breaks away. Default 0.
+        Coulomb friction over mass [m/s^2], also the force at which the resting axis breaks away. Range: 0 or more.
+        Default 0.
     acceleration : float
         Largest acceleration of the drive [m/s^2]. Default: no limit.
     speed : float
@@ -86,13 +87,13 @@ class Axis:
     lower, upper : float
         Stops of the axis [m]. Default: none.
     resonance : float
-        Natural angular frequency of the payload [rad/s]; 0 (default) is a rigid payload.
+        Natural angular frequency of the payload [rad/s], 0 or more; 0 (default) is a rigid payload.
     damping : float
         Damping ratio of the payload, 0 to 1. Default 0.05.
     fine : FineStage, optional
         Fine stage between the axis and the payload.
     encoder : float
-        Step of the encoder [m]; 0 (default) reads exactly.
+        Step of the encoder [m], 0 or more; 0 (default) reads exactly.
 
     Raises
     ------

@@ -360,9 +360,9 @@ class DelayBudget:
     exposure : float
         Time of exposure [s], 0 or more. Half of it counts. Default 0.
     readout : float
-        Time from the end of the exposure to the last needed pixel [s]. Default 0.
+        Time from the end of the exposure to the last needed pixel [s], 0 or more. Default 0.
     transfer : float
-        Time of the transfer to the memory of the computer [s]. Default 0.
+        Time of the transfer to the memory of the computer [s], 0 or more. Default 0.
     stages : mapping of str to float
         Time of each stage of processing by name [s]: edges, pose, control, drive. Default: none.
 

@@ -48,8 +48,8 @@ class LoopLimits:
     abort_after : float
         Age from which on the loop gives up [s]. Default 0.1 s (chosen).
     gated : int
-        Number of measurements in a row beyond the gate after which the loop gives up. Default 10 (chosen): a valid
-        measurement is beyond the gate once in 1000.
+        Number of measurements in a row beyond the gate after which the loop gives up, 1 or more. Default 10 (chosen):
+        a valid measurement is beyond the gate once in 1000.
     margin_sigmas : float
         Largest travel beyond the error of a measured pose [standard deviations of this pose].
         Default 3. Range: 0 or more.
@@ -68,10 +68,9 @@ class LoopLimits:
         the axes. The zero of the encoders is the first reading that the next reading confirms. Default: not checked.
     readings : int
         Number of readings in a row after which a wrong encoder or an axis at its limit ends the loop. Shorter faults
-        are ignored.
-        Default 5 (chosen).
+        are ignored. Range: 1 or more. Default 5 (chosen).
     missed : int
-        Number of late frames in a row after which the loop gives up. Default 10 (chosen).
+        Number of late frames in a row after which the loop gives up, 1 or more. Default 10 (chosen).
 
     Raises
     ------

@@ -197,7 +197,8 @@ class VibrationSettling:
     tolerance : array_like
         (3,) largest errors of this part [m], [m], [rad], above 0.
     frequency : array_like
-        (3,) frequencies of the residual vibration of the axes [Hz]; 0 for an axis that does not swing. Default 0.
+        (3,) frequencies of the residual vibration of the axes [Hz], 0 or more; 0 for an axis that does not swing.
+        Default 0.
     damping : array_like
         (3,) damping ratios. Default 0.02.
     miss_probability : float

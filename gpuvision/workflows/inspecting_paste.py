@@ -65,9 +65,9 @@ class ScaleSigma:
     Parameters
     ----------
     height : float
-        Of heights: 0.002 for 0.2 %.
+        Of heights: 0.002 for 0.2 %. Range: 0 or more.
     lateral : float
-        Of lengths in x and in y.
+        Of lengths in x and in y. Range: 0 or more.
 
     Raises
     ------

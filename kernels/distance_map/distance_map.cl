@@ -20,9 +20,9 @@ kernel void distance_map(global const float *restrict at_x, global float *restri
     const size_t column = get_global_id(0), row = get_global_id(1), i = row * columns + column;
     if (column >= columns) return;
     const float x = at_x[column], y = first_y + (float)row * cell;
-    // The NEAREST smallest distances and their shapes, by insertion.
-    float distance[NEAREST];
-    int which[NEAREST];
+    // The NEAREST smallest distances and their shapes, by insertion. The last place takes the one that drops out.
+    float distance[NEAREST + 1];
+    int which[NEAREST + 1];
     for (int place = 0; place < NEAREST; place++) {
         distance[place] = INFINITY;
         which[place] = 0;
@@ -30,10 +30,8 @@ kernel void distance_map(global const float *restrict at_x, global float *restri
     for (int k = 0; k < count; k++) {
         const float far = fabs(field_distance(shapes + SHAPE * k, x, y).distance);
         for (int place = NEAREST - 1; place >= 0 && far < distance[place]; place--) {
-            if (place + 1 < NEAREST) {
-                distance[place + 1] = distance[place];
-                which[place + 1] = which[place];
-            }
+            distance[place + 1] = distance[place];
+            which[place + 1] = which[place];
             distance[place] = far;
             which[place] = k;
         }

@@ -151,9 +151,13 @@ def test_a_command_does_its_job_or_gives_the_reason_in_one_line(job: str, label:
     known = [
         jobs for (kind, driver), jobs in REFUSED.items() if device.kind == kind and device.driver.startswith(driver)
     ]
-    if ran.returncode == 1 and (job == "profile" or any(job in jobs for jobs in known)):
-        lines = [line for line in ran.stderr.splitlines() if not line.startswith("MESA: ")]
-        assert job == "profile" or (len(lines), lines[0][:11]) == (1, "gpuvision: "), ran.stderr
-        assert "Traceback" not in ran.stderr
+    lines = [line for line in ran.stderr.splitlines() if not line.startswith("MESA: ")]
+    if ran.returncode == 1 and job == "profile":
+        # The measurement succeeded on a machine that changed its speed.
+        assert lines[-1].startswith("not valid: "), ran.stderr
+        assert "not measured: " not in ran.stderr
+        return
+    if ran.returncode == 1 and any(job in jobs for jobs in known):
+        assert (len(lines), lines[0][:11]) == (1, "gpuvision: "), ran.stderr
         return
     assert ran.returncode == 0, ran.stderr

@@ -30,6 +30,12 @@ OTHERS = {
 }
 
 
+# Names and docstring entries of the classes and functions around a place of the source, from the outside.
+Owners = tuple[tuple[str, dict[str, str]], ...]
+# Variable of the innermost loop over names of members, and these names.
+Loop = tuple[str, tuple[str, ...]]
+
+
 class Check(NamedTuple):
     """Checked parameter: bounds of the call, and text of the docstring."""
 
@@ -47,24 +53,44 @@ def _entries(node: ast.AST) -> dict[str, str]:
     return found
 
 
-def _checks(node: ast.AST, owners: tuple[tuple[str, dict[str, str]], ...]) -> Iterator[Check]:
-    """Yield the checks `finite` and `integer` of documented parameters with constant bounds."""
+def _checks(node: ast.AST, owners: Owners = (), loop: Loop = ("", ())) -> Iterator[Check]:
+    """Yield the checks `finite` and `integer` with constant bounds, one for each documented name that they check."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.ClassDef | ast.FunctionDef):
             yield from _checks(child, (*owners, (child.name, _entries(child))))
             continue
         if isinstance(child, ast.Call) and ast.unparse(child.func) in ("finite", "integer"):
-            given = ast.unparse(child.args[0])
-            name = given.removeprefix("self.")
-            # Parameters are in the docstring of the function, or of the class for `__init__`; members in the class's.
-            count = 2 if given != name or owners[-1][0] == "__init__" else 1
-            owner = next(((each, texts[name]) for each, texts in reversed(owners[-count:]) if name in texts), None)
             bounds = {str(each.arg): each.value for each in child.keywords}
             constant = {key: value.value for key, value in bounds.items() if isinstance(value, ast.Constant)}
-            if owner is not None and constant and len(constant) == len(bounds):
+            if constant and len(constant) == len(bounds):
                 numbers = {key: float(value) for key, value in constant.items() if isinstance(value, int | float)}
-                yield Check(f"{owner[0]}.{name}", numbers, owner[1])
-        yield from _checks(child, owners)
+                for owner, name, text in _documented(child, owners, loop):
+                    yield Check(f"{owner}.{name}", numbers, text)
+        yield from _checks(child, owners, _loop_over_names(child) or loop)
+
+
+def _loop_over_names(node: ast.AST) -> Loop | None:
+    """Return the variable and the strings of ``for name in ("a", "b")``; None for another node."""
+    if not (isinstance(node, ast.For) and isinstance(node.target, ast.Name) and isinstance(node.iter, ast.Tuple)):
+        return None
+    return node.target.id, tuple(str(each.value) for each in node.iter.elts if isinstance(each, ast.Constant))
+
+
+def _documented(call: ast.Call, owners: Owners, loop: Loop) -> list[tuple[str, str, str]]:
+    """Return owner, name and text of the docstring entries of a checked number.
+
+    Parameters are in the docstring of the function, or of the class for `__init__`; members in that of the class. In
+    these methods the message names a number without a name of its own (``for each in self.gains``).
+    """
+    given, message = ast.unparse(call.args[0]), call.args[1]
+    names = loop[1] if given == f"getattr(self, {loop[0]})" else (given.removeprefix("self."),)
+    builds = owners[-1][0] in ("__init__", "__post_init__")
+    near = owners[-2:] if builds or given.startswith("self.") else owners[-1:]
+    found = [(owner, name, text[name]) for name in names for owner, text in reversed(near) if name in text]
+    if not found and builds and isinstance(message, ast.Constant):
+        label = str(message.value).partition(" [")[0].rpartition(".")[2]
+        found = [(owner, label, text[label]) for owner, text in near if label in text]
+    return found
 
 
 def _stated(text: str) -> dict[str, float]:
@@ -80,7 +106,7 @@ def test_a_checked_range_is_the_stated_one() -> None:
     checks = [
         each._replace(name=f"{path.relative_to(ROOT)}: {each.name}")
         for path in FILES
-        for each in _checks(tree_of(path), ())
+        for each in _checks(tree_of(path))
     ]
     assert len(checks) > 100
     wrong = [each for each in checks if _stated(each.text) != each.bounds and each.name not in OTHERS]

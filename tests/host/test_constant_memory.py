@@ -11,6 +11,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
+from example_inputs import assert_has_numbers, random_values
 from gpuvision.host import Device, Launch, bound
 from gpuvision.host.constant_memory import constant_sizes, fitting_defines
 from gpuvision.host.debug import flatten_includes
@@ -86,16 +87,13 @@ def results_of(example: Example, device: Device) -> Any:
     rng = np.random.default_rng(3)
     bound: Any = example.operation.bind(device, (min(301, example.shape[0]), *example.shape[1:]), example.dtype)
     for array in bound.inputs:
-        if array.dtype.kind == "f":
-            array.set(rng.uniform(0.1, 1.0, array.shape).astype(array.dtype))
-        elif array.dtype.itemsize < 4:  # integers of 4 bytes are indices
-            array.set(rng.integers(0, 200, array.shape).astype(array.dtype))
+        array.set(random_values(array.shape, array.dtype, rng))
     bound().wait()
     return type(bound.outputs)(*(None if each is None else each.get() for each in bound.outputs))
 
 
 def assert_the_same(example: Example, device: Device, moved: list[str], little_memory: Callable[[], None]) -> None:
-    """Check that results are bit-equal with tables in global memory."""
+    """Check that results are bit-equal with tables in global memory, and that there are numbers to compare."""
     expected = results_of(example, device)
     assert not moved
     little_memory()
@@ -103,6 +101,7 @@ def assert_the_same(example: Example, device: Device, moved: list[str], little_m
     assert moved
     for name, before, after in zip(found._fields, expected, found, strict=True):
         np.testing.assert_array_equal(after, before, err_msg=name)
+    assert_has_numbers(example.operation, expected)
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pyopencl as cl
 import pyopencl.array
 import pytest
 
+from example_inputs import assert_has_numbers, random_values
 from gpuvision.host import Device, Operation
 from gpuvision.profiling.offline.registry import all_examples
 from gpuvision.ranging.psd import PsdReadout
@@ -49,14 +50,7 @@ def placed(like: npt.NDArray[Any], offset: int) -> npt.NDArray[Any]:
 def assert_any_offset(operation: Operation[Any], device: Device, shape: Any, dtype: Any) -> None:
     """Check that results on arrays at any element are bit-equal to the results on aligned arrays."""
     rng, bound = np.random.default_rng(7), operation.bind(device, shape, dtype)
-    inputs = []
-    for array in bound.inputs:
-        values = np.zeros(array.shape, array.dtype)
-        if array.dtype.kind == "f":
-            values[...] = rng.uniform(0.1, 30.0, array.shape)
-        elif array.dtype.itemsize < 4:  # integers of 4 bytes are indices
-            values[...] = rng.integers(0, 200, array.shape)
-        inputs.append(values)
+    inputs = [random_values(array.shape, array.dtype, rng) for array in bound.inputs]
     found = []
     for offset in (0, 1, 7):
         outputs = [None if each is None else np.zeros(each.shape, each.dtype) for each in bound.outputs]
@@ -65,6 +59,7 @@ def assert_any_offset(operation: Operation[Any], device: Device, shape: Any, dty
     for result in found[1:]:
         for name, expected, values in zip(result._fields, found[0], result, strict=True):
             np.testing.assert_array_equal(values, expected, err_msg=name)
+    assert_has_numbers(operation, found[0])
 
 
 def test_readout_of_arrays_at_any_element(device: Device) -> None:

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.views.camera_fit import Pose
 from gpuvision.camera.views.pose_response import PoseResponse, change_camera
+from gpuvision.ranging import sheet_calibration
 from gpuvision.ranging.sheet_calibration import _system, fit_sheet
-from gpuvision.ranging.sheet_readings import LaserLine, SheetFrame
+from gpuvision.ranging.sheet_readings import DEFAULT_LIMITS, LaserLine, SheetFrame
 from gpuvision.ranging.sheet_result import SheetFit
 from laser_sensor import LaserSensor, on_stage, poses, readings, sensor
 
@@ -219,6 +220,26 @@ def test_lines_with_few_readings_are_left_out(rng: np.random.Generator) -> None:
     assert np.isnan(found.residuals[0]).all()
     np.testing.assert_allclose(found.origin, clean.origin, rtol=1e-9)
     np.testing.assert_allclose(found.noise_covariance, clean.noise_covariance, rtol=1e-6, atol=1e-30)
+
+
+def test_the_fit_ends_when_the_noise_does_not_change(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The iterations of the robust fit converge within a limit; more iterations would not change the sheet."""
+    calls = 0
+
+    def counted(*arguments: object) -> object:
+        nonlocal calls
+        calls += 1
+        return _system(*arguments)
+
+    monkeypatch.setattr(sheet_calibration, "_system", counted)
+    lines = lines_of(TRUTH, rng)
+    fits, counts = [], []
+    for max_iterations in (DEFAULT_LIMITS.max_iterations, 3 * DEFAULT_LIMITS.max_iterations):
+        calls = 0
+        fits.append(fit_sheet(camera_of(TRUTH), lines, limits=replace(DEFAULT_LIMITS, max_iterations=max_iterations)))
+        counts.append(calls)
+    assert counts[0] == counts[1]
+    np.testing.assert_array_equal(fits[0].origin, fits[1].origin)
 
 
 def test_derivatives_of_the_distances(rng):

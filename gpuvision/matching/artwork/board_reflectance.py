@@ -17,13 +17,13 @@ class BoardReflectance:
     Parameters
     ----------
     laminate_masked, copper_masked : float
-        Laminate and copper under the solder mask. Defaults 0.24 and 0.43.
+        Laminate and copper under the solder mask. Defaults 0.24 and 0.43. Range: 0 to 1.
     laminate, copper : float
-        Laminate and copper in the openings of the mask. Defaults 0.35 and 0.78.
+        Laminate and copper in the openings of the mask. Defaults 0.35 and 0.78. Range: 0 to 1.
     silk : float
-        Silk. Default 0.94.
+        Silk. Default 0.94. Range: 0 to 1.
     hole : float
-        Holes. Default 0.06.
+        Holes. Default 0.06. Range: 0 to 1.
 
     Raises
     ------

@@ -101,11 +101,13 @@ class Settling:
         small probability only (`VibrationSettling`); "fixed" waits for a fixed time.
     wait : float, optional
         Time from the first measured pose to the release by the rule "fixed" [s], above 0.
-    frequency, damping : (float, float, float), optional
-        Frequencies [Hz] and damping ratios of the residual vibration of the steered head in x, y and theta, for the
-        rule "vibration"; frequency 0 for an axis that does not swing. Take them from
+    frequency : (float, float, float), optional
+        Frequencies [Hz], 0 or more, of the residual vibration of the steered head in x, y and theta, for the rule
+        "vibration"; 0 for an axis that does not swing. Take frequencies and damping ratios from
         `gpuvision.servoing.settling.vibration_of_loop`. Default: a simulation makes an extra move to find them; a real
         machine needs them.
+    damping : (float, float, float), optional
+        Damping ratios of this vibration, 0 to 0.7. Default: as for the frequencies.
     miss_probability : float
         Largest probability that the head leaves the tolerance after the release, for the rule "vibration". Default
         0.0027 (3 sigma). Range: above 0 to 1.

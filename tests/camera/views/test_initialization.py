@@ -1,4 +1,4 @@
-"""Focal length and principal point from homographies, against a pinhole camera."""
+"""Focal length, aspect and principal point from homographies, against a pinhole camera."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 import pytest
+import scipy.linalg
 from scipy.spatial.transform import Rotation
 
-from gpuvision.camera.views.initialization import tilt_closed_form
+from gpuvision.camera.views.initialization import tilt_closed_form, zhang_closed_form
 
 
 def homographies_of(f: float, v: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
@@ -42,3 +43,34 @@ def test_a_direction_may_be_opposite(rng: np.random.Generator) -> None:
 
 def test_a_focal_length_shorter_than_the_tilt_has_no_solution(rng: np.random.Generator) -> None:
     assert tilt_closed_form(homographies_of(1.0, (0.9, 0.0), rng), None, 0.1) is None
+
+
+@pytest.mark.parametrize("aspect", [1.0, 1.25])
+def test_zhang_closed_form_gives_the_camera(aspect: float, rng: np.random.Generator) -> None:
+    """The factor fy / fx scales the rows of homographies with the aspect 1."""
+    views = np.diag([1.0, aspect, 1.0]) @ homographies_of(0.9, (-0.2, 0.1), rng)
+    found = zhang_closed_form(views, aspect=True)
+    assert found is not None
+    assert found[:2] == pytest.approx((0.9, aspect), rel=1e-9)
+    np.testing.assert_allclose(found[2], (-0.2, 0.1 * aspect), rtol=1e-8)
+    if aspect == 1.0:
+        without = zhang_closed_form(views, aspect=False)
+        assert without is not None
+        assert without[:2] == (pytest.approx(0.9, rel=1e-9), 1.0)
+        np.testing.assert_allclose(without[2], (-0.2, 0.1), rtol=1e-8)
+
+
+@pytest.mark.parametrize("signs", [(1.0, -1.0, 1.0), (1.0, 1.0, -1.0)])
+def test_an_indefinite_conic_is_no_camera(signs: tuple[float, float, float], rng: np.random.Generator) -> None:
+    """The columns of H are orthogonal and equally long in the metric diag(signs): fy^2 or f^2 would be negative."""
+    omega = np.diag(signs)
+    minus = signs.index(-1.0)
+    views = []
+    for _ in range(4):
+        # exp(omega A) with A skew-symmetric keeps the metric.
+        skew = rng.uniform(-0.5, 0.5, (3, 3))
+        turn = scipy.linalg.expm(omega @ (skew - skew.T))
+        views.append(np.delete(turn, minus, axis=1) @ np.array([[1.0, 0.0, 0.2], [0.0, 1.0, 0.3]]))
+        views[-1][:, 2] += turn[:, minus]
+        assert views[-1][:, 0] @ omega @ views[-1][:, 1] == pytest.approx(0.0, abs=1e-12)
+    assert zhang_closed_form(np.array(views), aspect=True) is None

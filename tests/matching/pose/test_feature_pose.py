@@ -21,7 +21,7 @@ from gpuvision.matching.features.fiducials import SPOKES, Fiducials, fiducial_sm
 from gpuvision.matching.features.imaging import Imaging
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.pose.bound_features import BoundFeatures
-from gpuvision.matching.pose.feature_pose import CameraFeatures, EstimateFeaturePose
+from gpuvision.matching.pose.feature_pose import CameraFeatures, EstimateFeaturePose, SolveFeatures
 from gpuvision.matching.pose.pose import SolvePose, line_rows
 from gpuvision.reference import robust
 from gpuvision.status import Status
@@ -288,18 +288,44 @@ def test_a_blob_of_another_size_is_not_the_fiducial(
     assert found.status == 0
 
 
+def only(features: FeatureSet, kind: str) -> FeatureSet:
+    """Return the rulers of a feature set, or its fiducials without holes."""
+    if kind == "rulers":
+        return replace(features, fiducials=Fiducials.empty())
+    fiducials = features.fiducials.subset(features.fiducials.hole == 0)
+    empty = {name: getattr(features, name)[:0] for name in ("point", "normal", "spacing", "length", "sigma")}
+    return replace(features, fiducials=fiducials, **empty)
+
+
+def test_a_radius_at_the_tolerance_is_the_fiducials(features: FeatureSet, device: Device) -> None:
+    """Powers of two: 8 px drawn, 1 px of tolerance, and measured radii at the ends of the range and just beyond."""
+    pixel = 2.0**-16
+    sizes = np.array([7.0, 9.0, 8.0, np.nextafter(np.float32(7.0), 0), np.nextafter(np.float32(9.0), 10)], np.float32)
+    count = len(sizes)
+    places = tuple((x * 1e-3, y * 1e-3, 8.0 * pixel) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (0, 0)))
+    operation = SolveFeatures(
+        features=CameraFeatures(
+            rulers=(), matched=places, drilled=(), placement=(0.0, 0.0), pixel_size=pixel, frame_shape=SHAPE
+        ),
+        solver=bind(only(features, "fiducials"), device).operation.solver,
+        size_tolerance=pixel,
+        ruler_sigma_px=0.0,
+        matched_sigma_px=0.0,
+        drilled_sigma_px=0.0,
+    )
+    pose = np.zeros(3, np.float64 if device.has_double else np.float32)
+    covariance = np.broadcast_to(np.float32(1e-4) * np.eye(3, dtype=np.float32), (count, 3, 3)).copy()
+    measured = (np.zeros((count, 2), np.float32), sizes, covariance, np.zeros(count, np.uint8))
+    found = operation(pose, np.zeros(2, np.float32), *measured, np.zeros((count, 3), np.float32), device=device)
+    np.testing.assert_array_equal(found.feature_status, [0, 0, 0, Status.AMBIGUOUS, Status.AMBIGUOUS])
+
+
 @pytest.mark.parametrize("kind", ["rulers", "fiducials"])
 def test_one_kind_of_features_is_enough(
     kind: str, features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
 ) -> None:
     image, true = seen
-    if kind == "rulers":
-        some = replace(features, fiducials=Fiducials.empty())
-    else:
-        fiducials = features.fiducials.subset(features.fiducials.hole == 0)
-        empty = {name: getattr(features, name)[:0] for name in ("point", "normal", "spacing", "length", "sigma")}
-        some = replace(features, fiducials=fiducials, **empty)
-    found = bind(some, device)(image, NEAR)
+    found = bind(only(features, kind), device)(image, NEAR)
     assert found.status == 0
     assert_near(found.pose, true, 5 * np.sqrt(np.diag(found.covariance)))
 

@@ -1,17 +1,19 @@
 """Benchmark harness: measure our operation and its peers interleaved.
 
 Absolute times on a shared machine are unreliable: its speed changes by a factor of two within minutes. Therefore the
-candidates of a case run in turn within each round, a ratio is the median over the rounds of the ratio within a round,
-and a section is measured again if the FLOP rate of the machine differs before and after it.
+candidates of a case run in turn within each round, a ratio is the median over the rounds of the ratio within a round
+with its confidence interval, and a section is measured again if the FLOP rate of the machine differs before and after
+it.
 """
 
 from __future__ import annotations
 
 import datetime
 import importlib
+import itertools
 import json
+import math
 import platform
-import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -25,6 +27,8 @@ from numpy.typing import NDArray
 from gpuvision.host import Device
 from gpuvision.host.outputs import Outputs
 from gpuvision.profiling import ceiling
+from gpuvision.profiling.rounds import median_interval, take_turns
+from gpuvision.profiling.time_plan import TimePlan
 
 # Benchmarked operations: name in the rows, and module of this package that measures it. Some modules also yield cases
 # of related operations. The names stay stable when modules are renamed, because results are compared over time.
@@ -57,9 +61,8 @@ OPERATIONS = {
     "launch": "launch",
     "stream": "stream",
 }
-_ROUND_LIMITS = (7, 101)  # smallest and largest number of rounds
-_WARM_UP = 1e-3  # duration of untimed calls before a timed one [s]
-_CALLS_PER_TURN = 3
+# Cases that a quick run measures, where these are not the first ones of their module.
+QUICK_CASES = {"psd": "float32/1e6", "line": "whole/16", "triangulation": "float32/1e6", "ruler": "100", "blob": "100"}
 _STEADY = 0.2  # largest relative change of the FLOP rate during a valid section
 _ATTEMPTS = 4  # measurements of a section before the run is marked invalid
 _Call = tuple[str, str]  # names of a peer and of its form
@@ -126,6 +129,12 @@ class Row:
         Time of a copy with the same traffic over our time; None if the case gives no traffic.
     form
         Fastest form of the peer; empty if the peer has one form.
+    ratio_low, ratio_high
+        Confidence interval of the ratio, from the spread over the rounds: see `rounds.median_interval`.
+    confidence
+        Confidence of the interval: at least 0.95, less for a peer so slow that it took part in fewer than 6 rounds.
+    rounds
+        Number of rounds in which the peer took part.
     metadata
         Additional columns.
     """
@@ -141,6 +150,10 @@ class Row:
     error: float
     fraction: float | None
     form: str = ""
+    ratio_low: float | None = None
+    ratio_high: float | None = None
+    confidence: float | None = None
+    rounds: int = 0
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -170,6 +183,27 @@ class Failure:
 
 
 @dataclass(frozen=True)
+class Probe:
+    """FLOP rate of a device before and after the measurement of an operation.
+
+    Attributes
+    ----------
+    operation, device
+        Name of the operation, and label of the device.
+    before, after
+        Rates of single-precision multiply-adds [FLOP/s].
+    steady
+        Whether the rates differ by less than 20 %. A section that was not steady is measured again.
+    """
+
+    operation: str
+    device: str
+    before: float
+    after: float
+    steady: bool
+
+
+@dataclass(frozen=True)
 class Run:
     """Rows of a benchmark run.
 
@@ -183,18 +217,26 @@ class Run:
         Description of the machine, see `describe_machine`.
     failures
         Operations without rows, because their benchmark raised an exception.
+    probes
+        Speed of the machine before and after each measurement, also of those that were repeated.
+    seconds
+        Duration of the run [s], with the preparation of the cases.
     """
 
     rows: Sequence[Row]
     valid: bool
     machine: Mapping[str, Any]
     failures: Sequence[Failure] = ()
+    probes: Sequence[Probe] = ()
+    seconds: float = 0.0
 
     def to_json(self) -> str:
         """Return the run as JSON."""
         table = {
             "machine": self.machine,
             "valid": self.valid,
+            "seconds": self.seconds,
+            "probes": [asdict(probe) for probe in self.probes],
             "failures": [asdict(failure) for failure in self.failures],
             "rows": [row.to_dict() for row in self.rows],
         }
@@ -214,28 +256,45 @@ def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:
     calls[_OURS] = case.ours
     if case.traffic is not None:
         calls[_CEILING] = ceiling.move(device, *case.traffic, case.repeats)
-    durations = _take_turns(calls, seconds)
-    times = {call: np.array(each) * (case.factors.get(call[0], 1.0) / case.repeats) for call, each in durations.items()}
+    durations = take_turns(calls, seconds, always=_OURS)
+    times = {call: each * (case.factors.get(call[0], 1.0) / case.repeats) for call, each in durations.items()}
     ours = times.pop(_OURS)
     limit = times.pop(_CEILING, None)
-    fraction = None if limit is None else float(np.median(limit / ours))
+    fraction = None if limit is None else float(np.nanmedian(limit / ours))
     return [
-        Row(
-            operation=case.operation,
-            case=case.name,
-            device=device.label,
-            seconds=float(np.median(ours)),
-            peer=peer,
-            peer_version=peer_version(peer),
-            peer_seconds=float(np.median(theirs)),
-            ratio=float(np.median(theirs / ours)),
-            error=case.error,
-            fraction=fraction,
-            form=form,
-            metadata=case.metadata,
-        )
-        for (peer, form), theirs in _fastest_forms(times).items()
+        _row(case, device, ours, peer, form, theirs, fraction) for (peer, form), theirs in _fastest_forms(times).items()
     ]
+
+
+def _row(
+    case: Case,
+    device: Device,
+    ours: NDArray[Any],
+    peer: str,
+    form: str,
+    theirs: NDArray[Any],
+    fraction: float | None,
+) -> Row:
+    ratios = (theirs / ours)[np.isfinite(theirs)]
+    interval = median_interval(ratios)
+    return Row(
+        operation=case.operation,
+        case=case.name,
+        device=device.label,
+        seconds=float(np.median(ours)),
+        peer=peer,
+        peer_version=peer_version(peer),
+        peer_seconds=float(np.nanmedian(theirs)),
+        ratio=float(np.median(ratios)),
+        error=case.error,
+        fraction=fraction,
+        form=form,
+        ratio_low=interval.low,
+        ratio_high=interval.high,
+        confidence=interval.confidence,
+        rounds=len(ratios),
+        metadata=case.metadata,
+    )
 
 
 def _forms(peer: Peer) -> Mapping[str, Callable[[], object]]:
@@ -247,44 +306,9 @@ def _fastest_forms(times: Mapping[_Call, NDArray[Any]]) -> dict[_Call, NDArray[A
     best: dict[str, _Call] = {}
     for call, durations in times.items():
         rival = best.setdefault(call[0], call)
-        if np.median(durations) < np.median(times[rival]):
+        if np.nanmedian(durations) < np.nanmedian(times[rival]):
             best[call[0]] = call
     return {call: times[call] for call in best.values()}
-
-
-def _take_turns(calls: Mapping[_Call, Callable[[], object]], seconds: float) -> dict[_Call, list[float]]:
-    for call in calls.values():  # compiles, allocates, warms the caches
-        call()
-    start = time.perf_counter()
-    _round(calls, 0)
-    rounds = int(seconds / max(time.perf_counter() - start, 1e-6))
-    low, high = _ROUND_LIMITS
-    times: dict[_Call, list[float]] = {name: [] for name in calls}
-    for number in range(min(max(rounds, low), high)):
-        for name, duration in _round(calls, number).items():
-            times[name].append(duration)
-    return times
-
-
-def _round(calls: Mapping[_Call, Callable[[], object]], number: int) -> dict[_Call, float]:
-    """Time each function once, in a different order each round: a predecessor that fills the caches costs time."""
-    names = list(calls)
-    order = np.random.default_rng(number).permutation(len(names))
-    return {names[place]: _turn(calls[names[place]]) for place in order}
-
-
-def _turn(call: Callable[[], object]) -> float:
-    """Return the median time of a few calls [s], after untimed calls that fill the caches with the data of `call`."""
-    begun = time.perf_counter()
-    call()
-    while time.perf_counter() - begun < _WARM_UP:
-        call()
-    times = []
-    for _ in range(_CALLS_PER_TURN):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
 
 
 def peer_version(peer: str) -> str:
@@ -299,6 +323,8 @@ def profile(
     devices: Sequence[Device],
     *,
     seconds: float = 2.0,
+    total: float = math.inf,
+    quick: bool = False,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Run:
     """Measure the cases of the given operations on the given devices.
@@ -312,25 +338,30 @@ def profile(
     devices
         Devices to measure on.
     seconds
-        Approximate time to measure each case [s].
+        Longest time to measure each case [s].
+    total
+        Approximate time of the whole run [s]. Cases are measured for a shorter time if the run would take longer. The
+        preparation of the cases may alone take longer.
+    quick
+        Whether only one case of each operation is measured: see `QUICK_CASES`.
     progress
         Function that is called with lines of text about the progress.
     """
     rows: list[Row] = []
     failures: list[Failure] = []
-    valid = True
+    probes: list[Probe] = []
+    plan = TimePlan(total, seconds, len(operations) * len(devices))
     for operation in operations:
         for device in devices:
             progress(f"{operation} on {device.label}")
             try:
-                section, steady = _steady_section(operation, device, seconds, progress)
+                with plan.section():
+                    rows += _steady_section(operation, device, plan, quick, probes, progress)
             except Exception as error:
                 failures.append(_failure(operation, device, error))
                 progress(f"  failed: {failures[-1].reason}")
-                continue
-            rows += section
-            valid &= steady
-    return Run(rows, valid, describe_machine(devices), failures)
+    last = {(probe.operation, probe.device): probe.steady for probe in probes}
+    return Run(rows, all(last.values()), describe_machine(devices), failures, probes, plan.elapsed)
 
 
 def _failure(operation: str, device: Device, error: Exception) -> Failure:
@@ -339,20 +370,44 @@ def _failure(operation: str, device: Device, error: Exception) -> Failure:
 
 
 def _steady_section(
-    operation: str, device: Device, seconds: float, progress: Callable[[str], None]
-) -> tuple[list[Row], bool]:
-    """Measure an operation on a device; again if the machine changed its speed meanwhile. Return rows and validity."""
-    module = importlib.import_module(f"gpuvision.profiling.{OPERATIONS[operation]}")
+    operation: str,
+    device: Device,
+    plan: TimePlan,
+    quick: bool,
+    probes: list[Probe],
+    progress: Callable[[str], None],
+) -> list[Row]:
+    """Measure an operation on a device; again if the machine changed its speed meanwhile and the time suffices.
+
+    Returns
+    -------
+    list of Row
+        Rows of the last measurement. Its probe is the last one in `probes`.
+    """
     rows: list[Row] = []
     for attempt in range(_ATTEMPTS):
+        if attempt and not plan.allows_repetition():
+            break
         before = ceiling.flop_rate(device)
-        cases: Iterator[Case] = module.cases(device)
-        rows = [row for case in cases for row in measure(case, device, seconds=seconds)]
+        rows = []
+        for case in _cases(operation, device, quick):
+            rows += measure(case, device, seconds=plan.grant())
         after = ceiling.flop_rate(device)
-        if abs(after / before - 1.0) <= _STEADY:
-            return rows, True
+        probes.append(Probe(operation, device.label, before, after, abs(after / before - 1.0) <= _STEADY))
+        if probes[-1].steady:
+            break
         progress(f"  {before / 1e9:.0f} -> {after / 1e9:.0f} GFLOP/s: the machine changed its speed ({attempt + 1})")
-    return rows, False
+    return rows
+
+
+def _cases(operation: str, device: Device, quick: bool) -> Iterator[Case]:
+    """Yield the cases of an operation, one at a time: their arrays may fill the memory."""
+    module = importlib.import_module(f"gpuvision.profiling.{OPERATIONS[operation]}")
+    if not quick:
+        yield from module.cases(device)
+        return
+    chosen = QUICK_CASES.get(operation)
+    yield from itertools.islice((case for case in module.cases(device) if chosen in (None, case.name)), 1)
 
 
 def describe_machine(devices: Sequence[Device]) -> dict[str, Any]:

@@ -27,7 +27,14 @@ _COLUMNS = (
     "ratio",
     "error",
     "fraction",
+    "form",
+    "ratio_low",
+    "ratio_high",
+    "confidence",
+    "rounds",
 )
+_PROBED = ("before", "after")
+_CONFIDENCE = 0.95  # of the intervals that are shown; a peer measured once or twice has none
 
 
 def _time(seconds: float) -> str:
@@ -44,18 +51,27 @@ def _value(value: Any) -> str:
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
     fraction = row.get("fraction")
     more = ", ".join(f"{key} {_value(value)}" for key, value in row.items() if key not in _COLUMNS)
-    ratio = f"{row['ratio']:.2f}"
+    form = f" ({row['form']})" if row.get("form") else ""
     return (
         f"``{row['case']}``",
         row["device"],
         _time(row["seconds"]),
-        f"{row['peer']} {row['peer_version']}".strip(),
+        f"{row['peer']}{form} {row['peer_version']}".strip(),
         _time(row["peer_seconds"]),
-        f"**{ratio}**" if row["ratio"] < 1.0 else ratio,
+        _ratio(row),
         f"{row['error']:.1e}",
         "" if fraction is None else f"{100 * fraction:.0f} %",
         more.replace("_", "\\_"),
     )
+
+
+def _ratio(row: Mapping[str, Any]) -> str:
+    """Return the ratio, bold if the peer is faster, and its interval where the run states one."""
+    ratio = f"{row['ratio']:.2f}"
+    interval = ""
+    if (row.get("confidence") or 0.0) >= _CONFIDENCE:
+        interval = f" ({row['ratio_low']:.2f} to {row['ratio_high']:.2f})"
+    return (f"**{ratio}**" if row["ratio"] < 1.0 else ratio) + interval
 
 
 _HEADER = ("case", "device", "time", "peer", "peer's time", "ratio", "error", "of limit", "metadata")
@@ -72,6 +88,15 @@ def _machine(machine: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _speeds(run: Mapping[str, Any]) -> str:
+    """Return the range of the FLOP rates before and after each operation; nothing for runs without them."""
+    parts = []
+    for device in dict.fromkeys(probe["device"] for probe in run.get("probes", ())):
+        rates = [probe[when] / 1e9 for probe in run["probes"] if probe["device"] == device for when in _PROBED]
+        parts.append(f"``{device}`` {min(rates):.0f} to {max(rates):.0f} GFLOP/s")
+    return f" Probes before and after each operation: {', '.join(parts)}." if parts else ""
+
+
 def run_page(name: str, run: Mapping[str, Any]) -> str:
     """Return the page of one run."""
     rows = run["rows"]
@@ -83,7 +108,7 @@ def run_page(name: str, run: Mapping[str, Any]) -> str:
         title(name),
         _machine(run["machine"]),
         f"{date}- Command: ``gpuvision profile {' '.join(operations)} --json FILE``.",
-        f"- The speed of the machine was constant during the run: {'yes' if run['valid'] else '**no**'}.",
+        f"- The speed of the machine was constant during the run: {'yes' if run['valid'] else '**no**'}.{_speeds(run)}",
         f"- Rows: {len(rows)}; the peer is faster in {slower} of them (ratio in bold).\n",
         "See :doc:`../index` for the meaning of the columns.\n",
     ]

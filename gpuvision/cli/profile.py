@@ -12,9 +12,11 @@ from gpuvision.cli.arguments import Overwrite, ReportFile, echo, named_path, pri
 from gpuvision.host.errors import GpuVisionError
 
 if TYPE_CHECKING:
-    from gpuvision.profiling.harness import Row
+    from gpuvision.profiling.harness import Row, Run
 
-_SECONDS = 2.0
+_SECONDS, _QUICK_SECONDS = 2.0, 0.3  # longest time to measure a case [s]
+_MINUTES, _QUICK_MINUTES = 20.0, 3.0
+_CONFIDENCE = 0.95
 _NO_PLOTS = "no plots: these operations have no series over size or tolerance; try light_clustering or reflections"
 
 
@@ -30,7 +32,21 @@ def profile(
             help="Label of an OpenCL device, see `gpuvision devices`; repeat the option for several. Default: all.",
         ),
     ] = None,
-    seconds: Annotated[float, typer.Option(help="Approximate time to measure each case [s].", min=0.01)] = _SECONDS,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="Longest time to measure each case [s]. Default: 2, with --quick 0.3.", min=0.01),
+    ] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(
+            help="Approximate time of the whole run [min]; cases are measured for a shorter time if the run would take "
+            "longer. Default: 20, with --quick 3.",
+            min=0.01,
+        ),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Measure only one case of each operation, on the default device.")
+    ] = False,
     as_json: ReportFile = None,
     plots: Annotated[
         Path | None,
@@ -55,8 +71,9 @@ def profile(
 ) -> None:
     """Measure operations against their peers: NumPy, Numba, OpenCV.
 
-    Candidates run interleaved. The ratio is the time of the peer over the time of gpuvision. A run during which the
-    machine changed its speed is marked invalid, and the exit code is 1. If the measurement of an operation fails, the
+    Candidates run interleaved. The ratio is the time of the peer over the time of gpuvision, with its 95 % confidence
+    interval. The FLOP rate of the device is measured before and after each operation; a run during which it changed is
+    marked invalid, and the exit code is 1. If the measurement of an operation fails, the
     others are still measured; the report names the operation and the reason, and the exit code is 1.
 
     With --offline nothing is measured: the kernels are compiled for GPUs by Clang and NVIDIA's ptxas. The table shows
@@ -67,7 +84,7 @@ def profile(
     if offline:
         from gpuvision.cli.profile_offline import profile_offline
 
-        measures = {"device": device or None, "seconds": None if seconds == _SECONDS else seconds, "plots": plots}
+        measures = {"device": device or None, "seconds": seconds, "minutes": minutes, "quick": quick, "plots": plots}
         reject_unused("with --offline", **measures)
         profile_offline(offline, operations or (), as_json, one_build=one_build, overwrite=overwrite)
         return
@@ -87,11 +104,14 @@ def profile(
     for name in operations or ():
         if name not in harness.OPERATIONS:
             raise ValueError(f"no operation {name!r} to profile; expected some of {', '.join(harness.OPERATIONS)}")
-    devices = [Device.named(each) for each in device] if device else list(Device.all() or [Device.best()])
+    everywhere = [] if quick else Device.all()
+    devices = [Device.named(each) for each in device] if device else list(everywhere or [Device.best()])
     run = harness.profile(
         operations or list(harness.OPERATIONS),
         devices,
-        seconds=seconds,
+        seconds=seconds or (_QUICK_SECONDS if quick else _SECONDS),
+        total=60.0 * (minutes or (_QUICK_MINUTES if quick else _MINUTES)),
+        quick=quick,
         progress=lambda line: echo(line, err=True),
     )
     if prints_report(as_json):
@@ -99,6 +119,8 @@ def profile(
     elif as_json is not None:
         run.write(as_json, overwrite=overwrite)
     _show(list(run.rows), to_stderr=prints_report(as_json))
+    for line in _speeds(run):
+        echo(line, err=True)
     if plots is not None:
         drawn = draw_plots(plots, run.rows, overwrite=overwrite)
         echo(f"look at {', '.join(str(plots / name) for name in drawn)}" if drawn else _NO_PLOTS, err=True)
@@ -132,14 +154,37 @@ def _show(rows: list[Row], to_stderr: bool) -> None:
             console.print(line, highlight=False, markup=False)
 
 
+def _speeds(run: Run) -> list[str]:
+    """Return the trace of the speed probe: a line for each device, and one for each section that was not steady."""
+    lines = []
+    for device in dict.fromkeys(probe.device for probe in run.probes):
+        rates = [1e-9 * rate for probe in run.probes if probe.device == device for rate in (probe.before, probe.after)]
+        trace = " ".join(f"{rate:.0f}" for rate in rates)
+        lines.append(f"speed of {device} before and after each operation [GFLOP/s]: {trace}")
+    for probe in run.probes:
+        if not probe.steady:
+            change = f"{1e-9 * probe.before:.0f} -> {1e-9 * probe.after:.0f} GFLOP/s"
+            lines.append(f"not steady: {probe.operation} on {probe.device}, {change}")
+    return lines
+
+
 def _metadata_line(row: Row) -> str:
     return f" {row.case} on {row.device}: " + ", ".join(f"{name} {value}" for name, value in row.metadata.items())
 
 
 def _cells(row: Row) -> tuple[str, ...]:
     fraction = "" if row.fraction is None else f"{100 * row.fraction:.0f} %"
-    times = (_time(row.seconds), row.peer, _time(row.peer_seconds))
-    return row.case, row.device, *times, f"{row.ratio:.2f}", f"{row.error:.1e}", fraction
+    peer = f"{row.peer}\n({row.form})" if row.form else row.peer
+    times = (_time(row.seconds), peer, _time(row.peer_seconds))
+    return row.case, row.device, *times, _ratio(row), f"{row.error:.1e}", fraction
+
+
+def _ratio(row: Row) -> str:
+    """Return the ratio, and the larger half of its interval unless this has less than 95 % confidence."""
+    if row.ratio_low is None or row.ratio_high is None or (row.confidence or 0.0) < _CONFIDENCE:
+        return f"{row.ratio:.2f}"
+    half = max(row.ratio_high - row.ratio, row.ratio - row.ratio_low)
+    return f"{row.ratio:.2f} ±{100 * half / row.ratio:.0f}%"
 
 
 def _time(seconds: float) -> str:

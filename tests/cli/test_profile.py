@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from gpuvision.cli.main import application
 from gpuvision.host import Device, GpuVisionError, NoDeviceError
 from gpuvision.profiling import harness
-from gpuvision.profiling.harness import Failure, Row, Run
+from gpuvision.profiling.harness import Failure, Probe, Row, Run
 
 ROW = Row(
     operation="psd",
@@ -25,6 +25,10 @@ ROW = Row(
     peer_version="2.9",
     peer_seconds=4.56e-5,
     ratio=3.14159,
+    ratio_low=3.11,
+    ratio_high=3.3,
+    confidence=0.96,
+    form="words",
     error=1.5e-9,
     fraction=0.5,
     metadata={"rate": 4000, "p50": 1e-4},
@@ -38,7 +42,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
     def profile(operations: Sequence[str], devices: Sequence[Device], **options: Any) -> Run:
         seen.update(operations=list(operations), devices=[each.label for each in devices], **options)
-        return Run([ROW], seen.get("valid", True), {"processor": "abacus"}, seen.get("failures", ()))
+        probes = [Probe("psd", "pocl", 101e9, 99e9, True), Probe("line", "pocl", 98e9, 55e9, False)]
+        return Run([ROW], seen.get("valid", True), {"processor": "abacus"}, seen.get("failures", ()), probes)
 
     monkeypatch.setattr(harness, "profile", profile)
     return seen
@@ -67,7 +72,8 @@ def test_what_was_asked_for_is_measured_and_shown(asked: dict[str, Any], tmp_pat
         "12.3 ms",
         "numpy",
         "45.6 µs",
-        "3.14",
+        "3.14 ±5%",
+        "(words)",
         "1.5e-09",
         "50 %",
         "float32/1e6 on pocl: rate 4000, p50 0.0001",
@@ -82,6 +88,19 @@ def test_rows_on_standard_output_are_json_alone(asked: dict[str, Any]) -> None:
     ran = CliRunner().invoke(application(), ["profile", "psd", "--json", "-"])
     assert json.loads(ran.stdout)["rows"][0]["case"] == "float32/1e6"
     assert "12.3 ms" in ran.stderr
+
+
+def test_the_trace_of_the_speed_probe_is_shown(asked: dict[str, Any]) -> None:
+    ran = CliRunner().invoke(application(), ["profile", "psd"])
+    assert "speed of pocl before and after each operation [GFLOP/s]: 101 99 98 55\n" in ran.stderr
+    assert "not steady: line on pocl, 98 -> 55 GFLOP/s\n" in ran.stderr
+
+
+def test_a_quick_run_is_short_and_on_the_default_device(asked: dict[str, Any]) -> None:
+    CliRunner().invoke(application(), ["profile", "--quick"])
+    assert (asked["quick"], asked["total"], asked["devices"]) == (True, 180.0, [Device.best().label])
+    CliRunner().invoke(application(), ["profile", "--minutes", "1.5", "--seconds", "1"])
+    assert (asked["quick"], asked["total"], asked["seconds"]) == (False, 90.0, 1.0)
 
 
 def test_without_plots_it_says_which_operations_have_some(asked: dict[str, Any], tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import json
 import types
 from importlib.metadata import version
@@ -12,7 +13,7 @@ import pytest
 
 pytest.importorskip("numba", reason="the extra 'profile' is not installed")
 
-from gpuvision.profiling import ceiling, harness
+from gpuvision.profiling import ceiling, harness, rounds
 
 
 def case(**changes):
@@ -46,7 +47,7 @@ class StepClock:
 @pytest.fixture
 def clock(monkeypatch):
     clock = StepClock()
-    monkeypatch.setattr(harness, "time", clock)
+    monkeypatch.setattr(rounds, "time", clock)
     return clock
 
 
@@ -69,6 +70,44 @@ def test_a_row_shows_the_fastest_form_of_a_peer(clock, device):
     assert strongest.peer_version == plain.peer_version == version("numba")
     assert (strongest.peer_seconds, plain.peer_seconds) == pytest.approx((8e-4, 16e-4))
     assert strongest.to_dict()["form"] == "words"
+
+
+def test_a_row_states_the_spread_of_the_ratio_over_the_rounds(clock, device):
+    """The peer takes 200 to 800 times as long as ours; its turn is one call."""
+    extra = itertools.cycle([0.1 * k - 1e-4 for k in (5, 5, 2, 8, 3, 7, 4, 6)])
+
+    def uneven():
+        clock.now += next(extra)
+
+    few, many = (
+        harness.measure(case(ours=clock.work(0.0009), peers={"numpy": uneven}), device, seconds=seconds)[0]
+        for seconds in (7.0, 30.0)
+    )
+    for row in (few, many):
+        assert row.ratio == pytest.approx(500.0, rel=0.21)
+        assert 199.0 < row.ratio_low < row.ratio < row.ratio_high < 801.0
+        assert 0.95 <= row.confidence < 1.0
+    assert few.rounds < many.rounds <= 101
+    assert many.ratio_high - many.ratio_low < few.ratio_high - few.ratio_low
+
+
+def test_a_slow_peer_is_measured_once_or_twice(clock, device):
+    """A peer that alone takes longer than the time of the case takes one turn of one call; one of half of it two."""
+    calls = {"numba": 0, "numpy": 0}
+
+    def slow(name, seconds):
+        def call():
+            calls[name] += 1
+            clock.now += seconds
+
+        return call
+
+    peers = {"numba": slow("numba", 5.0), "numpy": slow("numpy", 0.8)}
+    once, twice = harness.measure(case(ours=clock.work(0.01), peers=peers), device, seconds=1.0)
+    assert (once.rounds, twice.rounds) == (1, 2)
+    assert (once.confidence, twice.confidence) == (0.0, 0.5)
+    assert calls == {"numba": 3, "numpy": 4}  # the first call compiles, the second one gives the expected duration
+    assert once.ratio == pytest.approx(500.0, rel=0.02)
 
 
 def test_the_ceiling_moves_the_bytes_of_the_case(clock, monkeypatch, device):
@@ -128,6 +167,31 @@ def test_a_section_is_measured_again_when_the_machine_changed_its_speed(fake, de
     assert run.valid
     assert len(run.rows) == 1
     assert sum("changed its speed" in line for line in lines) == 1
+    assert [(probe.before, probe.after, probe.steady) for probe in run.probes] == [
+        (100.0, 55.0, False),
+        (100.0, 99.0, True),
+    ]
+
+
+def test_a_section_is_not_repeated_when_the_time_is_over(fake, device):
+    fake(*[100.0, 55.0] * 4)
+    run = harness.profile(["psd"], [device], seconds=0.01, total=1e-6)
+    assert not run.valid
+    assert len(run.probes) == len(run.rows) == 1
+
+
+def test_a_quick_run_measures_one_case_of_each_operation(fake, monkeypatch, device):
+    built = []
+
+    def cases(device):
+        for name in ("small", "float32/1e6", "never"):
+            built.append(name)
+            yield case(name=name)
+
+    monkeypatch.setattr(harness.importlib, "import_module", lambda name: types.SimpleNamespace(cases=cases))
+    run = harness.profile(["psd", "bvh"], [device], seconds=0.01, quick=True)
+    assert [row.case for row in run.rows] == ["float32/1e6", "small"]
+    assert built == ["small", "float32/1e6", "small"]
 
 
 def test_a_machine_that_never_holds_its_speed_voids_the_run(fake, device, tmp_path):
@@ -137,6 +201,8 @@ def test_a_machine_that_never_holds_its_speed_voids_the_run(fake, device, tmp_pa
     run.write(tmp_path / "run.json")
     table = json.loads((tmp_path / "run.json").read_text())
     assert table["valid"] is False
+    assert [probe["after"] for probe in table["probes"]] == [55.0] * 4
+    assert {"ratio_low", "ratio_high", "confidence", "rounds"} <= set(table["rows"][0])
     expected = {"operation", "case", "device", "seconds", "peer", "peer_version", "peer_seconds", "ratio", "error"}
     assert expected | {"fraction"} <= set(table["rows"][0])
     assert datetime.date.fromisoformat(table["machine"]["date"]).year >= 2026

@@ -8,7 +8,7 @@ from gpuvision.profiling.plots import draw_plots
 
 
 def row(case: str, seconds: float, **metadata: object) -> Row:
-    return Row("any", case, "pocl", seconds, "gpuvision", "1", 2.0 * seconds, 2.0, 1e-6, None, metadata)
+    return Row("any", case, "pocl", seconds, "gpuvision", "1", 2.0 * seconds, 2.0, 1e-6, None, metadata=metadata)
 
 
 def test_what_grows_and_what_accuracy_costs_is_drawn(tmp_path):

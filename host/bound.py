@@ -80,7 +80,12 @@ class Bound(Generic[R]):
         after_inputs = enumerate(launch.outputs.values(), len(launch.inputs))
         # Indices of the input and output arrays among the kernel's arguments.
         self._places = [*range(len(launch.inputs)), *(place for place, spec in after_inputs if spec is not None)]
-        self._own = (*self.inputs, *self._computed(self.outputs))
+        fields = operation.Result._fields
+        self._absent = [launch.outputs.get(name) is None for name in fields]
+        self._computed_fields = [fields.index(name) for name in self._computed_specs]
+        self._own_outputs = self._computed(self.outputs)
+        self._own = (*self.inputs, *self._own_outputs)
+        self._array_specs = (*launch.inputs, *self._computed_specs.values())
         self._inline_site: _Site | None = None
         try:
             self._connect(launch)
@@ -198,9 +203,8 @@ class Bound(Generic[R]):
 
     def _given(self, frames: tuple[DeviceArray, ...], out: R | None) -> tuple[Any, ...]:
         """Return the arrays of a call in the kernel's order; the instance's arrays if no arrays are given."""
-        if out is not None and out is not self.outputs:
-            self._check_fields(out)
-        return (*(frames or self.inputs), *self._computed(self.outputs if out is None else out))
+        outputs = self._own_outputs if out is None or out is self.outputs else self._computed(out)
+        return (*(frames or self.inputs), *outputs)
 
     def _enqueue(self, given: tuple[Any, ...], wait_for: Sequence[Any] | None = None) -> Any:
         site = self._queue_site if self._inline_site is None else self._site(wait_for)
@@ -241,7 +245,6 @@ class Bound(Generic[R]):
         if out is None:
             out = self._result({k: np.empty(shape, dtype) for k, (shape, dtype) in self._computed_specs.items()})
         targets = self._computed(out)
-        self._check_fields(out)
         for (name, (shape, dtype)), array in zip(self._computed_specs.items(), targets, strict=True):
             check_host(array, shape, dtype, f"out.{name}")
         _check_apart(frames, targets, np.may_share_memory)
@@ -286,24 +289,37 @@ class Bound(Generic[R]):
         self.queue.finish()
 
     def _computed(self, result: R) -> tuple[Any, ...]:
-        return tuple(getattr(result, name) for name in self._computed_specs)
+        """Return the computed fields of a result in the kernel's order; check that only the others are ``None``."""
+        if [array is None for array in result] != self._absent:
+            self._check_fields(result)
+        return tuple([result[index] for index in self._computed_fields])
 
     def _result(self, arrays: Mapping[str, Any]) -> R:
         result: R = self.operation.Result(**{name: arrays.get(name) for name in self.operation.Result._fields})
         return result
 
     def _set_arrays(self, site: _Site, given: tuple[Any, ...]) -> None:
-        specs = (*self._launch.inputs, *self._computed_specs.values())
-        if len(given) != len(specs):
-            raise self._wrong_count(len(given) - len(specs) + len(self.inputs))
-        for array, before, spec in zip(given, site.given, specs, strict=True):
+        """Set the arrays that the last launch at a site did not have as arguments of its kernel, after all checks."""
+        if len(given) != len(self._array_specs):
+            raise self._wrong_count(len(given) - len(self._array_specs) + len(self.inputs))
+        context, known = self.device.context, self._known
+        changed = []
+        for array, before, place, (shape, dtype) in zip(
+            given, site.given, self._places, self._array_specs, strict=True
+        ):
             if array is not before:
-                self._check(array, *spec)
-        inputs = len(self.inputs)
-        _check_apart(given[:inputs], given[inputs:], _same_memory)
-        for place, array, before in zip(self._places, given, site.given, strict=True):
-            if array is not before:
-                site.kernel.set_arg(place, self._known.get(id(array)) or memory_of(array))
+                # The conditions of `_check`, which costs as much again for its call.
+                is_array = isinstance(array, cl.array.Array)
+                if not is_array or array.dtype != dtype or array.shape != shape or array.context != context:
+                    self._check(array, shape, dtype)
+                changed.append((place, known.get(id(array)) or memory_of(array)))
+        # As many memory objects as arrays: none is shared. Fewer: an input is given twice, or arrays are empty, or an
+        # output is refused.
+        if changed and len({id(array.base_data) for array in given}) < len(given):
+            inputs = len(self.inputs)
+            _check_apart(given[:inputs], given[inputs:], _same_memory)
+        for place, memory in changed:
+            site.kernel.set_arg(place, memory)
         site.given = given
 
     def _wrong_count(self, given: int) -> TypeError:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
+import pyopencl.array
 
 from gpuvision.host import Device
+from gpuvision.host.arrays import memory_of
 from gpuvision.profiling.harness import Case
 from gpuvision.ranging.psd import PsdReadout
 
@@ -17,33 +21,57 @@ _REPEATS = 50
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield `bound`, with fixed arguments, and `given`, with a different input array in each call."""
+    """Yield `bound`, with fixed arguments, `given`, with a new input in each call, and `given-out`, with new arrays.
+
+    The peer sets the same arguments of the kernel of the bound operation, and launches it with the same sizes.
+    """
     bound = PsdReadout(strip_length=6e-3).bind(device, (16, 2), np.float32)
     frames = [device.empty((16, 2), np.float32) for _ in range(2)]
     for frame in frames:
         frame.set(np.ones((16, 2), np.float32))
-    # The peer launches the kernel of the bound operation with the same sizes.
-    arguments = bound.enqueue_arguments
-    queue = arguments[0]
+    results = [bound.allocate() for _ in range(2)]
+    inputs = [{0: memory_of(frame)} for frame in frames]
+    # Arguments of the kernel: the input, then the fields of the result.
+    arrays = [
+        {
+            **inputs[k],
+            **{
+                place: memory_of(array)
+                for place, array in enumerate(results[k], 1)
+                if isinstance(array, cl.array.Array)
+            },
+        }
+        for k in range(2)
+    ]
+    queue, kernel, *sizes = bound.enqueue_arguments
+    calls: dict[str, tuple[Callable[[int], object], list[dict[int, Any]]]] = {
+        "bound": (lambda _: bound(), [{}, {}]),
+        "given": (lambda number: bound(frames[number]), inputs),
+        "given-out": (lambda number: bound(frames[number], out=results[number]), arrays),
+    }
+    for name, (launch, arguments) in calls.items():
+        ours = _repeated(launch, queue)
+        plain = _repeated(functools.partial(_launch_plainly, queue, kernel, sizes, arguments), queue)
+        metadata = {"overhead_us": _overhead(ours, plain) * 1e6}
+        yield Case("launch", name, ours, {"pyopencl": plain}, error=0.0, repeats=_LAUNCHES, metadata=metadata)
 
-    def plain() -> None:
-        for _ in range(_LAUNCHES):
-            cl.enqueue_nd_range_kernel(*arguments)
-        queue.finish()
 
-    def preset() -> None:
-        for _ in range(_LAUNCHES):
-            bound()
-        queue.finish()
+def _launch_plainly(queue: Any, kernel: Any, sizes: list[Any], arguments: list[dict[int, Any]], number: int) -> None:
+    """Set the arguments of one call and launch the kernel, with pyopencl alone."""
+    for place, memory in arguments[number].items():
+        kernel.set_arg(place, memory)
+    cl.enqueue_nd_range_kernel(queue, kernel, *sizes)
 
-    def given() -> None:
+
+def _repeated(launch: Callable[[int], object], queue: Any) -> Callable[[], None]:
+    """Return a function that launches many times, with the arrays 0 and 1 in turn, and waits."""
+
+    def launches() -> None:
         for number in range(_LAUNCHES):
-            bound(frames[number % 2])
+            launch(number % 2)
         queue.finish()
 
-    for name, call in (("bound", preset), ("given", given)):
-        metadata = {"overhead_us": _overhead(call, plain) * 1e6}
-        yield Case("launch", name, call, {"pyopencl": plain}, error=0.0, repeats=_LAUNCHES, metadata=metadata)
+    return launches
 
 
 def _overhead(call: Callable[[], None], plain: Callable[[], None]) -> float:

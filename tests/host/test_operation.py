@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import gc
 import threading
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyopencl as cl
 import pytest
 
-from gpuvision.host import BuildError, Device, host_view
+from gpuvision.host import BuildError, Device, Launch, Operation, host_view, to_numpy
 from gpuvision.host.arrays import memory_of
 from gpuvision.host.program import build, options
 from gpuvision.operation import KERNEL_FOLDER
@@ -229,6 +230,51 @@ def test_another_dtype_shape_kind_or_number_is_told(device, pairs):
     with pytest.raises(TypeError, match="all of one kind"):
         READOUT(pairs, bound.inputs[0], device=device)
     bound().wait()  # the refused call has not changed the bound instance
+
+
+def test_a_refused_array_leaves_all_arguments_as_they_were(memory, pairs):
+    bound = READOUT.bind(memory, pairs.shape, pairs.dtype)
+    frame, other = memory.empty(pairs.shape, pairs.dtype), memory.empty(pairs.shape, pairs.dtype)
+    frame.set(pairs)
+    other.set(pairs[::-1].copy())
+    bound.run(frame)
+    with pytest.raises(ValueError, match="expected shape"):
+        bound(other, out=bound.outputs._replace(total=memory.empty((999,), np.float32)))
+    np.testing.assert_allclose(bound.run(frame).position.get(), expected(pairs), atol=5e-7)
+
+
+class Copies(NamedTuple):
+    """Result whose fields are in another order than the kernel's arguments."""
+
+    tripled: Any
+    missing: Any
+    doubled: Any
+
+
+class Copy(Operation[Copies]):
+    """Operation whose kernel takes its outputs in another order than the fields of the result."""
+
+    Result = Copies
+
+    def launch(self, device, shape, dtype):
+        spec = (shape, dtype)
+        outputs = {"doubled": spec, "tripled": spec, "missing": None}
+        return Launch("copies.cl", "copies", [spec], outputs, shape, (1,))
+
+
+def test_outputs_follow_the_order_of_the_kernel(memory, tmp_path):
+    arguments = "global const float *in, global float *doubled, global float *tripled, global float *missing"
+    body = "int i = get_global_id(0); doubled[i] = 2 * in[i]; tripled[i] = 3 * in[i]; if (missing) missing[i] = 0;"
+    (tmp_path / "copies.cl").write_text(f"kernel void copies({arguments}) {{ {body} }}")
+    operation = Copy()
+    operation.kernel_folder = tmp_path
+    values = np.arange(8, dtype=np.float32)
+    bound = operation.bind(memory, values.shape, values.dtype)
+    frame, out = memory.empty(values.shape, values.dtype), bound.allocate()
+    frame.set(values)
+    for result in (bound.run(frame), bound.run(frame, out=out), bound.on_host((values,))):
+        np.testing.assert_array_equal(to_numpy(result.doubled), 2 * values)
+        np.testing.assert_array_equal(to_numpy(result.tripled), 3 * values)
 
 
 def test_run_waits_and_returns_what_was_written(memory, pairs):

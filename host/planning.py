@@ -282,8 +282,7 @@ def plan_stream(
     )
     if device is not None or measure is not None:
         return plan(Device.best() if device is None else device)
-    devices = candidate_devices()
-    return plan(devices[0]) if len(devices) == 1 else _fastest(plan, devices)
+    return _fastest(plan, candidate_devices())
 
 
 def _fastest(plan: Callable[[Device], Plan], devices: Sequence[Device]) -> Plan:

@@ -54,7 +54,7 @@ class Queues:
     With ``inline``, the compute queue runs kernels in the thread that enqueues them.
     """
 
-    def __init__(self, device: Device, *, zero_copy: bool, profiling: bool, inline: bool = False) -> None:
+    def __init__(self, device: Device, *, zero_copy: bool, profiling: bool, inline: bool) -> None:
         self.compute = device.new_queue(profiling=profiling, inline=inline)
         self.upload = self.download = self.compute
         if not zero_copy:

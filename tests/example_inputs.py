@@ -14,9 +14,12 @@ WITHOUT_NUMBERS = frozenset(
         "FieldPoseRefinement",
         "FindBlobs",
         "MeasureBoardEdges",
+        "MeasureDeposits",
+        "MirrorPoints",
         "RulerEdges",
         "SolveFeatures",
         "_AlongProfiles",
+        "_AlongSamples",
     }
 )
 

@@ -60,7 +60,8 @@ def assert_same(reading, expected, precision=np.float32, slack=1.0):
 @pytest.mark.parametrize("method", ["centroid", "windowed"])
 @pytest.mark.parametrize(("dtype", "along", "variant"), EVERY)
 def test_centre_of_gravity(device, rng, method, dtype, along, variant):
-    parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": WINDOW}
+    second = {"ambiguity": 0.5} if method == "windowed" and dtype == "uint8" else {}
+    parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": WINDOW, **second}
     readout = LineReadout(variant=variant, **parameters)
     # The last one has a column more than one strip takes, or a row of many blocks and a rest.
     for shape in ((2, 137, 201), (64, 64), (50, 1025)):

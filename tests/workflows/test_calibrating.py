@@ -230,6 +230,9 @@ def test_points_go_through_the_same_lens(device: Device, tmp_path: Path, rng: np
     assert written == (tmp_path / "out" / "points.npy",)
     rounding = 1e-9 if device.has_double else 1e-3
     np.testing.assert_allclose(np.load(written[0]), LENS.undistort(points), rtol=0.0, atol=rounding)
+    (binned,) = undistort_files([tmp_path / "points.npy"], LENS, tmp_path / "binned", binning=2, device=device)
+    expected = (LENS.undistort(2.0 * points + 0.5) - 0.5) / 2.0
+    np.testing.assert_allclose(np.load(binned), expected, rtol=0.0, atol=rounding)
 
 
 @pytest.mark.parametrize("kind", ["uint8", "uint16", "float32"])

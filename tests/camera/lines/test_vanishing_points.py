@@ -431,6 +431,9 @@ def test_too_few_points_are_refused(rng: np.random.Generator) -> None:
         fit_lens([[points[0, :3], points[9, :3], points[20, :3]]], model="k1,k2", lines="free")
     with pytest.raises(ValueError, match="no family has two lines, so none has a vanishing point"):
         fit_lens([[points[0]], [points[:, 0]]], model="k1", lines="vanishing")
+    # As many numbers as parameters: two of the lens, two of the vanishing point and one of each line.
+    with pytest.raises(ValueError, match="6 points on 2 lines leave nothing to estimate the errors from"):
+        fit_lens([[points[2, :3], points[9, :3]]], model="k1,k2", lines="vanishing", centre=(320.0, 240.0))
     with pytest.raises(ValueError, match="all lines go through the centre"):
         fit_lens([[points[11]]], model="k1", centre=tuple(points[11, 3]))
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.matching.board import edge_measurement
 from gpuvision.matching.board.edge_measurement import BoardMeasurer, _reason_of, move_view
-from gpuvision.matching.board.measurement_result import MeasurementLimits
+from gpuvision.matching.board.measurement_result import Copper, MeasurementLimits
 from gpuvision.status import Status
 
 LENGTHS = st.floats(-0.2, 0.2)
@@ -85,3 +85,46 @@ def test_range_in_which_fiducials_are_searched(
     )
     view: Any = types.SimpleNamespace(scale=20e-6)
     assert measurer._find_fiducials(view, "bright", is_first=is_first) == pytest.approx(search_px)
+
+
+@pytest.mark.parametrize(("copper", "polarities"), [("bright", ["falling", "rising"]), ("dark", ["rising", "falling"])])
+def test_rulers_of_edges_and_of_traces(monkeypatch: pytest.MonkeyPatch, copper: Copper, polarities: list[str]) -> None:
+    """Single edges, then traces of 10 to 11 px: their widths are searched from 0.6 w - 2 to 1.4 w + 2 pixels."""
+    rulers: list[dict[str, Any]] = []
+
+    def measure(**how: Any) -> Any:
+        rulers.append(how)
+        return lambda _, placed, **more: types.SimpleNamespace(
+            position=placed[:, 0], sigma=np.full(len(placed), 0.3), status=np.full(len(placed), 2)
+        )
+
+    monkeypatch.setattr(edge_measurement, "RulerEdges", measure)
+    view = BoardView(scale=1e-4, shape=(40, 60), pose=(0.0, 0.0, 0.0))
+    features: Any = types.SimpleNamespace(
+        point=np.array([[1e-3, 0.0], [2e-3, 0.0], [-1e-3, 0.0]]),
+        normal=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]]),
+        spacing=np.array([1.1e-3, 0.0, 1e-3]),
+        imaging=types.SimpleNamespace(width_px=5, smoothing_ratio=1.5),
+    )
+    device: Any = None
+    limits = MeasurementLimits()
+    measurer = BoardMeasurer(
+        np.zeros((40, 60), np.float32),
+        features,
+        noise=1.0,
+        threshold=10.0,
+        blur_px=1.0,
+        etch_bias_sigma=10e-6,
+        device=device,
+        limits=limits,
+    )
+    found = measurer._measure_rulers(view, copper, np.array([20.0, 33.0, 10.0]))
+    assert [each["pairs"] for each in rulers] == [False, True]
+    assert [each["spacing_px"] for each in rulers] == [None, pytest.approx((4.0, 17.4))]
+    assert [each["polarity"] for each in rulers] == polarities
+    assert [(each["length"], each["smoothing_px"], each["width"]) for each in rulers] == [(48, 1.5, 5)] * 2
+    np.testing.assert_allclose(found.position_px, 29.5 + np.array([10.0, 20.0, -10.0]))
+    np.testing.assert_allclose(found.sigma, np.hypot(0.3, limits.sampling_sigma_px) * 1e-4)
+    np.testing.assert_array_equal(found.status, 2)
+    np.testing.assert_array_equal(found.weight, 0.0)
+    assert np.isnan(found.residual).all()

@@ -401,3 +401,14 @@ def test_wrong_input(device: Device) -> None:
 def test_wrong_parameters(options: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         FindBlobs(**{"threshold": 20.0, **options})
+
+
+def test_integer_frames_have_the_noise_of_rounding() -> None:
+    """Rounding to whole grey levels adds a variance of 1/12: frames of floats with the sum have the same numbers."""
+    shape = (64, 64)
+    rounded = replace(PLAIN, count=3, noise=0.5).launch(Device.best(), shape, np.dtype(np.uint8))
+    exact = replace(PLAIN, count=3, noise=math.sqrt(0.25 + 1.0 / 12.0)).launch(
+        Device.best(), shape, np.dtype(np.float32)
+    )
+    for one, other in zip(rounded.arguments, exact.arguments, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)

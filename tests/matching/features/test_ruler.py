@@ -591,3 +591,15 @@ def test_each_ruler_looks_for_its_edge(variant: Any, rng: np.random.Generator, d
     assert np.isnan(found.spacing[~is_pair]).all()
     with pytest.raises(ValueError, match="per_ruler takes polarity and spacing from the rulers"):
         replace(base, per_ruler=True, pairs=True)
+
+
+def test_integer_frames_have_the_noise_of_rounding() -> None:
+    """Rounding to whole grey levels adds a variance of 1/12: frames of floats with the sum have the same numbers."""
+    rounded = replace(STRONGEST, count=3, noise=0.5).launch(Device.best(), SHAPE, np.dtype(np.uint8))
+    exact = replace(STRONGEST, count=3, noise=math.sqrt(0.25 + 1.0 / 12.0)).launch(
+        Device.best(), SHAPE, np.dtype(np.float32)
+    )
+    for one, other in zip(rounded.arguments, exact.arguments, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None:
+            np.testing.assert_allclose(one, other, rtol=1e-6)

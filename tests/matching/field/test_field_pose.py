@@ -358,6 +358,18 @@ def test_poses_that_are_none(device: Device, rng: np.random.Generator) -> None:
     assert refined.status[0] == Status.LOW_SIGNAL
 
 
+def test_four_exact_points_are_enough(device: Device) -> None:
+    """Two points on each of two border lines fix the pose; three are too few."""
+    field_map, pose = large(device), np.float32([[8.9375, 4.9375, 0.0]])
+    assert (field_map.field.lines[0][0], field_map.field.lines[0][1]) == (-10.9375, -6.9375)
+    points = np.float32([[2.0, -1.0], [2.0, 1.0], [-1.0, 2.0], [1.0, 2.0]])
+    fit = FieldPoseRefinement(map=field_map)(points, pose, device=device)
+    assert fit.status[0] == Status.OK
+    np.testing.assert_array_equal(fit.poses, pose)
+    refined = FieldPoseRefinement(map=field_map)(points[:3], pose, device=device)
+    assert refined.status[0] == Status.LOW_SIGNAL
+
+
 def test_wrong_inputs_are_refused(device: Device) -> None:
     field_map = large(device)
     search, refine = FieldPoseSearch(map=field_map), FieldPoseRefinement(map=field_map)

@@ -84,6 +84,20 @@ def test_dataclasses_are_made_by_keyword() -> None:
     assert not new, f"{new}: add kw_only=True, or the name to POSITIONAL_DATACLASSES"
 
 
+def test_private_fields_are_not_printed() -> None:
+    """They are computed from the parameters, and may be large arrays."""
+    checked, printed = 0, []
+    for file, node in _nodes(ast.ClassDef):
+        for each in (each for each in node.body if isinstance(each, ast.AnnAssign)):
+            if ast.unparse(each.target).startswith("_") and isinstance(each.value, ast.Call):
+                checked += 1
+                flags = {word.arg: ast.unparse(word.value) for word in each.value.keywords}
+                if (flags.get("init"), flags.get("repr")) != ("False", "False"):
+                    printed.append(f"{file}: {node.name}.{ast.unparse(each.target)}")
+    assert checked > 10
+    assert printed == []
+
+
 def test_dataclasses_with_arrays_are_compared_by_identity() -> None:
     assert COMPARED_BY_IDENTITY - {name for name, flags in _flags() if not flags.get("eq", True)} == set()
 

@@ -186,6 +186,20 @@ def test_triangulation_predicts_errors_up_to_a_rigid_motion(truth: LaserSensor, 
     assert np.median(absolute) > 1.5 * np.median(sigmas[:, 1])
 
 
+def test_triangulation_keeps_the_size_of_the_errors(truth: LaserSensor, found: SensorGeometry) -> None:
+    """The mean variance over the pixels is that of the points without the best rigid motion of each error pattern."""
+    pixels = truth.project(truth.surface(FLAT))
+    predicted = found.triangulation(SIZE, "columns", pixels).covariance_at(pixels[:, ::-1])
+    patterns = np.stack([found.sheet.g_axis, found.sheet.h_axis]) @ found.derivatives(pixels)
+    g, h = found.in_sheet(found.points(pixels)).T
+    turn = np.stack([h.mean() - h, g - g.mean()], axis=1)
+    patterns = patterns - patterns.mean(axis=0)
+    patterns = patterns - turn[:, :, None] * np.einsum("ni,nip->p", turn, patterns) / np.sum(turn**2)
+    covariance = found.covariance[: patterns.shape[2], : patterns.shape[2]]
+    expected = np.einsum("nip,pq,niq->", patterns, covariance, patterns) / len(pixels)
+    assert np.trace(predicted, axis1=-2, axis2=-1).mean() == pytest.approx(expected, rel=1e-6)
+
+
 @pytest.mark.slow
 def test_systematic_sigmas_hold_over_seeds(truth: LaserSensor) -> None:
     ratios = []

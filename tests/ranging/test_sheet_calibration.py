@@ -61,6 +61,7 @@ def test_sheet_is_found_within_its_sigma(truth: LaserSensor, rng: np.random.Gene
     error = errors_of(found, truth)
     assert error @ np.linalg.solve(found.covariance(np.zeros((0, 0))), error) < 23.0  # 0.1 % of six normal numbers
     assert found.sigma_px == pytest.approx(0.1, rel=0.1)
+    assert found.rms_px == pytest.approx(0.1, rel=0.1)
     assert found.g_axis @ truth.g > 0.99
     assert found.h_axis @ truth.h > 0.99
     assert found.view_ratio < 3.0

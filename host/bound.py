@@ -259,7 +259,8 @@ class Bound(Generic[R]):
             self._raise(error)
         return out
 
-    def _run_in_place(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
+    def _run_in_place(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> Any:
+        """Run in the memory of the arrays, wait, and return the event of the kernel."""
         flags, context = cl.mem_flags, self.device.context
         read = [cl.Buffer(context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in frames]
         write = [cl.Buffer(context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in targets]
@@ -267,7 +268,7 @@ class Bound(Generic[R]):
         site.given = (None,) * len(self._own)
         for index, memory in zip(self._places, (*read, *write), strict=True):
             site.kernel.set_arg(index, memory)
-        cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
+        event = cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
         for memory, array in zip(write, targets, strict=True):
             # Mapping makes the kernel's writes visible to the host; the address stays the same.
             mapped, _ = cl.enqueue_map_buffer(
@@ -277,15 +278,31 @@ class Bound(Generic[R]):
         site.queue.finish()
         # Replace the temporary buffers before they are freed: kernel arguments must never dangle.
         self._set_arrays(site, self._own)
+        return event
 
     def _run_with_copies(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
-        for array, frame in zip(self.inputs, frames, strict=True):
-            if frame.size:  # OpenCL refuses copies of zero bytes
-                cl.enqueue_copy(self.queue, memory_of(array), frame, is_blocking=False)
+        self._upload_frames(frames)
         self()
-        for array, target in zip(self._computed(self.outputs), targets, strict=True):
-            if target.size:
-                cl.enqueue_copy(self.queue, target, memory_of(array), is_blocking=False)
+        self._download_results(targets)
+        self._finish()
+
+    def _upload_frames(self, frames: Sequence[HostArray]) -> list[Any]:
+        """Enqueue the copies to the inputs and return their events."""
+        return [
+            cl.enqueue_copy(self.queue, memory_of(array), frame, is_blocking=False)
+            for array, frame in zip(self.inputs, frames, strict=True)
+            if frame.size  # OpenCL refuses copies of zero bytes
+        ]
+
+    def _download_results(self, targets: Sequence[HostArray]) -> list[Any]:
+        """Enqueue the copies from the outputs and return their events."""
+        return [
+            cl.enqueue_copy(self.queue, target, memory_of(array), is_blocking=False)
+            for array, target in zip(self._computed(self.outputs), targets, strict=True)
+            if target.size
+        ]
+
+    def _finish(self) -> None:
         self.queue.finish()
 
     def _computed(self, result: R) -> tuple[Any, ...]:

@@ -23,6 +23,7 @@ from gpuvision.host.failure import launch_failure
 from gpuvision.host.kept import clear_with
 from gpuvision.host.process import check_process
 from gpuvision.host.text import printable, size_in_words
+from gpuvision.host.trace import active_trace
 
 VARIABLE = "GPUVISION_DEVICE"
 _COMPLETE = cl.command_execution_status.COMPLETE
@@ -90,7 +91,7 @@ class Device:
         # The context is kept for the queue, too: Intel's runtime frees a context while a queue of it exists.
         self.inline_device = inline_device
         context = queue.context if queue is not None else self._new_context()
-        own_queue = queue if queue is not None else cl.CommandQueue(context, handle)
+        own_queue = queue if queue is not None else self._new_queue(context, handle)
         self._connection = _Connection(context, own_queue, may_reopen=queue is None)
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
         self.prefers_vectors = self.is_cpu and kind in _VECTOR_RUNTIMES
@@ -113,6 +114,12 @@ class Device:
 
     def _new_context(self) -> Any:
         return cl.Context([self.handle] if self.inline_device is None else [self.handle, self.inline_device])
+
+    @staticmethod
+    def _new_queue(context: Any, handle: Any) -> Any:
+        """Return a default queue; while a trace is active its events carry device times."""
+        properties: Any = cl.command_queue_properties.PROFILING_ENABLE if active_trace() is not None else 0
+        return cl.CommandQueue(context, handle, properties=properties)
 
     @property
     def context(self) -> Any:
@@ -148,7 +155,7 @@ class Device:
             connection.may_reopen = False
             try:
                 context = self._new_context()
-                connection.queue, connection.context = cl.CommandQueue(context, self.handle), context
+                connection.queue, connection.context = self._new_queue(context, self.handle), context
             except cl.Error:
                 return False
             return True
@@ -305,7 +312,7 @@ class Device:
         Parameters
         ----------
         profiling : bool
-            Whether events carry device times. Default False.
+            Whether events carry device times; while a `Trace` is active they always do. Default False.
         inline : bool
             Whether kernels run in the thread that enqueues them and are complete when the call returns. Useful for
             chains of kernels of a few microseconds each. Runtimes without inline queues (all but PoCL 3 and Intel's
@@ -315,7 +322,8 @@ class Device:
         -------
         pyopencl.CommandQueue
         """
-        properties = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
+        measures = profiling or active_trace() is not None
+        properties = cl.command_queue_properties.PROFILING_ENABLE if measures else 0
         return (self._new_inline_queue(properties) if inline else None) or self._queue(self.handle, properties)
 
     def inline_queue(self, like: Any, *, groups: int) -> Any:

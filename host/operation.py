@@ -25,6 +25,9 @@ from gpuvision.host.errors import BuildError, DeviceLimitError, DeviceMemoryErro
 from gpuvision.host.kept import clear_cache, kept_bound
 from gpuvision.host.launch import Launch, Specs
 from gpuvision.host.process import check_process
+from gpuvision.host.stages import stage
+from gpuvision.host.trace import records_launches
+from gpuvision.host.traced import TracedBound
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -154,11 +157,13 @@ class Operation(Generic[R]):
             )
         shape = tuple(map(operator.index, shape))
         try:
-            return self._bound_to(device, shape, dtype, queue, inputs)
+            with stage("bind", type(self).__name__):
+                return self._bound_to(device, shape, dtype, queue, inputs)
         except BuildError as error:
             if not device.prefers_vectors:
                 raise
-            bound = self._bound_to(device.without_vectors(), shape, dtype, queue, inputs)
+            with stage("bind", type(self).__name__):
+                bound = self._bound_to(device.without_vectors(), shape, dtype, queue, inputs)
             reason = str(error).splitlines()[0]
             warnings.warn(f"work-items replace vectors on {device.label}: {reason}", RuntimeWarning, stacklevel=2)
             return bound
@@ -171,7 +176,8 @@ class Operation(Generic[R]):
         queue: Any,
         inputs: Sequence[DeviceArray],
     ) -> Bound[R]:
-        return Bound(self, device, shape, dtype, queue, inputs)
+        kind: type[Bound[R]] = TracedBound if records_launches(queue) else Bound
+        return kind(self, device, shape, dtype, queue, inputs)
 
     def __call__(self, *inputs: Any, device: Device | None = None, out: R | None = None) -> R:
         """Run once: on NumPy arrays and wait, or on device arrays and return without waiting.

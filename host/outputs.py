@@ -23,12 +23,27 @@ from gpuvision.host.files import (
     is_device,
     locked_folder,
 )
+from gpuvision.host.stages import stage
 
 MANIFEST = ".gpuvision-outputs.json"
 """Name of the hidden file that lists the outputs in a folder."""
 
 # Largest manifest that is read [bytes] (chosen): about 100 000 files.
 _MAX_MANIFEST = 1 << 24
+
+
+# Files that the process writes when it ends, such as a trace: no other output of any job.
+_reserved: list[Path] = []
+
+
+def reserve(path: str | Path) -> None:
+    """Reserve a file that is written later: no job may read it or write another output under its name."""
+    _reserved.append(Path(path))
+
+
+def release(path: str | Path) -> None:
+    """Release a file that `reserve` was given."""
+    _reserved.remove(Path(path))
 
 
 class Outputs:
@@ -43,13 +58,19 @@ class Outputs:
         followed. Names of files that do not exist are ignored.
     overwrite : bool
         Whether other existing files may be replaced. Default False.
+
+    Raises
+    ------
+    FileExistsError
+        An input is a file that the process writes when it ends (`reserve`).
     """
 
     def __init__(self, job: str, *, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> None:
         self.job, self.overwrite = job, overwrite
         self._inputs = {_identity(each): each for path in inputs for each in _files(Path(path))}
-        self._claimed: dict[Path, Path] = {}
+        self._claimed = {path.resolve(): path for path in _reserved}
         self._manifests: dict[Path, dict[str, Any]] = {}
+        self.protect(*_reserved)
 
     def claim(self, *files: str | Path | None, job: str | None = None) -> None:
         """Check before the work that files can and may be written, and that no two outputs are the same file.
@@ -88,6 +109,9 @@ class Outputs:
     def claim_folder(self, folder: str | Path, names: Iterable[str], *, job: str | None = None) -> None:
         """Check a folder as `check_writable_folder` and its files as `claim`."""
         check_writable_folder(folder)
+        for path in _reserved:
+            if path.resolve() in (Path(folder).resolve(), *Path(folder).resolve().parents):
+                raise ValueError(f"{path} is the folder {folder} of the outputs or one above it; give a file")
         self.claim(*(Path(folder) / name for name in names), job=job)
 
     def protect(self, *files: Path) -> None:
@@ -145,7 +169,7 @@ class Outputs:
             A file is an input, or exists and is not an output of the job. No file is written.
         """
         with contextlib.ExitStack() as lock:  # released after the files have moved
-            with atomic_folder(folder) as inside:
+            with stage("write", str(folder)), atomic_folder(folder) as inside:
                 yield inside
                 lock.enter_context(locked_folder(Path(folder)))
                 self._seal(inside, Path(folder))

@@ -43,7 +43,7 @@ from gpuvision.host.ring import (
 from gpuvision.host.sources import ArraySource, Clock, Source
 from gpuvision.host.stalls import StallRecorder
 from gpuvision.host.text import size_in_words
-from gpuvision.host.trace import Trace
+from gpuvision.host.trace import Trace, active_trace
 
 Policy = Literal["block", "drop_oldest", "raise"]
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -95,7 +95,7 @@ class Pipeline(Generic[R]):
     profile : bool
         Whether to measure the times on the device.
     trace : Trace, optional
-        Timeline, written at the end; turns ``profile`` on.
+        Timeline of this stream, written at its end; turns ``profile`` on. Default: the active trace, if there is one.
     warm_up : int, optional
         Number of batches at the start that the report leaves out; one per slot by default.
     clock : callable
@@ -130,11 +130,12 @@ class Pipeline(Generic[R]):
     ) -> None:
         self._limits = limits
         self.source = _source(source)
-        self.ring, self.policy, self.trace = _whole(ring, "ring", 2, " slots"), policy, trace
+        self.ring, self.policy = _whole(ring, "ring", 2, " slots"), policy
+        self.trace = active_trace() if trace is None else trace
         self.device = Device.best() if device is None else device
         self.zero_copy = self.device.shares_memory if zero_copy is None else zero_copy
         self.inline = inline
-        self.profile = profile or trace is not None
+        self.profile = profile or self.trace is not None
         self._steps = steps_of(operation)
         usual = 1 if takes_single_frames(self._steps) else default_batch(self.source, self.ring)
         self.batch = usual if batch is None else _whole(batch, "batch", 1)
@@ -173,6 +174,8 @@ class Pipeline(Generic[R]):
             self._queues = queues_of(
                 self.device, self.ring, zero_copy=self.zero_copy, profiling=self.profile, inline=self.inline
             )
+            if self.trace is not None:
+                self._stream_number = self.trace.begin_stream(*(queue for each in self._queues for queue in each.all))
             slots: list[Slot[R]] = [
                 kind(self._steps, self.device, queues, self.batch, source.shape, source.dtype)
                 for queues in self._queues
@@ -256,7 +259,9 @@ class Pipeline(Generic[R]):
             self._ready = queue.SimpleQueue()
             self.source.close()
         if self.trace is not None:
-            self.trace.write()
+            self.trace.end_stream(self._stream_number)
+            if not self.trace.is_active:
+                self.trace.write()
         if failure is not None and not self._reported:
             raise StreamError(f"the device failed before the stream's end: {failure}") from failure
 
@@ -404,7 +409,8 @@ class Pipeline(Generic[R]):
         if slot.delivered:
             self._statistics.add_stage("sink", now - slot.delivered)
             if self.trace is not None:
-                self.trace.add({**self._held_spans, "sink": (slot.delivered, now)}, slot.number, slot.count)
+                spans = {**self._held_spans, "sink": (slot.delivered, now)}
+                self.trace.add(spans, slot.number, slot.count, stream=self._stream_number)
             slot.delivered = 0
         self._give_back(slot)
 

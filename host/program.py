@@ -16,6 +16,7 @@ from gpuvision.host.debug import debug_folder, dump_program, flatten_includes
 from gpuvision.host.device import Device
 from gpuvision.host.errors import BuildError
 from gpuvision.host.kept import clear_with
+from gpuvision.host.stages import stage
 
 _COMMENT = re.compile(r"[ \t]*//[^\n]*")
 
@@ -94,7 +95,8 @@ def _build(
             warnings.simplefilter("ignore", cl.CompilerWarning)
             # A program from pyopencl's cache has no build log.
             cache_dir: Any = None if debug_folder() is None else False
-            built: Any = program.build(options=[*words, *includes], devices=[handle], cache_dir=cache_dir)
+            with stage("compile", source):
+                built: Any = program.build(options=[*words, *includes], devices=[handle], cache_dir=cache_dir)
     except cl.RuntimeError as error:
         log = "\n".join(line for line in str(error).splitlines() if line.strip())
         dump(log)

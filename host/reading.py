@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gpuvision.host.errors import GpuVisionError, ReadError, RecordingError
+from gpuvision.host.stages import stage
 from gpuvision.host.text import printable
 
 _LONGEST_REASON = 200  # characters: a reason stays readable in a line
@@ -147,7 +148,8 @@ def reading(what: object, kind: str, error: type[Exception] = ReadError, *, hint
         Any other exception was raised in the block; or the class of `error`.
     """
     try:
-        yield
+        with stage("read", str(what)):
+            yield
     except GpuVisionError:
         raise
     except Exception as problem:  # readers of damaged files raise anything, from AssertionError to RecursionError

@@ -61,9 +61,14 @@ class Queues:
             self.upload = device.new_queue(profiling=profiling)
             self.download = device.new_queue(profiling=profiling)
 
+    @property
+    def all(self) -> tuple[Any, Any, Any]:
+        """Queues of upload, compute and download, which may be one."""
+        return self.upload, self.compute, self.download
+
     def finish(self) -> None:
         """Wait until all queues are empty."""
-        for queue in (self.upload, self.compute, self.download):
+        for queue in self.all:
             queue.finish()
 
 

@@ -13,11 +13,13 @@ from typing import Any, TypeVar
 import numpy as np
 import pyopencl as cl
 
+from gpuvision.host import stages
 from gpuvision.host.arrays import DeviceArray, HostArray, host_view
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
 from gpuvision.host.launch import Spec, Specs, check_shape, nbytes_of
 from gpuvision.host.operation import Operation
+from gpuvision.host.trace import records_launches
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -98,7 +100,8 @@ class OperationSequence(Operation[R]):
         queue: Any,
         inputs: Sequence[DeviceArray],
     ) -> Bound[R]:
-        return BoundSequence(self, device, shape, dtype, queue, inputs)
+        kind: type[BoundSequence[R]] = TracedSequence if records_launches(queue) else BoundSequence
+        return kind(self, device, shape, dtype, queue, inputs)
 
 
 class BoundSequence(Bound[R]):
@@ -196,13 +199,34 @@ class BoundSequence(Bound[R]):
             self._raise(error)
         return self.outputs if out is None else out
 
-    def _run_in_place(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
+    def _run_in_place(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> Any:
         """Copy to the inputs, run, and copy from the outputs: stages keep the arrays to which they are bound."""
         for array, frame in zip(self.inputs, frames, strict=True):
             host_view(array)[...] = frame
-        self.device.wait(self())
+        event = self()
+        self.device.wait(event)
         for array, target in zip(self._computed(self.outputs), targets, strict=True):
             target[...] = host_view(array)
+        return event
+
+
+class TracedSequence(BoundSequence[R]):
+    """Bound sequence that records its calls; its stages record their launches."""
+
+    def __call__(self, *frames: Any, out: R | None = None, wait_for: Sequence[Any] | None = None) -> Any:
+        """Enqueue all stages, as `BoundSequence.__call__`."""
+        with stages.stage("launch sequence", type(self.operation).__name__):
+            return super().__call__(*frames, out=out, wait_for=wait_for)
+
+    def run(self, *frames: Any, out: R | None = None) -> R:
+        """Enqueue all stages, wait and return the written arrays, as `BoundSequence.run`."""
+        with stages.stage("launch and wait", type(self.operation).__name__):
+            return super().run(*frames, out=out)
+
+    def on_host(self, frames: Sequence[HostArray], out: R | None = None) -> R:
+        """Run on NumPy arrays and wait, as `Bound.on_host`."""
+        with stages.stage("run", type(self.operation).__name__):
+            return super().on_host(frames, out)
 
 
 def _first(stage: Stage, arrays: Mapping[str, Spec | None]) -> Spec:

@@ -1,14 +1,29 @@
-"""Timeline of a stream in Chrome's trace format, for chrome://tracing or ui.perfetto.dev."""
+"""Timeline of a program in Chrome's trace format, for chrome://tracing or ui.perfetto.dev.
+
+``with Trace("trace.json"):`` records all work in the block: the stages of the host in a lane for each thread, the
+commands of the device in a lane for each queue. The file is written when the block ends. A `Pipeline` also takes a
+`Trace` without such a block; the trace then records this stream alone.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import threading
+import time
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, NamedTuple
 
-from gpuvision.host.outputs import Outputs
+import pyopencl as cl
+
+from gpuvision.host.kept import drop_bound
+from gpuvision.host.outputs import Outputs, release, reserve
+from gpuvision.host.stages import record_stages
 
 _PRODUCER, _DEVICE, _CONSUMER = "producer", "device", "consumer"
+# Lane of each stage of a stream.
 _LANES = {
     "slot": _PRODUCER,
     "source": _PRODUCER,
@@ -19,37 +34,238 @@ _LANES = {
     "wait": _CONSUMER,
     "sink": _CONSUMER,
 }
+_COMPLETE = cl.command_execution_status.COMPLETE
+_PENDING = 512  # events whose times are not read yet; more are read as they complete (bounds the memory)
+
+
+class _Span(NamedTuple):
+    """Stage in a lane, with its start and end on the clock of the host [ns]."""
+
+    lane: Hashable
+    name: str
+    start: int
+    end: int
+    arguments: dict[str, Any]
+
+
+class _Enqueued(NamedTuple):
+    """Command in a queue: event, and the times before and after the call that enqueued it [ns]."""
+
+    queue: Any
+    name: str
+    subject: str
+    event: Any
+    before: int
+    after: int
+
+
+class _Executed(NamedTuple):
+    """Completed command: times on the clock of the device [ns]."""
+
+    command: _Enqueued
+    queued: int
+    start: int
+    end: int
 
 
 class Trace:
-    """Timeline of the first batches of a stream: start and end of each stage.
+    """Timeline of the stages of the host and of the device.
+
+    As a context manager it records everything that the process does in the block, and writes the file at the end. After
+    an exception it writes no file. A queue has device times if it was made in the block or with ``profiling=True``;
+    a `Device` makes its queue when it is first asked for.
 
     Parameters
     ----------
     path : path
-        JSON file that is written when the stream closes.
+        JSON file to write.
     limit : int
-        Number of batches to keep, which bounds the memory of a long stream.
+        Number of spans to keep, which bounds the memory of a long run. Default 200 000.
     overwrite : bool
         Whether an existing file may be replaced that no earlier trace wrote. Default False.
+
+    Notes
+    -----
+    Recording a launch takes a few microseconds. Operations that are bound while no trace is active run the same code as
+    without this class.
     """
 
-    def __init__(self, path: str | Path, limit: int = 20_000, *, overwrite: bool = False) -> None:
+    def __init__(self, path: str | Path, limit: int = 200_000, *, overwrite: bool = False) -> None:
         self.path, self.limit, self.overwrite = Path(path), limit, overwrite
-        self._spans: list[tuple[str, int, int, int, int]] = []
-        self._batches = 0
+        self._lock = threading.Lock()
+        self._spans: list[_Span] = []
+        self._pending: list[_Enqueued] = []
+        self._executed: list[_Executed] = []
+        self._count = self._left_out = 0
+        self._lanes: dict[Hashable, str] = {}
+        self._streams: set[int] = set()
+        self._stream_queues: set[Any] = set()
+
+    def __enter__(self) -> Trace:
+        """Check that the file can be written, and record from now on."""
+        global _active
+        if _active is not None:
+            raise ValueError(f"a trace is active already, which writes {_active.path}; end it first")
+        Outputs("trace", overwrite=self.overwrite).claim(self.path)
+        reserve(self.path)
+        drop_bound()  # kept instances record nothing
+        _active = self
+        record_stages(self)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Stop, and write the file; after an exception write no file."""
+        global _active
+        _active = None
+        record_stages(None)
+        release(self.path)
+        drop_bound()
+        if error is None:
+            self.write()
+
+    @property
+    def is_active(self) -> bool:
+        """Whether the trace records the work of the process, not only of the streams that it was given to."""
+        return _active is self
 
     @property
     def is_full(self) -> bool:
-        """Whether the limit of batches is reached."""
-        return self._batches >= self.limit
+        """Whether the limit of spans is reached."""
+        return self._count >= self.limit
 
-    def add(self, spans: dict[str, tuple[int, int]], number: int, count: int) -> None:
-        """Add the stages of a batch with their start and end on the host's clock [ns]."""
-        if self.is_full:
-            return
-        self._batches += 1
-        self._spans.extend((stage, start, end, number, count) for stage, (start, end) in spans.items())
+    @contextlib.contextmanager
+    def span(self, name: str, subject: str = "") -> Iterator[None]:
+        """Record the block as a stage in the lane of this thread.
+
+        Parameters
+        ----------
+        name : str
+            Name of the stage.
+        subject : str, optional
+            Operation or file of the stage.
+        """
+        start = time.perf_counter_ns()
+        try:
+            yield
+        finally:
+            self.add_span(name, subject, start, time.perf_counter_ns())
+
+    def add_span(self, name: str, subject: str, start: int, end: int) -> None:
+        """Add a stage of this thread with its start and end on the clock of the host [ns]."""
+        thread = threading.current_thread()
+        lane = ("thread", thread.name, thread.ident)
+        with self._lock:
+            self._lanes.setdefault(lane, "host" if thread is threading.main_thread() else f"thread {thread.name}")
+            self._keep(_Span(lane, name, start, end, {"of": subject} if subject else {}))
+
+    def add_event(self, queue: Any, name: str, subject: str, event: Any, before: int, after: int) -> None:
+        """Add a command of a queue.
+
+        Parameters
+        ----------
+        queue : pyopencl.CommandQueue
+        name, subject : str
+            Name of the stage, and its operation.
+        event : pyopencl.Event
+            Event of the command. Without device times, the command is left out.
+        before, after : int
+            Times before and after the call that enqueued the command, on the clock of the host [ns].
+        """
+        with self._lock:
+            if self._has_room(1):
+                self._pending.append(_Enqueued(queue, name, subject, event, before, after))
+            if len(self._pending) >= _PENDING:
+                self._read_times(wait=False)
+
+    def begin_stream(self, *queues: Any) -> int:
+        """Return the number of a new stream. Launches in its queues are recorded by the stream alone."""
+        with self._lock:
+            number = next(each for each in range(1, len(self._streams) + 2) if each not in self._streams)
+            self._streams.add(number)
+            self._stream_queues.update(queues)
+            return number
+
+    def end_stream(self, number: int) -> None:
+        """Free the number of a stream, and with it its lanes, for the next stream."""
+        with self._lock:
+            self._streams.discard(number)
+
+    def is_of_stream(self, queue: Any) -> bool:
+        """Return whether a queue belongs to a stream, which records its launches."""
+        return queue in self._stream_queues
+
+    def add(self, spans: dict[str, tuple[int, int]], number: int, count: int, *, stream: int = 1) -> None:
+        """Add the stages of a batch of a stream.
+
+        Parameters
+        ----------
+        spans : dict of str to (int, int)
+            Start and end of each stage on the clock of the host [ns].
+        number, count : int
+            Number of the first frame, and number of frames.
+        stream : int
+            Number of the stream, of `begin_stream`. Default 1.
+        """
+        with self._lock:
+            if not self._has_room(len(spans)):
+                return
+            for stage, (start, end) in spans.items():
+                lane = ("stream", stream, _LANES[stage])
+                self._keep(_Span(lane, stage, start, end, {"frame": number, "frames": count}))
+            for each in dict.fromkeys(_LANES.values()):
+                self._lanes.setdefault(("stream", stream, each), each if stream == 1 else f"{each}, stream {stream}")
+
+    def _keep(self, span: _Span) -> None:
+        if self._has_room(1):
+            self._spans.append(span)
+            self._count += 1
+
+    def _has_room(self, count: int) -> bool:
+        """Return whether so many spans fit the limit, and count those that do not."""
+        fits = self._count + len(self._pending) + count <= self.limit
+        self._left_out += 0 if fits else count
+        return fits
+
+    def _read_times(self, *, wait: bool) -> None:
+        """Read the device times of the completed commands, or wait for all commands."""
+        left: list[_Enqueued] = []
+        for command in self._pending:
+            try:
+                if wait:
+                    command.event.wait()
+                elif command.event.command_execution_status > _COMPLETE:
+                    left.append(command)
+                    continue
+                profile = command.event.profile
+                times = _Executed(command, profile.queued, profile.start, profile.end)
+            except cl.Error:  # the queue does not measure times, or the command failed
+                continue
+            self._executed.append(times)
+            self._count += 1
+        self._pending = left
+
+    def _device_spans(self) -> list[_Span]:
+        """Return the commands of all queues on the clock of the host.
+
+        A command is queued during the call that enqueues it. Each command therefore bounds the offset between the
+        clocks of a queue and of the host from both sides; the estimate is the middle of the tightest bounds. Spans of a
+        queue have one offset, so that they overlap no more than the device reports.
+        """
+        queues: dict[Any, list[_Executed]] = {}
+        for each in self._executed:
+            queues.setdefault(each.command.queue, []).append(each)
+        spans = []
+        for number, (queue, executed) in enumerate(queues.items(), 1):
+            low = max(each.command.before - each.queued for each in executed)
+            high = min(each.command.after - each.queued for each in executed)
+            offset = (low + high) // 2
+            self._lanes[queue] = f"{_DEVICE} {queue.device.name.strip()}, queue {number}"
+            for each in executed:
+                arguments = {"of": each.command.subject}
+                spans.append(_Span(queue, each.command.name, each.start + offset, each.end + offset, arguments))
+        return spans
 
     def write(self) -> None:
         """Write the file atomically.
@@ -59,16 +275,56 @@ class Trace:
         FileExistsError
             The file exists, and is not an unchanged output of an earlier trace; see `gpuvision.host.outputs`.
         """
-        lanes = list(dict.fromkeys(_LANES.values()))
-        origin = min((start for _, start, *_ in self._spans), default=0)
+        with self._lock:
+            self._read_times(wait=True)
+            spans = [*self._spans, *self._device_spans()]
+            lanes = _lanes_of(spans, self._lanes)
+        origin = min((span.start for span in spans), default=0)
         events: list[dict[str, Any]] = [
-            {"ph": "M", "name": "thread_name", "pid": 1, "tid": tid, "args": {"name": lane}}
-            for tid, lane in enumerate(lanes)
+            {"ph": "M", "name": "thread_name", "pid": 1, "tid": tid, "args": {"name": name}}
+            for tid, (name, _) in enumerate(lanes)
         ]
-        for stage, start, end, number, count in self._spans:
-            event = {"ph": "X", "name": stage, "pid": 1, "tid": lanes.index(_LANES[stage])}
-            event |= {"ts": (start - origin) / 1e3, "dur": (end - start) / 1e3}
-            events.append(event | {"args": {"frame": number, "frames": count}})
-        Outputs("trace", overwrite=self.overwrite).write_text(
-            self.path, json.dumps({"traceEvents": events, "displayTimeUnit": "ns"})
-        )
+        for tid, (_, inside) in enumerate(lanes):
+            for span in inside:
+                event = {"ph": "X", "name": span.name, "pid": 1, "tid": tid, "args": span.arguments}
+                events.append(event | {"ts": (span.start - origin) / 1e3, "dur": (span.end - span.start) / 1e3})
+        tree = {"traceEvents": events, "displayTimeUnit": "ns", "otherData": {"spans beyond the limit": self._left_out}}
+        Outputs("trace", overwrite=self.overwrite).write_text(self.path, json.dumps(tree))
+
+
+def _lanes_of(spans: Sequence[_Span], names: Mapping[Hashable, str]) -> list[tuple[str, list[_Span]]]:
+    """Return the name and the spans of each lane in the file.
+
+    Spans of a lane in the file are nested or apart, as the viewers require. Batches of a stream may overlap on the
+    device: a span that overlaps others goes to a further lane of the same name.
+    """
+    lanes = []
+    for lane, name in names.items():
+        inside = sorted((each for each in spans if each.lane == lane), key=lambda each: (each.start, -each.end))
+        parts: list[list[_Span]] = [[]]
+        ends: list[list[int]] = [[]]  # ends of the spans of each part that contain the current time
+        for span in inside:
+            for open_ends in ends:
+                while open_ends and open_ends[-1] <= span.start:
+                    open_ends.pop()
+            place = next((n for n, each in enumerate(ends) if not each or each[-1] >= span.end), len(parts))
+            if place == len(parts):
+                parts.append([])
+                ends.append([])
+            parts[place].append(span)
+            ends[place].append(span.end)
+        lanes += [(name if not number else f"{name} ({number + 1})", part) for number, part in enumerate(parts)]
+    return lanes
+
+
+_active: Trace | None = None
+
+
+def active_trace() -> Trace | None:
+    """Return the trace that records the work of the process; None without one."""
+    return _active
+
+
+def records_launches(queue: Any) -> bool:
+    """Return whether an operation that is bound to a queue now has to record its launches: not those of a stream."""
+    return _active is not None and not _active.is_of_stream(queue)

@@ -45,6 +45,7 @@ def application() -> typer.Typer:
     from gpuvision.cli.scan import scan
     from gpuvision.cli.select import select
     from gpuvision.cli.simulate import simulate
+    from gpuvision.cli.tracing import with_trace
     from gpuvision.cli.undistort import undistort
     from gpuvision.cli.version import root
 
@@ -72,7 +73,7 @@ def application() -> typer.Typer:
         devices,
         profile,
     ):
-        app.command()(command)
+        app.command()(with_trace(command))
     return app
 
 

@@ -101,16 +101,6 @@ PlyFile = Annotated[
         "that do not support NaN).",
     ),
 ]
-TraceFile = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        parser=named_path,
-        help="Write a timeline of the stages for chrome://tracing or ui.perfetto.dev.",
-    ),
-]
-
-
 EncoderFile = Annotated[
     Path | None,
     typer.Option(
@@ -143,7 +133,6 @@ def scan(
     formats: SurfaceFiles = None,
     ply: PlyFile = PlyPoints.organised,
     encoder: EncoderFile = None,
-    trace: TraceFile = None,
     preview: Preview = False,
     as_json: ReportFile = None,
     overwrite: Overwrite = False,
@@ -169,14 +158,13 @@ def scan(
             policy=policy,
             format=formats,
             ply=None if ply is PlyPoints.organised else ply,
-            trace=trace,
             json=as_json,
         )
         _write_preview(recording, described, out, inputs, device, overwrite)
         return
     chosen_formats = [each.value for each in formats or ()]
     outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
-    _claim(outputs, out, chosen_formats, as_json, trace)
+    _claim(outputs, out, chosen_formats, as_json)
     chosen = None if device is None else Device.named(device)
     with progress_bar(f"scanning {recording.name}") as progress:
         done = run(
@@ -186,8 +174,6 @@ def scan(
             precision=None if precision is None else precision.value,
             rate=rate,
             policy=None if policy is None else policy.value,
-            trace=trace,
-            overwrite=overwrite,
             progress=progress,
         )
     # The size of the height map is known only now: write the other files before the error.
@@ -200,16 +186,12 @@ def scan(
         raise ValueError(f"{'; '.join(problems.values())}; all other files are written")
 
 
-def _claim(outputs: Outputs, out: Path, formats: Sequence[str], as_json: Path | None, trace: Path | None) -> None:
+def _claim(outputs: Outputs, out: Path, formats: Sequence[str], as_json: Path | None) -> None:
     """Claim all files of a scan before it runs."""
     from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES, surface_files
 
     outputs.claim_folder(out, (*SCAN_FILES, *SIGMA_FILES, *surface_files(formats).values()))
     outputs.claim(as_json)
-    if trace is not None:
-        if trace.absolute() in (out.absolute(), *out.absolute().parents):
-            raise ValueError(f"--trace is {trace}, the folder of --out or one above it; give a file")
-        outputs.claim(trace, job="trace")
 
 
 def _show(done: Scan, out: Path, *, to_stderr: bool) -> None:

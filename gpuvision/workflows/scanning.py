@@ -17,11 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device, Operation, Precision, to_numpy
-from gpuvision.host.outputs import Outputs
 from gpuvision.host.pipeline import Pipeline, Policy
 from gpuvision.host.planning import plan_stream
 from gpuvision.host.sources import PacedSource, Source
-from gpuvision.host.trace import Trace
 from gpuvision.ranging.focus_stack import FocusStack
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
@@ -47,8 +45,6 @@ def scan(
     precision: Precision = None,
     rate: float | None = None,
     policy: Policy | None = None,
-    trace: str | Path | None = None,
-    overwrite: bool = False,
     progress: Progress = lambda done, of: None,
     limits: ScanLimits = ScanLimits(),
 ) -> Scan:
@@ -70,11 +66,6 @@ def scan(
         read as fast as the device processes.
     policy : {"block", "drop_oldest", "raise"}, optional
         Handling of a frame when the queue is full; default "block" without a rate and "drop_oldest" with one.
-    trace : str or Path, optional
-        Output file for the timeline of the stream. The path is checked before the scan; the recording and the files of
-        the sensor are never replaced.
-    overwrite : bool
-        Whether an existing file of `trace` may be replaced that no earlier trace wrote. Default False.
     progress : callable, optional
         Called with the number of processed frames and the number of all frames (None if unknown).
     limits : ScanLimits, optional
@@ -92,23 +83,17 @@ def scan(
         No plan keeps up with the rate.
     TypeError, ValueError
         The frames do not fit the sensor, or no sample is valid.
-    OSError
-        The timeline cannot be written.
     """
     if isinstance(sensor.readout, FocusStack):
-        if rate is not None or policy is not None or trace is not None:
-            raise ValueError("a focus stack is one measurement; rate, policy and trace have no effect on it")
+        if rate is not None or policy is not None:
+            raise ValueError("a focus stack is one measurement; rate and policy have no effect on it")
         return _scan_stack(recording, sensor, sensor.readout, device, precision, progress, limits)
-    timeline = None
-    if trace is not None:
-        read = [*sensor.files, *([Path(recording)] if isinstance(recording, str | Path) else [])]
-        timeline = _DeferredTrace(trace, read, overwrite)
     opened = open_for_scan(recording, sensor)
     source, name, sensor = opened.source, opened.name, opened.sensor
     try:
         readout = _with_range_outputs(sensor, precision)
         device = Device.best() if device is None else device
-        paced, stream = _pipeline(source, readout, device, rate, policy, timeline)
+        paced, stream = _pipeline(source, readout, device, rate, policy)
     except BaseException:
         source.close()
         raise
@@ -121,8 +106,6 @@ def scan(
     intensity = fields["peak" if sensor.kind == "camera" else "total"]
     middle = time.perf_counter()
     heights, grid, errors = _height_map(sensor, points, intensity, errors, stream.device, limits.max_cells)
-    if timeline is not None:
-        timeline.write_file()
     seconds = {"assemble": middle - start, "resample": time.perf_counter() - middle}
     return Scan(
         sensor=sensor,
@@ -187,24 +170,6 @@ def _scan_stack(
     )
 
 
-class _DeferredTrace(Trace):
-    """Trace that writes its file after the scan: a scan that fails leaves no file.
-
-    The constructor checks that the file can be written and is no input.
-    """
-
-    def __init__(self, path: str | Path, inputs: Sequence[Path], overwrite: bool) -> None:
-        super().__init__(path, overwrite=overwrite)
-        Outputs("trace", inputs=inputs, overwrite=overwrite).claim(path)
-
-    def write(self) -> None:
-        """Ignore the end of the stream: the scan ends later."""
-
-    def write_file(self) -> None:
-        """Write the file."""
-        super().write()
-
-
 def _metadata(name: str, sensor: Sensor, rate: float | None, source: Source) -> dict[str, Any]:
     """Return the entries of the report about the recording and the replay: rates [frames/s], delay ``late`` [s]."""
     return {
@@ -245,20 +210,15 @@ def _with_range_outputs(sensor: Sensor, precision: Precision) -> LineReadout | P
 
 
 def _pipeline(
-    source: Source,
-    operation: Operation[Any],
-    device: Device,
-    rate: float | None,
-    policy: Policy | None,
-    timeline: Trace | None,
+    source: Source, operation: Operation[Any], device: Device, rate: float | None, policy: Policy | None
 ) -> tuple[Source, Pipeline[Any]]:
     """Return the source, paced if a rate [frames/s] is given, and the pipeline over its frames."""
     if rate is None:
-        stream = Pipeline(source, operation, device=device, profile=True, trace=timeline, policy=policy or "block")
+        stream = Pipeline(source, operation, device=device, profile=True, policy=policy or "block")
         return source, stream
     paced = PacedSource(source, rate)
     planned = plan_stream(paced, operation, device=device)
-    setup: dict[str, Any] = {"profile": True, "trace": timeline, "policy": policy or "drop_oldest"}
+    setup: dict[str, Any] = {"profile": True, "policy": policy or "drop_oldest"}
     return paced, Pipeline(paced, operation, **setup, **planned.settings)
 
 

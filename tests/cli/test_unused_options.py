@@ -38,7 +38,7 @@ from gpuvision.cli.main import application
         ),
         *(
             (("scan", "points.npy", "--sensor", "camera_line", "--out", "d", "--preview", option, value), option)
-            for option, value in (("--rate", "9"), ("--trace", "t.json"), ("--json", "-"), ("--ply", "valid"))
+            for option, value in (("--rate", "9"), ("--json", "-"), ("--ply", "valid"))
         ),
         (("select", "g", "--region", "0,0,1cm,1cm", "--scale", "25um", "--out", "d", "--device", "pocl"), "--device"),
         (("locate-robot", "points.npy", "--field", "robocup_msl", "--scale", "1cm"), "--scale"),

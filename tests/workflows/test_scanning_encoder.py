@@ -134,14 +134,18 @@ def test_the_file_of_the_encoder_is_never_replaced(
     assert (tmp_path / "belt.csv").read_bytes() == before
 
 
-def test_the_trace_never_replaces_a_file_of_the_scan(tmp_path: Path) -> None:
+def test_the_trace_never_replaces_a_file_of_the_scan(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     np.save(tmp_path / "belt.npy", currents(3))
     path = sensor_file(tmp_path, range(3), metres_per_count=1e-4)
-    sensor = Sensor.load(path)
     for file in (path, tmp_path / "belt.csv", tmp_path / "belt.npy"):
         before = file.read_bytes()
-        with pytest.raises(FileExistsError, match="it is the input"):
-            scan(tmp_path / "belt.npy", sensor, trace=file, overwrite=True)
+        ran = Ran(
+            capsys, monkeypatch, "scan", tmp_path / "belt.npy", "--sensor", path, "--out", tmp_path / "out",
+            "--trace", file, "--overwrite",
+        )  # fmt: skip
+        check_refused(ran, "it is the input")
         assert file.read_bytes() == before
 
 

@@ -86,7 +86,10 @@ def test_what_cannot_be_written_is_known_before_the_scan(plane: Path, shut: Path
         (("--out", shut / "deep" / "out"), rf"cannot write into {shut / 'deep' / 'out'}: {shut}: Permission denied"),
         (("--out", tmp_path / "out", "--trace", shut / "t.json"), rf"cannot write into {shut}: .*Permission denied"),
         (("--out", tmp_path / "out", "--trace", shut), rf"cannot write {shut}: it is a folder, expected a file"),
-        (("--out", tmp_path / "o", "--trace", tmp_path / "o"), r"--trace is .*o, the folder of --out or one above"),
+        (
+            ("--out", tmp_path / "o", "--trace", tmp_path / "o"),
+            r"o is the folder .*o of the outputs or one above it; give a file",
+        ),
     ):
         ran = run("scan", plane, "--sensor", "psd_line", *args)
         check_refused(ran, message)

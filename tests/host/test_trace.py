@@ -1,0 +1,229 @@
+"""Timelines: what is recorded, that the file is valid, and that nothing is left of a trace that has ended."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gpuvision as gv
+from gpuvision.host import Device, Pipeline, Trace
+from gpuvision.host.bound import Bound
+from gpuvision.host.outputs import Outputs
+from gpuvision.host.reading import reading
+from gpuvision.host.stages import stage
+from gpuvision.host.trace import active_trace
+from gpuvision.host.traced import TracedBound
+
+READOUT = gv.PsdReadout(strip_length=6e-3)
+CURRENTS = np.full((8, 16, 2), 2.0, np.float32)
+
+
+def spans_by_lane(path: Path) -> dict[str, list[dict[str, Any]]]:
+    """Return the spans of a file by the name of the lane; check the form of each event."""
+    tree = json.loads(path.read_text())
+    names = {each["tid"]: each["args"]["name"] for each in tree["traceEvents"] if each["ph"] == "M"}
+    assert len(set(names.values())) == len(names)
+    lanes: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for each in tree["traceEvents"]:
+        if each["ph"] != "M":
+            assert each["ph"] == "X"
+            assert each["pid"] == 1
+            assert each["ts"] >= 0
+            assert each["dur"] >= 0
+            lanes[names[each["tid"]]].append(each)
+    return lanes
+
+
+def check_nested(spans: list[dict[str, Any]]) -> None:
+    """Check that any two spans of a lane are apart or one contains the other (times have 1 ns)."""
+    ends: list[float] = []
+    for each in sorted(spans, key=lambda each: (each["ts"], -each["dur"])):
+        while ends and ends[-1] <= each["ts"] + 1e-3:
+            ends.pop()
+        end = each["ts"] + each["dur"]
+        assert not ends or end <= ends[-1] + 1e-3, each
+        ends.append(end)
+
+
+def test_stages_of_the_host_nest(tmp_path: Path, device: Device) -> None:
+    with Trace(tmp_path / "t.json") as trace, trace.span("whole"):
+        READOUT(CURRENTS, device=device)
+        Outputs("test").write_text(tmp_path / "some.txt", "text")
+        with reading("in.png", "image"):
+            pass
+    lanes = spans_by_lane(tmp_path / "t.json")
+    for spans in lanes.values():
+        check_nested(spans)
+    host = {each["name"]: each for each in lanes["host"]}
+    assert {"whole", "bind", "run", "write", "read"} <= set(host)
+    assert host["run"]["args"] == host["bind"]["args"] == {"of": "PsdReadout"}
+    assert host["read"]["args"] == {"of": "in.png"}
+    assert host["write"]["args"] == {"of": str(tmp_path)}
+    assert host["whole"]["ts"] == 0
+    ends = [each["ts"] + each["dur"] for each in lanes["host"]]
+    assert host["whole"]["dur"] == max(ends)
+    assert host["bind"]["ts"] + host["bind"]["dur"] <= host["run"]["ts"]
+
+
+def test_device_times_lie_in_the_calls_of_the_host(tmp_path: Path, device: Device) -> None:
+    """A launch that is waited for runs between its start and the end of the wait, up to the offset of the clocks."""
+    with Trace(tmp_path / "t.json"):
+        bound = READOUT.bind(device, CURRENTS.shape, CURRENTS.dtype, queue=device.new_queue())
+        for _ in range(5):
+            bound.run()
+    lanes = spans_by_lane(tmp_path / "t.json")
+    waits = [each for each in lanes["host"] if each["name"] == "launch and wait"]
+    assert len(waits) == 5
+    computed = [each for name, spans in lanes.items() if name.startswith("device ") for each in spans]
+    assert len(computed) >= 5
+    for spans in lanes.values():
+        check_nested(spans)
+    slack = 2000.0  # [us] a runtime may round its times, and the process may lose the core between two clocks
+    for wait in waits:
+        begun, ended = wait["ts"] - slack, wait["ts"] + wait["dur"] + slack
+        inside = [each for each in computed if begun <= each["ts"] and each["ts"] + each["dur"] <= ended]
+        assert any(each["name"] == "compute" and each["args"] == {"of": "PsdReadout"} for each in inside)
+
+
+def test_copies_are_recorded_where_memory_is_not_shared(
+    tmp_path: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device, "shares_memory", False)
+    with Trace(tmp_path / "t.json"):
+        bound = READOUT.bind(device, CURRENTS.shape, CURRENTS.dtype, queue=device.new_queue())
+        first = bound.on_host([CURRENTS])
+    monkeypatch.undo()
+    np.testing.assert_array_equal(first.position, READOUT(CURRENTS, device=device).position)
+    lanes = spans_by_lane(tmp_path / "t.json")
+    order = [each["name"] for each in sorted(lanes["host"], key=lambda each: each["ts"])]
+    assert order[order.index("run") :] == ["run", "upload", "launch", "download", "wait"]
+    on_device = {each["name"] for name, spans in lanes.items() if name.startswith("device ") for each in spans}
+    assert {"upload", "compute", "download"} <= on_device
+
+
+def test_each_thread_has_a_lane(tmp_path: Path) -> None:
+    def work() -> None:
+        with stage("bind", "in a thread"):
+            pass
+
+    with Trace(tmp_path / "t.json"):
+        thread = threading.Thread(target=work, name="worker")
+        thread.start()
+        thread.join()
+    assert [each["args"]["of"] for each in spans_by_lane(tmp_path / "t.json")["thread worker"]] == ["in a thread"]
+
+
+def test_a_stream_records_its_stages_and_no_launch_twice(tmp_path: Path, device: Device) -> None:
+    with Trace(tmp_path / "t.json"):
+        for _ in range(2):
+            Pipeline(CURRENTS, READOUT, device=device, batch=2).run()
+    lanes = spans_by_lane(tmp_path / "t.json")
+    for spans in lanes.values():
+        check_nested(spans)
+    assert [each["args"]["frame"] for each in lanes["consumer"] if each["name"] == "sink"] == [0, 2, 4, 6] * 2
+    assert "producer, stream 2" not in lanes  # the second stream began after the first one had ended
+    assert not any(each["name"] == "launch" for each in lanes["host"])
+    computed = [each for name, spans in lanes.items() if "compute" in name for each in spans]
+    assert len(computed) == 8
+
+
+def test_streams_at_the_same_time_have_lanes_of_their_own(tmp_path: Path, device: Device) -> None:
+    with (
+        Trace(tmp_path / "t.json"),
+        Pipeline(CURRENTS, READOUT, device=device, batch=4) as first,
+        Pipeline(CURRENTS, READOUT, device=device, batch=4) as second,
+    ):
+        assert sum(len(one) + len(other) for one, other in zip(first, second, strict=True)) == 16
+    lanes = spans_by_lane(tmp_path / "t.json")
+    assert [len(lanes[name]) for name in ("producer", "producer, stream 2")] == [6, 6]
+
+
+def test_spans_that_overlap_go_to_further_lanes(tmp_path: Path) -> None:
+    trace = Trace(tmp_path / "t.json")
+    for number, (start, end) in enumerate(((0, 10), (5, 15), (10, 20), (12, 14), (16, 30))):
+        trace.add({"compute": (start, end)}, number, 1)
+    trace.write()
+    lanes = spans_by_lane(tmp_path / "t.json")
+    frames = {name: [each["args"]["frame"] for each in spans] for name, spans in lanes.items()}
+    assert frames == {"device compute": [0, 2, 3], "device compute (2)": [1, 4]}
+
+
+def test_the_limit_bounds_the_spans_and_the_rest_is_counted(tmp_path: Path, device: Device) -> None:
+    with Trace(tmp_path / "t.json", limit=3) as trace:
+        for _ in range(5):
+            with stage("read"):
+                pass
+        assert trace.is_full
+        READOUT(CURRENTS, device=device)
+    assert sum(map(len, spans_by_lane(tmp_path / "t.json").values())) == 3
+    assert json.loads((tmp_path / "t.json").read_text())["otherData"]["spans beyond the limit"] > 2
+
+
+def test_nothing_is_left_after_the_trace(tmp_path: Path, device: Device) -> None:
+    with Trace(tmp_path / "t.json"):
+        inside = READOUT.bind(device, CURRENTS.shape, CURRENTS.dtype)
+        assert type(inside) is TracedBound
+        assert active_trace() is not None
+    written = (tmp_path / "t.json").read_bytes()
+    assert active_trace() is None
+    inside.run()
+    assert type(READOUT.bind(device, CURRENTS.shape, CURRENTS.dtype)) is Bound
+    assert stage("read") is stage("write")  # one object for all: nothing is allocated
+    assert (tmp_path / "t.json").read_bytes() == written
+
+
+def test_a_block_that_fails_leaves_no_file(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), Trace(tmp_path / "t.json"):
+        raise KeyError("a failure")
+    assert active_trace() is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_trace_at_a_time(tmp_path: Path) -> None:
+    with (
+        Trace(tmp_path / "t.json"),
+        pytest.raises(ValueError, match=r"a trace is active already, which writes .*t\.json"),
+    ):
+        Trace(tmp_path / "u.json").__enter__()
+    assert {each.name for each in tmp_path.iterdir()} >= {"t.json"}
+    assert not (tmp_path / "u.json").exists()
+
+
+def test_the_file_is_no_input_and_no_other_output(tmp_path: Path) -> None:
+    file = tmp_path / "t.json"
+    file.write_text("a user's")
+    with pytest.raises(FileExistsError, match="not an unchanged output of an earlier trace"), Trace(file):
+        pass
+    with Trace(file, overwrite=True):
+        with pytest.raises(FileExistsError, match="it is the input"):
+            Outputs("scan", inputs=[file])
+        with pytest.raises(ValueError, match="two outputs have the same name"):
+            Outputs("scan", overwrite=True).claim(file)
+    with (
+        Trace(tmp_path / "out"),
+        pytest.raises(ValueError, match=r"out is the folder .*out of the outputs or one above"),
+    ):
+        Outputs("scan").claim_folder(tmp_path / "out", ())
+    Outputs("trace", inputs=[file])  # released
+
+
+def test_the_default_queue_of_a_new_device_measures_times(tmp_path: Path, device: Device) -> None:
+    """In a new process, as in a command: the device is opened inside the trace."""
+    code = f"""
+import numpy, gpuvision as gv
+from gpuvision.host import Device, Trace
+with Trace({str(tmp_path / "t.json")!r}):
+    gv.PsdReadout(strip_length=6e-3)(numpy.ones((8, 16, 2), numpy.float32), device=Device.named({device.label!r}))
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+    lanes = spans_by_lane(tmp_path / "t.json")
+    computed = [each["name"] for name, spans in lanes.items() if name.startswith("device ") for each in spans]
+    assert computed.count("compute") >= 2  # of the bind and of the call

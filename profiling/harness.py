@@ -16,7 +16,7 @@ import math
 import platform
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
+from gpuvision.host import Bound, Device
 from gpuvision.host.outputs import Outputs
-from gpuvision.profiling import ceiling
+from gpuvision.profiling import ceiling, numba_cache
+from gpuvision.profiling.device_times import DeviceTimes, Recorder
 from gpuvision.profiling.rounds import median_interval, take_turns
 from gpuvision.profiling.time_plan import TimePlan
 
@@ -61,6 +62,31 @@ OPERATIONS = {
     "launch": "launch",
     "stream": "stream",
 }
+# Public operations, and the benchmark that has rows of each one.
+MEASURED = {
+    "AnyHit": "bvh",
+    "BoardPoseEstimator": "pose",
+    "ClosestHit": "bvh",
+    "EstimateFeaturePose": "servo",
+    "FieldPoseRefinement": "field",
+    "FieldPoseSearch": "field",
+    "FindBlobs": "blob",
+    "FitLines": "line_fit",
+    "LineIrradiance": "reflections",
+    "LineReadout": "line",
+    "MeasureDeposits": "deposits",
+    "MergeHeights": "merge_heights",
+    "OccludedIrradiance": "reflections",
+    "PsdReadout": "psd",
+    "RangeImage": "range_image",
+    "Reflectance": "reflectance",
+    "RenderBoard": "board_image",
+    "RulerEdges": "ruler",
+    "SolvePose": "pose",
+    "Triangulation": "triangulation",
+    "UndistortImage": "undistort",
+    "UndistortPoints": "points",
+}
 # Cases that a quick run measures, where these are not the first ones of their module.
 QUICK_CASES = {"psd": "float32/1e6", "line": "whole/16", "triangulation": "float32/1e6", "ruler": "100", "blob": "100"}
 _STEADY = 0.2  # largest relative change of the FLOP rate during a valid section
@@ -68,6 +94,7 @@ _ATTEMPTS = 4  # measurements of a section before the run is marked invalid
 _Call = tuple[str, str]  # names of a peer and of its form
 _OURS: _Call = ("", "")
 _CEILING: _Call = ("ceiling", "")
+_EVENTS: _Call = ("events", "")
 
 # Function of a peer, or functions by the name of the form.
 Peer = Callable[[], object] | Mapping[str, Callable[[], object]]
@@ -98,6 +125,12 @@ class Case:
     factors
         Factors, by the name of the peer, that multiply the measured time of a peer which does only a part of the work,
         because all of it would take too long. The module of the case documents the origin of a factor.
+    flops
+        Number of floating-point additions, subtractions, multiplications and divisions of the work, counted in its
+        formulas; None: no fraction of the device's FLOP rate. The module of the case documents the count.
+    bound
+        Bound operation that `ours` launches, for the times on the device. It is found without being given if `ours` is
+        a method of it; None: no times on the device.
     """
 
     operation: str
@@ -109,6 +142,14 @@ class Case:
     repeats: int = 1
     metadata: Mapping[str, Any] = field(default_factory=dict)
     factors: Mapping[str, float] = field(default_factory=dict)
+    flops: float | None = None
+    bound: Bound[Any] | None = None
+
+    @property
+    def launched(self) -> Bound[Any] | None:
+        """Bound operation whose times on the device are measured."""
+        owner = getattr(self.ours, "__self__", None)
+        return owner if self.bound is None and isinstance(owner, Bound) else self.bound
 
 
 @dataclass(frozen=True)
@@ -135,6 +176,13 @@ class Row:
         Confidence of the interval: at least 0.95, less for a peer so slow that it took part in fewer than 6 rounds.
     rounds
         Number of rounds in which the peer took part.
+    device_seconds
+        Median time from the start to the end of the kernels of a call, from the events of the runtime [s]; None for
+        functions that launch several operations, and where the runtime gives no times.
+    queued_seconds, submitted_seconds
+        Median times from the enqueue to the submission and from the submission to the start [s].
+    flops, bytes
+        Floating-point operations and least traffic of one call, as the case declares them [1], [bytes].
     metadata
         Additional columns.
     """
@@ -154,6 +202,11 @@ class Row:
     ratio_high: float | None = None
     confidence: float | None = None
     rounds: int = 0
+    device_seconds: float | None = None
+    queued_seconds: float | None = None
+    submitted_seconds: float | None = None
+    flops: float | None = None
+    bytes: int | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -256,45 +309,60 @@ def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:
     calls[_OURS] = case.ours
     if case.traffic is not None:
         calls[_CEILING] = ceiling.move(device, *case.traffic, case.repeats)
+    recorder = None if case.launched is None else Recorder(case.launched, device)
+    if recorder is not None:
+        calls[_EVENTS] = recorder
     durations = take_turns(calls, seconds, always=_OURS)
+    durations.pop(_EVENTS, None)
     times = {call: each * (case.factors.get(call[0], 1.0) / case.repeats) for call, each in durations.items()}
     ours = times.pop(_OURS)
     limit = times.pop(_CEILING, None)
     fraction = None if limit is None else float(np.nanmedian(limit / ours))
+    common = _common_columns(case, device, ours, fraction, None if recorder is None else recorder.medians())
     return [
-        _row(case, device, ours, peer, form, theirs, fraction) for (peer, form), theirs in _fastest_forms(times).items()
+        replace(common, **_peer_columns(ours, peer, form, theirs))
+        for (peer, form), theirs in _fastest_forms(times).items()
     ]
 
 
-def _row(
-    case: Case,
-    device: Device,
-    ours: NDArray[Any],
-    peer: str,
-    form: str,
-    theirs: NDArray[Any],
-    fraction: float | None,
+def _common_columns(
+    case: Case, device: Device, ours: NDArray[Any], fraction: float | None, events: DeviceTimes | None
 ) -> Row:
-    ratios = (theirs / ours)[np.isfinite(theirs)]
-    interval = median_interval(ratios)
+    """Return a row without a peer."""
     return Row(
         operation=case.operation,
         case=case.name,
         device=device.label,
         seconds=float(np.median(ours)),
-        peer=peer,
-        peer_version=peer_version(peer),
-        peer_seconds=float(np.nanmedian(theirs)),
-        ratio=float(np.median(ratios)),
+        peer="",
+        peer_version="",
+        peer_seconds=math.nan,
+        ratio=math.nan,
         error=case.error,
         fraction=fraction,
-        form=form,
-        ratio_low=interval.low,
-        ratio_high=interval.high,
-        confidence=interval.confidence,
-        rounds=len(ratios),
+        device_seconds=None if events is None else events.running,
+        queued_seconds=None if events is None else events.queued,
+        submitted_seconds=None if events is None else events.submitted,
+        flops=case.flops,
+        bytes=None if case.traffic is None else sum(case.traffic),
         metadata=case.metadata,
     )
+
+
+def _peer_columns(ours: NDArray[Any], peer: str, form: str, theirs: NDArray[Any]) -> dict[str, Any]:
+    ratios = (theirs / ours)[np.isfinite(theirs)]
+    interval = median_interval(ratios)
+    return {
+        "peer": peer,
+        "peer_version": peer_version(peer),
+        "peer_seconds": float(np.nanmedian(theirs)),
+        "ratio": float(np.median(ratios)),
+        "form": form,
+        "ratio_low": interval.low,
+        "ratio_high": interval.high,
+        "confidence": interval.confidence,
+        "rounds": len(ratios),
+    }
 
 
 def _forms(peer: Peer) -> Mapping[str, Callable[[], object]]:
@@ -403,6 +471,7 @@ def _steady_section(
 def _cases(operation: str, device: Device, quick: bool) -> Iterator[Case]:
     """Yield the cases of an operation, one at a time: their arrays may fill the memory."""
     module = importlib.import_module(f"gpuvision.profiling.{OPERATIONS[operation]}")
+    numba_cache.keep_compiled(module)
     if not quick:
         yield from module.cases(device)
         return

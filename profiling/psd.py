@@ -15,6 +15,7 @@ from gpuvision.ranging.psd import PsdReadout
 
 LENGTH, MINIMUM, SATURATION = 6e-3, 100.0, 60_000.0
 _IN_A_ROW = 8
+_FLOPS = 4  # of a sample: sum, difference, product with half of the length, quotient; without the comparisons
 
 
 @numba.njit(error_model="numpy")
@@ -152,7 +153,9 @@ def _case(device: Device, dtype: str, count: int, name: str, layout: Any = "plan
     outputs: Any = bound.outputs
     error = _error(outputs.position.get(), outputs.status.get(), left, right)
     traffic = (currents.nbytes, 5 * count)
-    return Case("psd", name, ours, {"numba": with_numba, "numpy": with_numpy}, error, traffic, repeats)
+    peers = {"numba": with_numba, "numpy": with_numpy}
+    flops = _FLOPS * count
+    return Case("psd", name, ours, peers, error, traffic, repeats, flops=flops, bound=bound)
 
 
 def _error(position: NDArray[Any], status: NDArray[Any], left: NDArray[Any], right: NDArray[Any]) -> float:

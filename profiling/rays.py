@@ -1,8 +1,9 @@
-"""Benchmark of `AnyHit` and of the BVH construction on a board with parts, compared with Embree.
+"""Benchmark of `AnyHit`, `ClosestHit` and the BVH construction on a board with parts, compared with Embree.
 
 The segments are the shadow rays of a simulation: from points on all surfaces of the board to a line of light on it.
 Embree runs its occlusion query in one call per core, the fastest way to use it. The column `error` is the fraction of
-segments for which the two results differ (at silhouettes, by rounding).
+segments for which the two results differ (at silhouettes, by rounding). `ClosestHit` gets the view rays of a camera
+above the board; `error` is the fraction of rays that hit another triangle.
 """
 
 from __future__ import annotations
@@ -22,10 +23,13 @@ from numpy.typing import NDArray
 from gpuvision.host import Device, to_numpy
 from gpuvision.profiling.harness import Case
 from gpuvision.simulation.scene.bvh import Bvh
-from gpuvision.simulation.scene.rays import AnyHit
+from gpuvision.simulation.scene.rays import AnyHit, ClosestHit
 from gpuvision.simulation.scene.scene import Scene
 
 _PARTS, _RECEIVERS, _SAMPLES = 40, 4000, 64
+# Rays that may hit another triangle: those within rounding of an edge. Triangles of a millimetre at a distance of
+# 0.25 m with positions in single precision (1.5e-8 m): some 1e-4 of the rays.
+_MOST_DIFFERENT = 1e-3
 _LIFT = 1e-5  # distance of a segment's start from the surface [m]
 
 
@@ -34,6 +38,7 @@ def cases(device: Device) -> Iterator[Case]:
     for name, finer, shuffled in (("board", 0, False), ("board-shuffled", 0, True), ("board-fine", 3, False)):
         yield _any_hit(device, name, board(finer), shuffled)
     yield _build(board(3), "1e5")
+    yield _closest_hit(device, "board", board(0))
 
 
 def board(finer: int) -> Any:
@@ -86,6 +91,32 @@ def _any_hit(device: Device, name: str, mesh: Any, shuffled: bool) -> Case:
     disagree = float(np.mean((np.concatenate(embree()) == 0) != occluded))
     metadata = {"triangles": len(mesh.faces), "segments": len(segments), "occluded": float(np.mean(occluded))}
     return Case("bvh", f"any-hit/{name}", bound.run, {"embreex": embree}, disagree, metadata=metadata)
+
+
+def view_rays(mesh: Any) -> NDArray[np.float32]:
+    """Return rays (n, 6), start and direction, from a camera above the board to points on the mesh in random order."""
+    points, _ = trimesh.sample.sample_surface(mesh, _RECEIVERS * _SAMPLES, seed=5)
+    camera = np.broadcast_to([0.0, -0.05, 0.25], points.shape)
+    return np.hstack([camera, points - camera]).astype(np.float32)
+
+
+def _closest_hit(device: Device, name: str, mesh: Any) -> Case:
+    rays, scene = view_rays(mesh), Scene.of(mesh)
+    bound = ClosestHit(scene=scene).bind(device, rays.shape, rays.dtype)
+    bound.inputs[0].set(rays)
+    theirs = embree_scene(scene.corners)
+    queries = [(each[:, :3].copy(), each[:, 3:].copy()) for each in np.array_split(rays, os.cpu_count() or 1)]
+    pool = ThreadPoolExecutor(len(queries))
+
+    def embree() -> list[NDArray[Any]]:
+        return list(pool.map(lambda given: np.asarray(theirs.run(*given)), queries))
+
+    bound.run()
+    differs = float(np.mean(np.concatenate(embree()) != to_numpy(bound.outputs.triangle)))
+    if differs > _MOST_DIFFERENT:
+        raise AssertionError(f"Embree hits another triangle with {differs:.1%} of the rays")
+    metadata = {"triangles": len(mesh.faces), "rays": len(rays)}
+    return Case("bvh", f"closest-hit/{name}", bound.run, {"embreex": embree}, differs, metadata=metadata)
 
 
 def _build(mesh: Any, size: str) -> Case:

@@ -32,6 +32,7 @@ _COLUMNS = (
     "ratio_high",
     "confidence",
     "rounds",
+    "device_seconds",
 )
 _PROBED = ("before", "after")
 _CONFIDENCE = 0.95  # of the intervals that are shown; a peer measured once or twice has none
@@ -50,12 +51,15 @@ def _value(value: Any) -> str:
 
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
     fraction = row.get("fraction")
-    more = ", ".join(f"{key} {_value(value)}" for key, value in row.items() if key not in _COLUMNS)
+    more = ", ".join(
+        f"{key} {_value(value)}" for key, value in row.items() if key not in _COLUMNS and value is not None
+    )
+    kernels = f" ({_time(row['device_seconds'])})" if row.get("device_seconds") else ""
     form = f" ({row['form']})" if row.get("form") else ""
     return (
         f"``{row['case']}``",
         row["device"],
-        _time(row["seconds"]),
+        _time(row["seconds"]) + kernels,
         f"{row['peer']}{form} {row['peer_version']}".strip(),
         _time(row["peer_seconds"]),
         _ratio(row),

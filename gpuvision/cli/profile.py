@@ -71,9 +71,10 @@ def profile(
 ) -> None:
     """Measure operations against their peers: NumPy, Numba, OpenCV.
 
-    Candidates run interleaved. The ratio is the time of the peer over the time of gpuvision, with its 95 % confidence
-    interval. The FLOP rate of the device is measured before and after each operation; a run during which it changed is
-    marked invalid, and the exit code is 1. If the measurement of an operation fails, the
+    Candidates run interleaved. Below the time of a call stands the time of its kernels on the device, in parentheses,
+    from the events of the OpenCL runtime. The ratio is the time of the peer over the time of gpuvision, with its 95 %
+    confidence interval. The FLOP rate of the device is measured before and after each operation; a run during which it
+    changed is marked invalid, and the exit code is 1. If the measurement of an operation fails, the
     others are still measured; the report names the operation and the reason, and the exit code is 1.
 
     With --offline nothing is measured: the kernels are compiled for GPUs by Clang and NVIDIA's ptxas. The table shows
@@ -175,7 +176,8 @@ def _metadata_line(row: Row) -> str:
 def _cells(row: Row) -> tuple[str, ...]:
     fraction = "" if row.fraction is None else f"{100 * row.fraction:.0f} %"
     peer = f"{row.peer}\n({row.form})" if row.form else row.peer
-    times = (_time(row.seconds), peer, _time(row.peer_seconds))
+    kernels = "" if row.device_seconds is None else f"\n({_time(row.device_seconds)})"
+    times = (_time(row.seconds) + kernels, peer, _time(row.peer_seconds))
     return row.case, row.device, *times, _ratio(row), f"{row.error:.1e}", fraction
 
 

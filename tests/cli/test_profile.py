@@ -29,6 +29,7 @@ ROW = Row(
     ratio_high=3.3,
     confidence=0.96,
     form="words",
+    device_seconds=0.0117,
     error=1.5e-9,
     fraction=0.5,
     metadata={"rate": 4000, "p50": 1e-4},
@@ -70,6 +71,7 @@ def test_what_was_asked_for_is_measured_and_shown(asked: dict[str, Any], tmp_pat
     for shown in (
         "float32/1e6",
         "12.3 ms",
+        "(11.7 ms)",
         "numpy",
         "45.6 µs",
         "3.14 ±5%",

@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("numba", reason="the extra 'profile' is not installed")
 
+import gpuvision as gv
 from gpuvision.profiling import ceiling, harness, rounds
 
 
@@ -123,6 +124,18 @@ def test_the_ceiling_moves_the_bytes_of_the_case(clock, monkeypatch, device):
     assert calls == [(device, 3 << 20, 1 << 20, 8)]
     assert row.seconds == pytest.approx(20e-3 / 8)
     assert row.fraction == pytest.approx(0.1)  # fraction of the device's limit
+
+
+def test_a_row_has_the_times_on_the_device(device):
+    bound = gv.PsdReadout(strip_length=6e-3, layout="planar").bind(device, (2, 100_000), np.float32)
+    (row,) = harness.measure(case(ours=bound.run, flops=4e5, traffic=(8, 16)), device, seconds=0.02)
+    assert 0.0 < row.device_seconds < row.seconds * 2.0
+    assert min(row.queued_seconds, row.submitted_seconds) >= 0.0
+    assert (row.flops, row.bytes) == (4e5, 24)
+    (row,) = harness.measure(case(ours=lambda: bound.run(), bound=bound), device, seconds=0.02)
+    assert row.device_seconds > 0.0
+    (row,) = harness.measure(case(ours=lambda: bound.run()), device, seconds=0.02)
+    assert (row.device_seconds, row.queued_seconds, row.submitted_seconds, row.flops, row.bytes) == (None,) * 5
 
 
 def test_what_moves_bytes_runs(device):

@@ -126,6 +126,18 @@ def test_peak_selection(device, rng, peak_selection, kernel):
     assert_same(LineReadout(variant=variant, **parameters)(frames, *second, device=device), expected)
 
 
+def test_widths_at_the_limits_are_read(device):
+    """Lines of 1 to 6 lit samples, of which 3 to 5 are wide enough and not too wide for the centroid."""
+    frame = np.zeros((24, 18), np.uint8)
+    for column in range(18):
+        frame[9 : 10 + column % 6, column] = 100
+    reading = LineReadout(method="centroid", threshold=20, minimum_width=3, maximum_width=5)(frame, device=device)
+    lit = 1 + np.arange(18) % 6
+    np.testing.assert_array_equal(reading.width, lit)
+    np.testing.assert_array_equal(reading.status == 0, (lit >= 3) & (lit <= 5))
+    np.testing.assert_array_equal(np.isfinite(reading.position), reading.status == 0)
+
+
 @pytest.mark.double
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_double(device, rng, variant):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gpuvision.camera.views.correlated_errors import _jackknife
 from gpuvision.camera.views.planar_calibration import fit_camera
 from view_scenes import RADIAL, SIZE, bent, camera, exact_views
 
@@ -17,6 +18,19 @@ def test_noise_alone_is_not_correlated(rng: np.random.Generator) -> None:
     assert 0.25 < np.mean([fit.lack_of_fit.p_value for fit in fits]) < 0.75
     assert 0.25 < np.mean([fit.view_p_value for fit in fits]) < 0.75
     assert np.mean([fit.lack_of_fit.noise_px for fit in fits]) == pytest.approx(0.1, rel=0.03)
+
+
+def test_jackknife_is_that_of_fits_without_a_view(rng: np.random.Generator) -> None:
+    """Of a linear model the first order is exact: least squares by NumPy without each of six views in turn."""
+    design, values = rng.normal(size=(6, 8, 3)), rng.normal(size=(6, 8))
+    found = np.linalg.lstsq(design.reshape(-1, 3), values.ravel(), rcond=None)[0]
+    shifts = []
+    for view in range(6):
+        others = np.arange(6) != view
+        shifts.append(np.linalg.lstsq(design[others].reshape(-1, 3), values[others].ravel(), rcond=None)[0] - found)
+    rows = np.concatenate([design, (values - design @ found)[..., None]], axis=2)
+    products = np.swapaxes(rows, 1, 2) @ rows
+    np.testing.assert_allclose(_jackknife(products, 3), 5.0 / 6.0 * np.transpose(shifts) @ shifts, rtol=1e-9)
 
 
 @pytest.mark.slow

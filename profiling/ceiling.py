@@ -14,6 +14,9 @@ from gpuvision.host.arrays import memory_of
 from gpuvision.host.program import build
 from gpuvision.operation import KERNEL_FOLDER
 
+SIZES = (1 << 20, 8 << 20, 192 << 20)
+"""Bytes that the copies of `bandwidths` move."""
+_COPIES, _COPYING = 12, 0.03  # least number of copies of a size, and least time for them [s]
 _VECTOR = 64  # bytes that a work-item moves per step
 _ITEMS_PER_UNIT = 64
 _FLOPS_PER_STEP = 8 * 16 * 2  # 8 vectors of 16 floats, one multiplication and one addition each
@@ -60,6 +63,31 @@ def mover(device: Device, queue: Any, read: int, written: int) -> Callable[[], A
         return cl.enqueue_nd_range_kernel(queue, kernel, (items,), (1,) if vectors else None)
 
     return launch
+
+
+def bandwidths(device: Device) -> dict[int, float]:
+    """Return the rate of the copy kernel [B/s] by the number of bytes that it moves, a third of them writes.
+
+    Small copies stay in the caches, the largest one does not fit into the caches of common devices. The rate is that of
+    the fastest of several launches, by the events of the runtime, so that it holds no launch; without events by the
+    clock of the host.
+    """
+    return {size: size / _fastest_move(device, size) for size in SIZES}
+
+
+def _fastest_move(device: Device, size: int) -> float:
+    """Return the least time of a copy of `size` bytes [s]."""
+    launch = mover(device, device.new_queue(profiling=True), size - size // 3, size // 3)
+    times: list[float] = []
+    end = time.perf_counter() + _COPYING
+    while len(times) < _COPIES or time.perf_counter() < end:
+        start = time.perf_counter()
+        event = launch()
+        event.wait()
+        on_host = time.perf_counter() - start
+        on_device = 1e-9 * (event.profile.end - event.profile.start)
+        times.append(on_device if on_device > 0.0 else on_host)
+    return min(times)
 
 
 def flop_rate(device: Device, *, seconds: float = 0.15) -> float:

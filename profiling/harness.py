@@ -183,6 +183,8 @@ class Row:
         Median times from the enqueue to the submission and from the submission to the start [s].
     flops, bytes
         Floating-point operations and least traffic of one call, as the case declares them [1], [bytes].
+    flop_fraction
+        Rate of the declared operations over the rate of multiply-adds that the speed probe has measured.
     metadata
         Additional columns.
     """
@@ -207,6 +209,7 @@ class Row:
     submitted_seconds: float | None = None
     flops: float | None = None
     bytes: int | None = None
+    flop_fraction: float | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -461,11 +464,16 @@ def _steady_section(
         for case in _cases(operation, device, quick):
             rows += measure(case, device, seconds=plan.grant())
         after = ceiling.flop_rate(device)
+        rows = [_with_flop_fraction(row, 0.5 * (before + after)) for row in rows]
         probes.append(Probe(operation, device.label, before, after, abs(after / before - 1.0) <= _STEADY))
         if probes[-1].steady:
             break
         progress(f"  {before / 1e9:.0f} -> {after / 1e9:.0f} GFLOP/s: the machine changed its speed ({attempt + 1})")
     return rows
+
+
+def _with_flop_fraction(row: Row, rate: float) -> Row:
+    return row if row.flops is None else replace(row, flop_fraction=row.flops / row.seconds / rate)
 
 
 def _cases(operation: str, device: Device, quick: bool) -> Iterator[Case]:
@@ -493,6 +501,7 @@ def describe_machine(devices: Sequence[Device]) -> dict[str, Any]:
                 "driver": each.driver,
                 "units": each.compute_units,
                 "gflops": round(ceiling.flop_rate(each) / 1e9),
+                "bandwidths": {str(size): rate for size, rate in ceiling.bandwidths(each).items()},
             }
             for each in devices
         },

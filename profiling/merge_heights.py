@@ -94,6 +94,12 @@ def _opencv(z1: Array, z2: Array) -> Array:
     return mean
 
 
+# Operations of a cell with heights in both maps, in merge_at of kernels/merge_heights/merge_heights.cl: difference 1,
+# height 2, intensity 3; with sigmas also the parts 2, their sum of squares 3, the weight 2, the limit 3 and a root, and
+# the merged sigma 2.
+_FLOPS, _SIGMA_FLOPS = 6, 19
+
+
 def cases(device: Device) -> Iterator[Case]:
     """Yield the merge of four million cells in single precision, with and without standard deviations."""
     yield _case(device, sigma=True)
@@ -138,4 +144,5 @@ def _case(device: Device, *, sigma: bool) -> Case:
         raise AssertionError("the merge and float64 differ in the sources of the heights")
     error = float(np.nanmax(np.abs(outputs.z.get()[same] - exact[0][same])))
     moved = (2 * (9 + 4 * sigma) * _CELLS, (10 + 4 * sigma) * _CELLS)
-    return Case("merge heights", "float32-sigma/4e6" if sigma else "float32/4e6", bound.run, peers, error, moved)
+    name, flops = ("float32-sigma/4e6", _SIGMA_FLOPS) if sigma else ("float32/4e6", _FLOPS)
+    return Case("merge heights", name, bound.run, peers, error, moved, flops=flops * _CELLS)

@@ -1,30 +1,35 @@
-"""Plots of a benchmark run: time over the amount of work, and time and error over the tolerance."""
+"""Plots of a benchmark run: roofline, time over the amount of work, and time and error over the tolerance."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from gpuvision.host.outputs import Outputs
 from gpuvision.plots.figure import new_figure, write_png
 from gpuvision.profiling.harness import Row
+from gpuvision.profiling.roofline import draw_roofline
 
 _SIZE = (8.0, 3.6)  # [in]
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _GROWTH = re.compile(r"^growth/(?:(\w+)-)?x(\d+)$")
 
 
-PLOTS = ("growth.png", "tolerance.png")
+PLOTS = ("growth.png", "tolerance.png", "roofline.png")
 """Names of the files that `draw_plots` writes."""
 
 
-def draw_plots(folder: str | Path, rows: Sequence[Row], *, overwrite: bool = False) -> list[str]:
+def draw_plots(
+    folder: str | Path, rows: Sequence[Row], machine: Mapping[str, Any] | None = None, *, overwrite: bool = False
+) -> list[str]:
     """Draw the plots of the rows into a folder, as PNG; return the names of the files.
 
     ``growth.png``: times of the cases ``growth/...`` over the amount of work, relative to the case ``base`` of their
     metadata. ``tolerance.png``: times and errors over the tolerance, of the cases that have one in their metadata.
+    ``roofline.png``: rates of the cases that declare operations and traffic, below the limits of the devices in the
+    description of the machine (`harness.describe_machine`).
     With `overwrite` they may replace files that no earlier profile wrote.
     """
     drawn: dict[str, tuple[Callable[[Any, Sequence[Row]], None], list[Row]]] = {}
@@ -37,6 +42,9 @@ def draw_plots(folder: str | Path, rows: Sequence[Row], *, overwrite: bool = Fal
         some = [row for row in chosen if name == "growth.png" or not row.case.startswith("growth/")]
         if some:
             drawn[name] = (draw, some)
+    placed = [row for row in rows if row.flops and row.bytes]
+    if machine is not None and placed:
+        drawn["roofline.png"] = (lambda axes, some: draw_roofline(axes, some, machine["devices"]), placed)
     if drawn:
         with Outputs("profile", overwrite=overwrite).folder(folder) as inside:
             for name, (draw_rows, chosen_rows) in drawn.items():

@@ -118,6 +118,11 @@ def _numpy_flags(points: list[Array], known: Array, given: Array, low: Array, hi
     return RangePoints(points[0], points[1], points[2], status)
 
 
+# Operations of a sample: two products and two sums for each of x, y, z. The travel along the transport and the origin
+# are one number for each axis and profile.
+_STRAIGHT_FLOPS = 12
+
+
 def cases(device: Device) -> Iterator[Case]:
     """Yield a million points of a straight transport and of a rotating sheet, and a resampling."""
     yield _assembly(device, RangeImage(geometry=STRAIGHT), "straight/1e6", _numba_straight, _numpy_straight)
@@ -158,4 +163,5 @@ def _assembly(
     }
     samples = given.size
     traffic = ((4 * operation.geometry.inputs + 1) * samples, 13 * samples)
-    return Case("range_image", name, bound.run, peers, error, traffic)
+    flops = _STRAIGHT_FLOPS * samples if name.startswith("straight") else None
+    return Case("range_image", name, bound.run, peers, error, traffic, flops=flops)

@@ -78,6 +78,11 @@ def _numpy(u: NDArray[Any], v: NDArray[Any], table: NDArray[Any], lens: bool) ->
     return g, h, status
 
 
+# Operations of a point in `_numpy`: 4 for x and y, 4 for w, 2 quotients, 4 each for g and h. The lens: 2 for the place
+# beside its centre, 3 for the square, 3 for the stretch, 4 for the new x and y.
+_FLOPS, _LENS_FLOPS = 18, 12
+
+
 def cases(device: Device) -> Iterator[Case]:
     """Yield 1e4, 1e6 and 16e6 points in single precision; 1e6 points with a lens, and in double precision."""
     plain = Triangulation(homography=HOMOGRAPHY, region=REGION)
@@ -110,4 +115,6 @@ def _case(device: Device, operation: Triangulation, dtype: str, count: int, name
     points = (outputs.g.get(), outputs.h.get())
     error = max(float(np.nanmax(np.abs(a - b))) for a, b in zip(points, exact, strict=False))
     item = u.itemsize
-    return Case("triangulation", name, bound.run, peers, error, (2 * item * count, (2 * item + 1) * count))
+    flops = (_FLOPS if operation.lens is None else _FLOPS + _LENS_FLOPS) * count
+    traffic = (2 * item * count, (2 * item + 1) * count)
+    return Case("triangulation", name, bound.run, peers, error, traffic, flops=flops)

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 _SECONDS, _QUICK_SECONDS = 2.0, 0.3  # longest time to measure a case [s]
 _MINUTES, _QUICK_MINUTES = 20.0, 3.0
 _CONFIDENCE = 0.95
-_NO_PLOTS = "no plots: these operations have no series over size or tolerance; try light_clustering or reflections"
+_NO_PLOTS = (
+    "no plots: no series over size or tolerance, no declared operations; try light_clustering, reflections or psd"
+)
 
 
 def profile(
@@ -53,7 +55,7 @@ def profile(
         typer.Option(
             metavar="DIR",
             parser=named_path,
-            help="Folder for plots of time and error over the amount of work and over the tolerance.",
+            help="Folder for plots: a roofline, time and error over the amount of work and over the tolerance.",
         ),
     ] = None,
     offline: Annotated[
@@ -123,7 +125,7 @@ def profile(
     for line in _speeds(run):
         echo(line, err=True)
     if plots is not None:
-        drawn = draw_plots(plots, run.rows, overwrite=overwrite)
+        drawn = draw_plots(plots, run.rows, run.machine, overwrite=overwrite)
         echo(f"look at {', '.join(str(plots / name) for name in drawn)}" if drawn else _NO_PLOTS, err=True)
     if not run.valid:
         echo("not valid: the machine changed its speed during the measurement; run the command again", err=True)

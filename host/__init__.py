@@ -45,6 +45,7 @@ from gpuvision.host.sequence import BoundSequence, Layout, OperationSequence, St
 from gpuvision.host.sources import ArraySource, PacedSource, Source
 from gpuvision.host.stalls import Stall
 from gpuvision.host.trace import Trace
+from gpuvision.host.tuned_settings import Tunable
 from gpuvision.host.work_size import (
     WorkSize,
     capacity,
@@ -103,6 +104,7 @@ __all__ = [
     "StreamError",
     "StreamReport",
     "Trace",
+    "Tunable",
     "Variant",
     "WorkSize",
     "capacity",

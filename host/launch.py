@@ -51,6 +51,9 @@ class Launch:
         Whether each work-group of the work-item variant solves one problem, with results that do not depend on the
         size of the group. A device without registers for the groups then runs the same number of smaller groups.
         Default False.
+    inline : bool or None
+        Whether a launch that `passes_once` and is small runs in the calling thread. ``None``: where the runtime is
+        known to gain. Default None.
     """
 
     source: str
@@ -63,6 +66,7 @@ class Launch:
     arguments: Sequence[Any] = ()
     passes_once: bool = False
     problem_per_group: bool = False
+    inline: bool | None = None
 
     @property
     def groups(self) -> int:

@@ -25,6 +25,7 @@ from gpuvision.host.launch import (
     uses_vectors,
 )
 from gpuvision.host.program import Define
+from gpuvision.host.tuned_settings import settings_for
 from gpuvision.host.work_size import (
     WorkSize,
     ceil_div,
@@ -97,6 +98,7 @@ class LaunchBuilder:
         self.name = type(operation).__name__ if name is None else name
         self.device, self.shape, self.dtype = device, shape, dtype
         self._precision, self._narrows, self._variant = precision, narrows, variant
+        self._settings = settings_for(operation, device, shape, dtype)
 
     @functools.cached_property
     def real(self) -> np.dtype[Any]:
@@ -139,7 +141,8 @@ class LaunchBuilder:
     @functools.cached_property
     def uses_vectors(self) -> bool:
         """Whether the vector variant runs on this device."""
-        return uses_vectors(self._variant, self.device)
+        variant = self._settings.variant if self._variant == "auto" else None
+        return uses_vectors(variant or self._variant, self.device)
 
     def check_dtype(self, *names: str, of: str) -> None:
         """Check that the first input has one of these dtypes and that the device reads it.
@@ -183,10 +186,22 @@ class LaunchBuilder:
         grouping : {"padded", "fitted", "strided", "per_element"}
             Work-groups of the other variant: `padded_groups`, `fitted_groups`, `strided_groups` or
             `group_per_element`.
+
+        Notes
+        -----
+        Tuned settings replace `each` and `group`.
         """
         if self.uses_vectors and count >= least:
-            return vector_work(count, each)
-        return _GROUPINGS[grouping](count, group)
+            return vector_work(count, self.tuned_strip(each))
+        return _GROUPINGS[grouping](count, self.tuned_group(group))
+
+    def tuned_strip(self, default: int) -> int:
+        """Return the elements of one work-item of the vector variant: tuned for this device, or the default."""
+        return self._settings.strip or default
+
+    def tuned_group(self, default: int) -> int:
+        """Return the work-group size of the work-item variant: tuned for this device, or the default."""
+        return self._settings.group or default
 
     def share(self, count: int, *, per_core: int, multiple: int = 1) -> int:
         """Return the elements of one share, a multiple of a number, when each core gets `per_core` shares."""
@@ -257,6 +272,7 @@ class LaunchBuilder:
             arguments=arguments,
             passes_once=passes_once,
             problem_per_group=problem_per_group,
+            inline=self._settings.inline,
         )
 
 

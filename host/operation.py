@@ -28,6 +28,7 @@ from gpuvision.host.process import check_process
 from gpuvision.host.stages import stage
 from gpuvision.host.trace import records_launches
 from gpuvision.host.traced import TracedBound
+from gpuvision.host.tuned_settings import Tunable
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -48,6 +49,8 @@ class Operation(Generic[R]):
         Folder of the kernel sources.
     include_folders : tuple of pathlib.Path
         More folders that are searched for headers, such as ``gpuvision.operation.KERNEL_FOLDER``.
+    tunable : Tunable or None
+        Settings that `gpuvision tune` may change; default None.
     takes_single_frames : bool
         Whether the first input is one frame, without an axis for a batch; default False. A stream then has batches of
         one frame.
@@ -56,6 +59,7 @@ class Operation(Generic[R]):
     Result: ClassVar[type[Any]]
     kernel_folder: ClassVar[Path | None] = None
     include_folders: ClassVar[tuple[Path, ...]] = ()
+    tunable: ClassVar[Tunable | None] = None
     takes_single_frames: ClassVar[bool] = False
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:

@@ -31,17 +31,10 @@ def cases(device: Device) -> Iterator[Case]:
         frame.set(np.ones((16, 2), np.float32))
     results = [bound.allocate() for _ in range(2)]
     inputs = [{0: memory_of(frame)} for frame in frames]
-    # Arguments of the kernel: the input, then the fields of the result.
+    # Arguments of the kernel: the input, then the fields of the result, of which the computed ones are the first.
     arrays = [
-        {
-            **inputs[k],
-            **{
-                place: memory_of(array)
-                for place, array in enumerate(results[k], 1)
-                if isinstance(array, cl.array.Array)
-            },
-        }
-        for k in range(2)
+        dict(enumerate(memory_of(array) for array in (frame, *result) if isinstance(array, cl.array.Array)))
+        for frame, result in zip(frames, results, strict=True)
     ]
     queue, kernel, *sizes = bound.enqueue_arguments
     calls: dict[str, tuple[Callable[[int], object], list[dict[int, Any]]]] = {

@@ -48,6 +48,8 @@ ROOT = Path(__file__).resolve().parents[1]
 # warm and nothing is written in the home. Each of these folders is read when it is first needed, after this line.
 CACHE = ROOT / "build" / "cache"
 os.environ |= {"XDG_CACHE_HOME": str(CACHE), "MPLCONFIGDIR": str(CACHE / "matplotlib")}
+# Launches as described by the operations, whatever `gpuvision tune` has kept.
+os.environ["GPUVISION_TUNING"] = "off"
 hypothesis.configuration.set_hypothesis_home_dir(CACHE / "hypothesis")
 
 LEFT_COUNTS = pytest.StashKey[dict[str, int]]()

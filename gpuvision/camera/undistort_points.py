@@ -20,6 +20,7 @@ from gpuvision.host import (
     LaunchBuilder,
     Precision,
     StatusArray,
+    Tunable,
     Variant,
     flags,
     type_defines,
@@ -82,6 +83,9 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
     """
 
     Result: ClassVar[type[Any]] = UndistortedPoints
+    tunable: ClassVar[Tunable | None] = Tunable(
+        strips=(512, 1024, 2048, 4096, 8192, 16384), groups=(32, 64, 128, 256), variants=True
+    )
 
     model: Camera | Lens | PlanePolynomial
     inverse: bool = False

@@ -46,6 +46,7 @@ def application() -> typer.Typer:
     from gpuvision.cli.select import select
     from gpuvision.cli.simulate import simulate
     from gpuvision.cli.tracing import with_trace
+    from gpuvision.cli.tune import tune
     from gpuvision.cli.undistort import undistort
     from gpuvision.cli.version import root
 
@@ -72,6 +73,7 @@ def application() -> typer.Typer:
         demo,
         devices,
         profile,
+        tune,
     ):
         app.command()(with_trace(command))
     return app

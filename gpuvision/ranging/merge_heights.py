@@ -21,6 +21,7 @@ from gpuvision.host import (
     LaunchBuilder,
     Precision,
     StatusArray,
+    Tunable,
     Variant,
     flags,
     to_numpy,
@@ -122,6 +123,9 @@ class MergeHeights(VisionOperation[MergedHeights]):
     """
 
     Result: ClassVar[type[Any]] = MergedHeights
+    tunable: ClassVar[Tunable | None] = Tunable(
+        strips=(512, 1024, 2048, 4096, 8192, 16384), groups=(64, 128, 256), variants=True
+    )
 
     max_sigmas: float = 3.0
     tolerance: float = 0.0

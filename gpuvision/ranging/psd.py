@@ -24,6 +24,7 @@ from gpuvision.host import (
     LaunchBuilder,
     Precision,
     StatusArray,
+    Tunable,
     Variant,
     WorkSize,
     flags,
@@ -217,6 +218,9 @@ class PsdReadout(VisionOperation[PsdReading]):
     """
 
     Result: ClassVar[type[Any]] = PsdReading
+    tunable: ClassVar[Tunable | None] = Tunable(
+        strips=(1024, 2048, 4096, 8192, 16384, 65536), groups=(32, 64, 128, 256), variants=True
+    )
 
     strip_length: float
     ampere: float = 1.0
@@ -337,12 +341,12 @@ class PsdReadout(VisionOperation[PsdReading]):
         if samples >= 2**30:
             raise ValueError(f"PsdReadout takes fewer than 2**30 samples at once, got {samples}; split the batch")
         long_strips = samples >= _STRIPS_PER_CORE * _LONG_STRIP * device.compute_units
-        each = _LONG_STRIP if long_strips else _SHORT_STRIP
+        each = build.tuned_strip(_LONG_STRIP if long_strips else _SHORT_STRIP)
         if build.uses_vectors and samples >= _LANES:
             # The last work-item also processes the remainder.
             work = WorkSize((max(samples // each, 1),), (1,), each, vectors=True)
         else:
-            work = strided_groups(samples, _GROUP)
+            work = strided_groups(samples, build.tuned_group(_GROUP))
         chosen = self.outputs or ()
         sheet = self.triangulation
         table = None if self.linearity is None else np.array(self.linearity, build.real)

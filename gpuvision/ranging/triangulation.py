@@ -21,7 +21,7 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.polynomial import PlanePolynomial
-from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, flags, type_defines
+from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Tunable, Variant, flags, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging import homography
 from gpuvision.ranging.homography import DEFAULT_LIMITS, HomographyLimits, Model
@@ -100,6 +100,9 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
     """
 
     Result: ClassVar[type[Any]] = SheetPoints
+    tunable: ClassVar[Tunable | None] = Tunable(
+        strips=(512, 1024, 2048, 4096, 8192, 16384), groups=(32, 64, 128, 256), variants=True
+    )
 
     precision: Precision = None
     variant: Variant = "auto"

@@ -1,0 +1,84 @@
+"""``gpuvision tune``: find faster settings of the operations on this machine, and keep them in the user's cache."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gpuvision.cli.arguments import echo
+
+if TYPE_CHECKING:
+    from gpuvision.host.tuning import TuningResult
+
+# Size classes of 4^5 = 1024 to 4^11 = 4 million elements (chosen): smaller launches are shorter than their overhead,
+# larger ones are bound by the memory in every setting.
+_CLASSES = range(5, 11)
+
+
+def tune(
+    operations: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="OPERATION", help="Operations to tune, such as psd or points. Default: all."),
+    ] = None,
+    device: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LABEL",
+            help="Label of an OpenCL device, see `gpuvision devices`; repeat the option for several. Default: all.",
+        ),
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Measure and print, but keep nothing.")] = False,
+) -> None:
+    """Find faster settings of the operations on this machine: work-group sizes, strips, kernel variants.
+
+    Each operation is measured on inputs of 1 thousand to 4 million elements. Settings win only if their results are the
+    results of the defaults, and if they are faster by more than the measured spread. The winners are kept in the cache
+    folder of gpuvision; every operation that is bound later uses them, until the driver or the version of gpuvision
+    changes. GPUVISION_TUNING=off ignores them.
+    """
+    from gpuvision.host import Device
+    from gpuvision.host.tuned_settings import DEFAULTS, keep_entries
+    from gpuvision.host.tuning import tune as tuned
+    from gpuvision.profiling import tuning_inputs
+
+    for name in operations or ():
+        if name not in tuning_inputs.NAMES:
+            raise ValueError(f"no operation {name!r} to tune; expected some of {', '.join(tuning_inputs.NAMES)}")
+    devices = [Device.named(each) for each in device] if device else list(Device.all() or [Device.best()])
+    results: list[TuningResult] = []
+    for each in devices:
+        for name in operations or tuning_inputs.NAMES:
+            echo(f"{name} on {each.label}", err=True)
+            for operation, make in tuning_inputs.cases(name):
+                is_possible = each.has_double or make(2)[0].dtype != "float64"
+                results += [tuned(operation, make, each, size) for size in _CLASSES if is_possible]
+    _show(results)
+    if dry_run:
+        return
+    entries = [each.entry for each in results]
+    path = keep_entries([each for each in entries if each.settings != DEFAULTS], [each.key for each in entries])
+    echo(f"kept in {path}", err=True)
+
+
+def _show(results: list[TuningResult]) -> None:
+    """Print the table; below it the settings that failed."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD)
+    for heading in ("operation", "type", "elements", "device"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("default [us]", "best [us]", "gain"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("settings")
+    for each in results:
+        times = [f"{1e6 * seconds:.3g}" for seconds in (each.default_seconds, each.best_seconds)]
+        names = (each.operation, each.dtype, str(each.elements), each.device)
+        table.add_row(*names, *times, f"{each.gain:.2f}", str(each.best))
+    Console(width=120).print(table)
+    for each in results:
+        for settings, reason in each.rejected.items():
+            case = f"{each.operation} {each.dtype} {each.elements} on {each.device}"
+            echo(f"rejected: {case}, {settings}: {reason}", err=True)

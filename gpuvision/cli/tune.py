@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpuvision.cli.arguments import echo
+from gpuvision.cli.arguments import Overwrite, ReportFile, echo, prints_report, write_report
 
 if TYPE_CHECKING:
     from gpuvision.host.tuning import TuningResult
@@ -29,6 +30,8 @@ def tune(
         ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Measure and print, but keep nothing.")] = False,
+    as_json: ReportFile = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Find faster settings of the operations on this machine: work-group sizes, strips, kernel variants.
 
@@ -38,6 +41,7 @@ def tune(
     changes. GPUVISION_TUNING=off ignores them.
     """
     from gpuvision.host import Device
+    from gpuvision.host.outputs import Outputs
     from gpuvision.host.tuned_settings import DEFAULTS, keep_entries
     from gpuvision.host.tuning import tune as tuned
     from gpuvision.profiling import tuning_inputs
@@ -45,6 +49,8 @@ def tune(
     for name in operations or ():
         if name not in tuning_inputs.NAMES:
             raise ValueError(f"no operation {name!r} to tune; expected some of {', '.join(tuning_inputs.NAMES)}")
+    outputs = Outputs("tune", overwrite=overwrite)
+    outputs.claim(as_json)
     devices = [Device.named(each) for each in device] if device else list(Device.all() or [Device.best()])
     results: list[TuningResult] = []
     for each in devices:
@@ -53,7 +59,8 @@ def tune(
             for operation, make in tuning_inputs.cases(name):
                 is_possible = each.has_double or make(2)[0].dtype != "float64"
                 results += [tuned(operation, make, each, size) for size in _CLASSES if is_possible]
-    _show(results)
+    write_report(as_json, [_described(each) for each in results], outputs)
+    _show(results, to_stderr=prints_report(as_json))
     if dry_run:
         return
     entries = [each.entry for each in results]
@@ -61,7 +68,22 @@ def tune(
     echo(f"kept in {path}", err=True)
 
 
-def _show(results: list[TuningResult]) -> None:
+def _described(result: TuningResult) -> dict[str, object]:
+    return {
+        "operation": result.operation,
+        "dtype": result.dtype,
+        "device": result.device,
+        "elements": result.elements,
+        "default_seconds": result.default_seconds,
+        "best_seconds": result.best_seconds,
+        "gain": result.gain,
+        "spread": result.spread,
+        "settings": asdict(result.best),
+        "rejected": {str(settings): reason for settings, reason in result.rejected.items()},
+    }
+
+
+def _show(results: list[TuningResult], *, to_stderr: bool) -> None:
     """Print the table; below it the settings that failed."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -77,7 +99,7 @@ def _show(results: list[TuningResult]) -> None:
         times = [f"{1e6 * seconds:.3g}" for seconds in (each.default_seconds, each.best_seconds)]
         names = (each.operation, each.dtype, str(each.elements), each.device)
         table.add_row(*names, *times, f"{each.gain:.2f}", str(each.best))
-    Console(width=120).print(table)
+    Console(width=120, stderr=to_stderr).print(table)
     for each in results:
         for settings, reason in each.rejected.items():
             case = f"{each.operation} {each.dtype} {each.elements} on {each.device}"

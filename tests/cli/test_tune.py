@@ -71,6 +71,27 @@ def test_winners_are_printed_and_kept(cache: Path, tuned: list[Any]) -> None:
     assert str(cache) in result.output
 
 
+@pytest.mark.usefixtures("tuned", "cache")
+def test_the_report_in_json() -> None:
+    device = Device.best().label
+    result = CliRunner().invoke(application(), ["tune", "psd", "--device", device, "--json", "-", "--dry-run"])
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert len(report) == 12
+    assert report[6] == {
+        "operation": "PsdReadout",
+        "dtype": "uint16",
+        "device": device,
+        "elements": 1024,
+        "default_seconds": 5e-6,
+        "best_seconds": 5e-6 / 1.25,
+        "gain": 1.25,
+        "spread": 0.01,
+        "settings": {"variant": None, "strip": 2048, "group": None, "inline": None},
+        "rejected": {"group 32": "another result: field total"},
+    }
+
+
 @pytest.mark.usefixtures("tuned")
 def test_a_dry_run_keeps_nothing(cache: Path) -> None:
     result = CliRunner().invoke(application(), ["tune", "psd", "--dry-run", "--device", Device.best().label])

@@ -85,7 +85,8 @@ def test_fits(device, rng, method, dtype, along, variant):
     noise = {"read_noise": TOP[dtype] * 0.02, "gain": 0.3} if method == "ml" else {}
     # More samples for the fit with the noise of uint16, so that it converges in nearly all profiles.
     window = 7 if dtype == "uint16" else WINDOW
-    parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": window, **noise}
+    second = {"ambiguity": 0.5} if method == "fir" else {}
+    parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": window, **noise, **second}
     frames = line_frames(rng, dtype, (40, 83) if along == "columns" else (83, 40), along)
     if dtype == "uint8":
         frames = np.pad(frames, ((5, 5), (0, 0)))

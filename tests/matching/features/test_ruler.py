@@ -79,6 +79,38 @@ def test_against_the_reference(device: Device, variant: Any, dtype: Any, rng: np
 
 
 @VARIANTS
+@pytest.mark.parametrize("edge_selection", ["strongest", "all"])
+def test_pairs_among_many_edges(device: Device, variant: Any, edge_selection: Any, rng: np.random.Generator) -> None:
+    """A long ruler across noise: each pair of neighbouring edges of the reference, over several words of bits."""
+    image = 100.0 + 60.0 * cv2.GaussianBlur(rng.normal(0.0, 1.0, (100, 300)), (0, 0), 1.2)
+    image = image.astype(np.float32)
+    ruler, length = one_ruler(150.0, 50.0, 0.2), 200
+    operation = RulerEdges(
+        threshold=4.0,
+        length=length,
+        width=3,
+        smoothing_px=1.0,
+        edge_selection=edge_selection,
+        max_edges=40,
+        pairs=True,
+        polarity="rising",
+        variant=variant,
+    )
+    (edges,) = expected(operation, image, ruler)
+    pairs = [(one, other) for one, other in itertools.pairwise(edges) if one["gradient"] > 0.0 > other["gradient"]]
+    assert 10 < len(pairs) <= 40
+    ours = operation(image, ruler, device=device)
+    middle = np.array([0.5 * (one["position"] + other["position"]) for one, other in pairs])
+    if edge_selection == "all":
+        np.testing.assert_allclose(ours.position[0, : len(pairs)], middle, rtol=0, atol=2e-3)
+        assert np.isnan(ours.position[0, len(pairs) :]).all()
+        assert (ours.status[0, len(pairs) :] == Status.LOW_SIGNAL).all()
+    else:
+        weaker = [min(abs(one["gradient"]), abs(other["gradient"])) for one, other in pairs]
+        assert abs(ours.position[0] - middle[int(np.argmax(weaker))]) < 2e-3
+
+
+@VARIANTS
 def test_odd_sizes_and_steps(device: Device, variant: Any, rng: np.random.Generator) -> None:
     values, rulers = step(rng, angle=2.5)
     image = values.astype(np.float32)
@@ -139,38 +171,6 @@ def test_lengths_and_polarities_share_a_program(device: Device) -> None:
     assert options(length=120) == options(length=15) == options(polarity="rising") == options(polarity="falling")
     assert options(length=129) != options(length=120)
     assert options(length=129) == options(length=240)
-
-
-@VARIANTS
-@pytest.mark.parametrize("edge_selection", ["strongest", "all"])
-def test_pairs_among_many_edges(device: Device, variant: Any, edge_selection: Any, rng: np.random.Generator) -> None:
-    """A long ruler across noise: each pair of neighbouring edges of the reference, over several words of bits."""
-    image = 100.0 + 60.0 * cv2.GaussianBlur(rng.normal(0.0, 1.0, (100, 300)), (0, 0), 1.2)
-    image = image.astype(np.float32)
-    ruler, length = one_ruler(150.0, 50.0, 0.2), 200
-    operation = RulerEdges(
-        threshold=4.0,
-        length=length,
-        width=3,
-        smoothing_px=1.0,
-        edge_selection=edge_selection,
-        max_edges=40,
-        pairs=True,
-        polarity="rising",
-        variant=variant,
-    )
-    (edges,) = expected(operation, image, ruler)
-    pairs = [(one, other) for one, other in itertools.pairwise(edges) if one["gradient"] > 0.0 > other["gradient"]]
-    assert 10 < len(pairs) <= 40
-    ours = operation(image, ruler, device=device)
-    middle = np.array([0.5 * (one["position"] + other["position"]) for one, other in pairs])
-    if edge_selection == "all":
-        np.testing.assert_allclose(ours.position[0, : len(pairs)], middle, rtol=0, atol=2e-3)
-        assert np.isnan(ours.position[0, len(pairs) :]).all()
-        assert (ours.status[0, len(pairs) :] == Status.LOW_SIGNAL).all()
-    else:
-        weaker = [min(abs(one["gradient"]), abs(other["gradient"])) for one, other in pairs]
-        assert abs(ours.position[0] - middle[int(np.argmax(weaker))]) < 2e-3
 
 
 def test_shortest_and_a_single_line(device: Device) -> None:

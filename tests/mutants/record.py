@@ -18,7 +18,8 @@ import coverage
 from mutants.faults import ROOT, Fault
 
 OUT = ROOT / "build" / "mutants"
-_MAX_FILES, _MAX_FILES_OF_MODULE = 6, 3
+_MAX_FILES = 7
+_LEVELS = 3  # a module, its users, and their users
 _DATA, _TIMES = OUT / "coverage", OUT / "times.xml"
 # Tests that read the text of every source file: no record shows them.
 _TESTS_OF_TEXTS = (
@@ -82,22 +83,34 @@ def tests_of(fault: Fault, budget: float) -> list[str]:
 
 
 @cache
-def _test_files(path: Path, *, direct: bool = True) -> tuple[str, ...]:
-    """Return the test files of a Python file: the one of the same name, then the files that mention most of its names.
+def _test_files(path: Path) -> tuple[str, ...]:
+    """Return the test files of a Python file, at most `_MAX_FILES`.
 
-    A module whose names no test mentions is tested through the modules that import it.
+    They are the files of the same name and the files that import the module, those that mention most of its names
+    first; then the same of the modules that import it, and of the modules that import these.
     """
-    names = "|".join({path.stem, *_public_names(path.read_text())})
-    found = {file: len(set(re.findall(rf"\b(?:{names})\b", text))) for file, text in _tests().items()}
-    own = [file for file in found if file.name == f"test_{path.stem}.py" and file.parent.name == path.parent.name]
-    others = sorted((file for file in found if found[file]), key=lambda file: (-found[file], len(_tests()[file])))
-    chosen = list(dict.fromkeys([*own, *others]))[:_MAX_FILES_OF_MODULE]
-    files = [str(each.relative_to(ROOT)) for each in chosen]
-    if direct and not own and not any(found[file] > 1 for file in chosen):
-        for user in (each for folder in ("gpuvision", "host") for each in sorted((ROOT / folder).rglob("*.py"))):
-            if f".{path.stem} import" in user.read_text():
-                files += _test_files(user, direct=False)
-    return tuple(files)
+    files: list[Path] = []
+    level, known = [path], {path}
+    for _ in range(_LEVELS):
+        for each in level:
+            names = re.compile(rf"\b(?:{'|'.join([each.stem, *_public_names(each.read_text())])})\b")
+            own = [file for file in _tests() if file.name == f"test_{each.stem}.py"]
+            others = (file for file in _tests() if _imports(_tests()[file], each))
+            files += own
+            files += sorted(others, key=lambda file: (-len(set(names.findall(_tests()[file]))), len(_tests()[file])))
+        users = [file for file, text in _modules().items() if any(_imports(text, each) for each in level)]
+        level = [each for each in users if each not in known]
+        known |= set(level)
+        if len(set(files)) >= _MAX_FILES:
+            break
+    return tuple(str(each.relative_to(ROOT)) for each in list(dict.fromkeys(files))[:_MAX_FILES])
+
+
+def _imports(text: str, path: Path) -> bool:
+    """Return whether the text of a Python file imports from a module."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    package, name = ".".join(("gpuvision",) * (parts[0] != "gpuvision") + parts[:-1]), parts[-1]
+    return bool(re.search(rf"(?:from|import) {re.escape(package)}(?:\.{name}\b| import [^\n]*\b{name}\b)", text))
 
 
 def _in_folder(kernel: str) -> str:
@@ -114,6 +127,13 @@ def _public_names(text: str) -> list[str]:
 def _tests() -> dict[Path, str]:
     """Return the texts of the test files."""
     return {file: file.read_text() for file in sorted((ROOT / "tests").rglob("test_*.py"))}
+
+
+@cache
+def _modules() -> dict[Path, str]:
+    """Return the texts of the modules."""
+    folders = ("gpuvision", "host")
+    return {file: file.read_text() for folder in folders for file in sorted((ROOT / folder).rglob("*.py"))}
 
 
 def _contexts(path: Path, lines: range | None) -> set[str]:

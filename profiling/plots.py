@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from gpuvision.host.outputs import Outputs
 from gpuvision.plots.figure import new_figure, write_png
 from gpuvision.profiling.harness import Row
@@ -32,27 +34,41 @@ def draw_plots(
     description of the machine (`harness.describe_machine`).
     With `overwrite` they may replace files that no earlier profile wrote.
     """
-    drawn: dict[str, tuple[Callable[[Any, Sequence[Row]], None], list[Row]]] = {}
+    figures = figures_of(rows, machine)
+    if figures:
+        with Outputs("profile", overwrite=overwrite).folder(folder) as inside:
+            for name, figure in figures.items():
+                write_png(figure, inside / f"{name}.png")
+    return [f"{name}.png" for name in figures]
+
+
+def figures_of(rows: Sequence[Row], machine: Mapping[str, Any] | None = None) -> dict[str, Figure]:
+    """Return the figures that the rows have data for, by the names of the files of `draw_plots` without suffix."""
+    figures: dict[str, Figure] = {}
     grown = [row for row in rows if _GROWTH.match(row.case)]
     bases = {row.metadata.get("base") for row in grown}
     for name, draw, chosen in (
-        ("growth.png", _growth, grown and [row for row in rows if row in grown or row.case in bases]),
-        ("tolerance.png", _tolerance, [row for row in rows if "tolerance" in row.metadata and "/" in row.case]),
+        ("growth", _growth, grown and [row for row in rows if row in grown or row.case in bases]),
+        ("tolerance", _tolerance, [row for row in rows if "tolerance" in row.metadata and "/" in row.case]),
     ):
-        some = [row for row in chosen if name == "growth.png" or not row.case.startswith("growth/")]
+        some = [row for row in chosen if name == "growth" or not row.case.startswith("growth/")]
         if some:
-            drawn[name] = (draw, some)
-    placed = [row for row in rows if row.flops and row.bytes]
-    if machine is not None and placed:
-        drawn["roofline.png"] = (lambda axes, some: draw_roofline(axes, some, machine["devices"]), placed)
-    if drawn:
-        with Outputs("profile", overwrite=overwrite).folder(folder) as inside:
-            for name, (draw_rows, chosen_rows) in drawn.items():
-                _draw(inside / name, draw_rows, chosen_rows)
-    return list(drawn)
+            figures[name] = _figure(draw, some)
+    placed = [row for row in rows if row.flops and row.bytes and _roofs(machine, row.device)]
+    if placed:
+        devices = {row.device: _roofs(machine, row.device) for row in placed}
+        figures["roofline"] = _figure(lambda axes, some: draw_roofline(axes, some, devices), placed)
+    return figures
 
 
-def _draw(path: Path, draw: Callable[[Any, Sequence[Row]], None], rows: Sequence[Row]) -> None:
+def _roofs(machine: Mapping[str, Any] | None, device: str) -> Mapping[str, Any]:
+    """Return the limits of a device in the description of the machine; empty in runs of earlier versions."""
+    devices = (machine or {}).get("devices")
+    found = devices.get(device) if isinstance(devices, Mapping) else None
+    return found if isinstance(found, Mapping) and {"gflops", "bandwidths"} <= set(found) else {}
+
+
+def _figure(draw: Callable[[Any, Sequence[Row]], None], rows: Sequence[Row]) -> Figure:
     devices = list(dict.fromkeys(row.device for row in rows))
     figure = new_figure(*_SIZE)
     for axes, device in zip(figure.subplots(1, len(devices), squeeze=False, sharey=True)[0], devices, strict=True):
@@ -60,7 +76,7 @@ def _draw(path: Path, draw: Callable[[Any, Sequence[Row]], None], rows: Sequence
         draw(axes, [row for row in rows if row.device == device])
         axes.grid(which="both", alpha=0.2)
         axes.legend(fontsize=6.5, frameon=False)
-    write_png(figure, path)
+    return figure
 
 
 def _growth(axes: Any, rows: Sequence[Row]) -> None:

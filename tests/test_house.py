@@ -31,7 +31,7 @@ ROOMS = {
     "profiling": "gpuvision/profiling",
     "tests/reference": "gpuvision/reference",
 }
-SHIPPED = {".py", ".pyi", ".cl", ".h", ".toml", ".typed"}
+SHIPPED = {".py", ".pyi", ".cl", ".h", ".html", ".toml", ".typed"}
 
 
 def _files(*places: str) -> Iterator[Path]:

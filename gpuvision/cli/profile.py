@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -12,6 +12,7 @@ from gpuvision.cli.arguments import Overwrite, ReportFile, echo, named_path, pri
 from gpuvision.host.errors import GpuVisionError
 
 if TYPE_CHECKING:
+    from gpuvision.host.outputs import Outputs
     from gpuvision.profiling.harness import Row, Run
 
 _SECONDS, _QUICK_SECONDS = 2.0, 0.3  # longest time to measure a case [s]
@@ -58,6 +59,23 @@ def profile(
             help="Folder for plots: a roofline, time and error over the amount of work and over the tolerance.",
         ),
     ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            parser=named_path,
+            help="Folder for profile.html: a page with machine, peers, figures and all rows, which needs no network.",
+        ),
+    ] = None,
+    stored: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="FILE",
+            parser=named_path,
+            help="Make the page or the plots from a file of --json instead of measuring.",
+        ),
+    ] = None,
     offline: Annotated[
         list[str] | None,
         typer.Option(
@@ -79,6 +97,8 @@ def profile(
     changed is marked invalid, and the exit code is 1. If the measurement of an operation fails, the
     others are still measured; the report names the operation and the reason, and the exit code is 1.
 
+    With --html DIR the run is also written as a page; with --from FILE the page shows a stored run.
+
     With --offline nothing is measured: the kernels are compiled for GPUs by Clang and NVIDIA's ptxas. The table shows
     the registers, stack, spilled registers and local memory of each kernel. The exit code is 1 if a kernel does not
     compile, calls a function without a body, spills more registers than the limit, or takes more than 5 KiB of stack
@@ -88,10 +108,18 @@ def profile(
         from gpuvision.cli.profile_offline import profile_offline
 
         measures = {"device": device or None, "seconds": seconds, "minutes": minutes, "quick": quick, "plots": plots}
-        reject_unused("with --offline", **measures)
+        reject_unused("with --offline", **measures, html=html, **{"from": stored})
         profile_offline(offline, operations or (), as_json, one_build=one_build, overwrite=overwrite)
         return
     reject_unused("without --offline", one_build=one_build)
+    pictures = _Pictures(plots, html, overwrite)
+    if stored is not None:
+        settings = {"device": device or None, "seconds": seconds, "minutes": minutes, "quick": quick, "json": as_json}
+        reject_unused("with --from", **settings)
+        if operations:
+            raise ValueError("OPERATION has no effect with --from; leave it out")
+        pictures.write_stored(stored)
+        return
     if importlib.util.find_spec("numba") is None:
         raise GpuVisionError("the peer numba is missing; install it: pip install 'gpuvision[profile]'")
     from gpuvision.host import Device
@@ -100,10 +128,7 @@ def profile(
 
     outputs = Outputs("profile", overwrite=overwrite)
     outputs.claim(as_json)
-    if plots is not None:
-        from gpuvision.profiling.plots import PLOTS, draw_plots
-
-        outputs.claim_folder(plots, PLOTS)
+    pictures.claim(outputs)
     for name in operations or ():
         if name not in harness.OPERATIONS:
             raise ValueError(f"no operation {name!r} to profile; expected some of {', '.join(harness.OPERATIONS)}")
@@ -124,15 +149,56 @@ def profile(
     _show(list(run.rows), to_stderr=prints_report(as_json))
     for line in _speeds(run):
         echo(line, err=True)
-    if plots is not None:
-        drawn = draw_plots(plots, run.rows, run.machine, overwrite=overwrite)
-        echo(f"look at {', '.join(str(plots / name) for name in drawn)}" if drawn else _NO_PLOTS, err=True)
+    pictures.write(run)
     if not run.valid:
         echo("not valid: the machine changed its speed during the measurement; run the command again", err=True)
     for failure in run.failures:
         echo(f"not measured: {failure.operation} on {failure.device}: {failure.reason}", err=True)
     if run.failures or not run.valid:
         raise typer.Exit(1)
+
+
+class _Pictures(NamedTuple):
+    """Folders of ``--plots`` and ``--html``."""
+
+    plots: Path | None
+    html: Path | None
+    overwrite: bool
+
+    def claim(self, outputs: Outputs) -> None:
+        """Check the files before the measurement."""
+        if self.plots is not None:
+            from gpuvision.profiling.plots import PLOTS
+
+            outputs.claim_folder(self.plots, PLOTS)
+        if self.html is not None:
+            if importlib.util.find_spec("jinja2") is None:
+                raise GpuVisionError("the page needs jinja2; install it: pip install 'gpuvision[profile]'")
+            from gpuvision.profiling.page import PAGE_FILE
+
+            outputs.claim_folder(self.html, (PAGE_FILE,))
+
+    def write(self, run: Run) -> None:
+        """Draw the plots and write the page."""
+        if self.plots is not None:
+            from gpuvision.profiling.plots import draw_plots
+
+            drawn = draw_plots(self.plots, run.rows, run.machine, overwrite=self.overwrite)
+            echo(f"look at {', '.join(str(self.plots / name) for name in drawn)}" if drawn else _NO_PLOTS, err=True)
+        if self.html is not None:
+            from gpuvision.profiling.page import write_page
+
+            echo(f"look at {write_page(self.html, run, overwrite=self.overwrite)}", err=True)
+
+    def write_stored(self, path: Path) -> None:
+        """Draw the plots and write the page of a stored run."""
+        from gpuvision.host.outputs import Outputs
+        from gpuvision.profiling.stored_run import read_run
+
+        if self.plots is None and self.html is None:
+            raise ValueError("--from has no effect without --html or --plots; give a folder")
+        self.claim(Outputs("profile", inputs=[path], overwrite=self.overwrite))
+        self.write(read_run(path))
 
 
 def _show(rows: list[Row], to_stderr: bool) -> None:

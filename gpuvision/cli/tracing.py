@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gpuvision.cli.arguments import named_path
+from gpuvision.cli.arguments import Overwrite, named_path
 
 TraceFile = Annotated[
     Path | None,
@@ -24,34 +24,42 @@ TraceFile = Annotated[
 
 
 def with_trace(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command with the option ``--trace`` before its last option, ``--overwrite``.
+    """Return a command with the option ``--trace`` before ``--overwrite``; a command without ``--overwrite`` gets both.
 
     The timeline is written when the command has succeeded, or ends with an exit code after its work.
     """
     signature = inspect.signature(command, eval_str=True)
-    *others, overwrite = signature.parameters.values()
-    if overwrite.name != "overwrite":
-        raise ValueError(f"the last option of {command.__name__} is {overwrite.name}, expected overwrite")
+    parameters = dict(signature.parameters)
+    overwrite_option = parameters.pop("overwrite", None)
 
     @functools.wraps(command)
-    def traced(*, trace: Path | None = None, **arguments: Any) -> None:
+    def traced(*, trace: Path | None = None, overwrite: bool = False, **arguments: Any) -> None:
+        if overwrite_option is not None:
+            arguments["overwrite"] = overwrite
         if trace is None:
             command(**arguments)
         else:
-            _run_traced(command, trace, arguments)
+            _run_traced(command, trace, overwrite, arguments)
 
-    option = inspect.Parameter("trace", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=None, annotation=TraceFile)
-    parameters = [*others, option, overwrite]
-    traced.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-    traced.__annotations__ = {each.name: each.annotation for each in parameters} | {"return": None}
+    options = [
+        *parameters.values(),
+        _option("trace", None, TraceFile),
+        overwrite_option or _option("overwrite", False, Overwrite),
+    ]
+    traced.__signature__ = signature.replace(parameters=options)  # type: ignore[attr-defined]
+    traced.__annotations__ = {each.name: each.annotation for each in options} | {"return": None}
     return traced
 
 
-def _run_traced(command: Callable[..., None], path: Path, arguments: dict[str, Any]) -> None:
+def _option(name: str, default: object, annotation: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD, default=default, annotation=annotation)
+
+
+def _run_traced(command: Callable[..., None], path: Path, overwrite: bool, arguments: dict[str, Any]) -> None:
     from gpuvision.host.trace import Trace
 
     ended: typer.Exit | None = None
-    with Trace(path, overwrite=arguments["overwrite"]) as trace, trace.span(f"gpuvision {_command_name(command)}"):
+    with Trace(path, overwrite=overwrite) as trace, trace.span(f"gpuvision {_command_name(command)}"):
         try:
             command(**arguments)
         except typer.Exit as code:

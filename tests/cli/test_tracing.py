@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -34,12 +35,22 @@ def test_every_command_has_the_option() -> None:
         assert [each.name for each in command.params if "--trace" in each.opts] == ["trace"], name
 
 
-def test_a_command_without_overwrite_is_refused() -> None:
-    def broken(number: int) -> None:
-        raise AssertionError(number)
+def test_a_command_without_overwrite_gets_it_for_the_trace(tmp_path: Path) -> None:
+    seen: list[int] = []
 
-    with pytest.raises(ValueError, match="the last option of broken is number, expected overwrite"):
-        with_trace(broken)
+    def count(number: int = 1) -> None:
+        seen.append(number)
+
+    app = typer.Typer()
+    app.command()(with_trace(count))
+    file = tmp_path / "t.json"
+    file.write_text("a user's")
+    words = ["--number", "3", "--trace", str(file)]
+    assert isinstance(CliRunner().invoke(app, words).exception, FileExistsError)
+    assert seen == []
+    assert CliRunner().invoke(app, [*words, "--overwrite"]).exit_code == 0
+    assert seen == [3]
+    assert traced(file) == ["gpuvision count"]
 
 
 def traced(path: Path) -> list[str]:

@@ -463,13 +463,20 @@ def _steady_section(
         rows = []
         for case in _cases(operation, device, quick):
             rows += measure(case, device, seconds=plan.grant())
-        after = ceiling.flop_rate(device)
-        rows = [_with_flop_fraction(row, 0.5 * (before + after)) for row in rows]
-        probes.append(Probe(operation, device.label, before, after, abs(after / before - 1.0) <= _STEADY))
-        if probes[-1].steady:
+        probe = probe_of(operation, device, before)
+        rows = [_with_flop_fraction(row, 0.5 * (before + probe.after)) for row in rows]
+        probes.append(probe)
+        if probe.steady:
             break
-        progress(f"  {before / 1e9:.0f} -> {after / 1e9:.0f} GFLOP/s: the machine changed its speed ({attempt + 1})")
+        change = f"{before / 1e9:.0f} -> {probe.after / 1e9:.0f} GFLOP/s"
+        progress(f"  {change}: the machine changed its speed ({attempt + 1})")
     return rows
+
+
+def probe_of(operation: str, device: Device, before: float) -> Probe:
+    """Measure the FLOP rate of a device after a measurement; `before` is the rate before it [FLOP/s]."""
+    after = ceiling.flop_rate(device)
+    return Probe(operation, device.label, before, after, abs(after / before - 1.0) <= _STEADY)
 
 
 def _with_flop_fraction(row: Row, rate: float) -> Row:

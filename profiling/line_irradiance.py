@@ -84,8 +84,8 @@ _PAIR_FLOPS = 45
 
 def cases(device: Device) -> Iterator[Case]:
     """Yield a wall with many and with few lines, a board with boxes, light of patches, and light with occlusion."""
-    yield _case(device, *_wall(64, 20_000), "closed-form/wall/64x20000")
-    yield _case(device, *_wall(16, 100_000), "closed-form/wall/16x1e5")
+    yield _case(device, *wall(64, 20_000), "closed-form/wall/64x20000")
+    yield _case(device, *wall(16, 100_000), "closed-form/wall/16x1e5")
     yield _case(device, *_board(20_000), "closed-form/board/64x20000")
     yield _case(device, *_slopes(64, 20_000), "closed-form-slopes/64x20000")
     yield from patches.cases(device)
@@ -129,7 +129,7 @@ def _peer_table(segments: LitSegments) -> NDArray[np.float32]:
     return np.column_stack(columns).astype(np.float32)
 
 
-def _wall(segments: int, receivers: int) -> tuple[LitSegments, NDArray[np.float32]]:
+def wall(segments: int, receivers: int) -> tuple[LitSegments, NDArray[np.float32]]:
     """Return lines on a floor that end at a wall, and receivers on the wall."""
     rng = np.random.default_rng(1)
     ends = np.zeros((segments, 2, 3))
@@ -150,7 +150,7 @@ def _slopes(segments: int, receivers: int) -> tuple[LitSegments, NDArray[np.floa
     across = rng.uniform((0.02, -0.02, -0.02), (0.1, 0.02, 0.02), (segments, 3))
     normals = np.cross(across, np.cross([-0.5, 0.0, 1.0], across))
     ends = np.stack([start, start + across], axis=1)
-    return LitSegments(ends, normals, np.ones(segments)), _wall(segments, receivers)[1]
+    return LitSegments(ends, normals, np.ones(segments)), wall(segments, receivers)[1]
 
 
 def _board(receivers: int) -> tuple[LitSegments, NDArray[np.float32]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import warnings
 from pathlib import Path
 from types import ModuleType
 
@@ -21,6 +22,8 @@ def keep_compiled(module: ModuleType) -> None:
     """
     loops = [each for each in vars(module).values() if isinstance(each, CPUDispatcher)]
     if loops:
+        # A function that uses large global arrays is compiled in each run.
+        warnings.filterwarnings("ignore", "Cannot cache compiled function", category=numba.NumbaWarning)
         numba.config.CACHE_DIR = os.fspath(cache_folder() / f"numba-{_sources_hash()}")  # type: ignore[attr-defined]
         for loop in loops:
             loop.enable_caching()

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _SECONDS, _QUICK_SECONDS = 2.0, 0.3  # longest time to measure a case [s]
 _MINUTES, _QUICK_MINUTES = 20.0, 3.0
+_MEMORY_MIB = 256.0
 _CONFIDENCE = 0.95
 _NO_PLOTS = (
     "no plots: no series over size or tolerance, no declared operations; try light_clustering, reflections or psd"
@@ -87,6 +88,17 @@ def profile(
     one_build: Annotated[
         bool, typer.Option("--one-build", help="With --offline: compile only the first build of each kernel file.")
     ] = False,
+    growth: Annotated[
+        bool,
+        typer.Option(
+            "--growth",
+            help="Measure the time against the size instead of against peers, from one item to --memory-mib.",
+        ),
+    ] = False,
+    memory_mib: Annotated[
+        float | None,
+        typer.Option(help="With --growth: largest memory of inputs and outputs [MiB]. Default: 256.", min=0.001),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure operations against their peers: NumPy, Numba, OpenCV.
@@ -99,6 +111,10 @@ def profile(
 
     With --html DIR the run is also written as a page; with --from FILE the page shows a stored run.
 
+    With --growth each operation is measured on its own, with 1, 4, 16, ... items. A line states the time of one item,
+    the shortest time, the number of items from which a call takes twice as long as that, the number at which inputs and
+    outputs exceed the largest cache, and the rates of the largest size.
+
     With --offline nothing is measured: the kernels are compiled for GPUs by Clang and NVIDIA's ptxas. The table shows
     the registers, stack, spilled registers and local memory of each kernel. The exit code is 1 if a kernel does not
     compile, calls a function without a body, spills more registers than the limit, or takes more than 5 KiB of stack
@@ -108,20 +124,27 @@ def profile(
         from gpuvision.cli.profile_offline import profile_offline
 
         measures = {"device": device or None, "seconds": seconds, "minutes": minutes, "quick": quick, "plots": plots}
-        reject_unused("with --offline", **measures, html=html, **{"from": stored})
+        reject_unused("with --offline", **measures, html=html, growth=growth, memory_mib=memory_mib, **{"from": stored})
         profile_offline(offline, operations or (), as_json, one_build=one_build, overwrite=overwrite)
         return
     reject_unused("without --offline", one_build=one_build)
     pictures = _Pictures(plots, html, overwrite)
     if stored is not None:
         settings = {"device": device or None, "seconds": seconds, "minutes": minutes, "quick": quick, "json": as_json}
-        reject_unused("with --from", **settings)
+        reject_unused("with --from", **settings, growth=growth, memory_mib=memory_mib)
         if operations:
             raise ValueError("OPERATION has no effect with --from; leave it out")
         pictures.write_stored(stored)
         return
     if importlib.util.find_spec("numba") is None:
         raise GpuVisionError("the peer numba is missing; install it: pip install 'gpuvision[profile]'")
+    if growth:
+        from gpuvision.cli.profile_growth import profile_growth
+
+        reject_unused("with --growth", seconds=seconds, minutes=minutes, quick=quick, html=html)
+        profile_growth(operations or (), device or (), memory_mib or _MEMORY_MIB, as_json, plots, overwrite=overwrite)
+        return
+    reject_unused("without --growth", memory_mib=memory_mib)
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.profiling import harness

@@ -1,0 +1,99 @@
+"""Time against size: sizes, knees, results and picture."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+pytest.importorskip("numba", reason="the extra 'profile' is not installed")
+
+from typer.testing import CliRunner
+
+from gpuvision.cli.main import application
+from gpuvision.profiling import growth
+from gpuvision.profiling.growth_plot import draw_growth
+
+
+def curve(*times: float, each: int = 16) -> list[growth.Point]:
+    """Return a curve of 1, 4, 16, ... items of some bytes."""
+    return [
+        growth.Point("psd", "pocl", "sample", 4**k, each * 4**k, time, 0.9 * time, 1.1 * time)
+        for k, time in enumerate(times)
+    ]
+
+
+def test_the_launch_knee_is_at_twice_the_shortest_time() -> None:
+    assert growth.launch_knee(curve(1.0, 1.0, 4.0)) == pytest.approx(8.0)
+    assert growth.launch_knee(curve(1.0, 1.1, 1.9)) is None
+    assert growth.launch_knee(curve(20.0, 1.0, 4.0)) == pytest.approx(8.0)  # one item takes longer than four
+
+
+def test_the_cache_knee_is_where_the_arrays_fill_the_cache() -> None:
+    assert growth.cache_knee(curve(1.0, 1.0, 1.0), 160) == pytest.approx(10.0)
+    assert growth.cache_knee(curve(1.0, 1.0, 1.0), 1000) is None
+
+
+def test_a_curve_goes_from_one_item_to_the_limit_of_memory(device: Any) -> None:
+    """A sample of float32 currents with position and status takes 13 bytes."""
+    found = growth.measure_growth(["psd"], [device], memory=13 * 4**5, seconds=0.002)
+    (points,) = found.curves.values()
+    assert [point.items for point in points] == [1, 4, 16, 64, 256, 1024]
+    assert [point.bytes for point in points] == [13 * 4**k for k in range(6)]
+    assert all(0.0 < point.low <= point.seconds <= point.high for point in points)
+    assert json.loads(found.to_json())["growth"][3]["items"] == 64
+    assert len(found.probes) == 1
+
+
+@pytest.mark.parametrize("name", sorted(growth.workloads()))
+def test_the_items_of_a_workload_are_repeated(name: str) -> None:
+    """More items than differ: the first ones come again; the operation accepts the shapes."""
+    workload = growth.workloads()[name]
+    few, many = (workload.prepare(items)[1] for items in (1, 5))
+    assert [each.dtype for each in few] == [each.dtype for each in many]
+    assert sum(each.nbytes for each in few) < sum(each.nbytes for each in many)
+
+
+def test_a_slow_operation_is_not_measured_with_more_items(monkeypatch: pytest.MonkeyPatch, device: Any) -> None:
+    monkeypatch.setattr(growth, "take_turns", lambda calls, *_, **__: {"": np.full(7, 1.5)})
+    found = growth.measure_growth(["psd"], [device], memory=1 << 20)
+    assert [point.items for point in found.points] == [1]
+
+
+def test_the_picture_has_the_curves_and_their_knees(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: dict[str, Any] = {}
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: drawn.update(lines=self.axes[0].lines))
+    found = growth.Growth(curve(1.0, 1.0, 4.0), [], {"pocl": 160}, {})
+    assert draw_growth(tmp_path, found) == "sizes.png"
+    line, launch, cache = (each.get_xydata() for each in drawn["lines"])
+    assert line.tolist() == [[1.0, 1e3], [4.0, 1e3], [16.0, 4e3]]
+    assert launch[0] == pytest.approx([8.0, 2e3])
+    assert cache[0] == pytest.approx([10.0, 2500.0])
+    assert found.lines() == [
+        "psd on pocl: 1000000.0 µs for one sample, 1000000.0 µs at least, twice as long from 8, "
+        "beyond the cache from 10; 4 samples/s and 6.4e-08 GB/s for 16"
+    ]
+
+
+def test_the_command_measures_and_writes(tmp_path: Any) -> None:
+    args = ["profile", "psd", "--growth", "--memory-mib", "0.001", "--json", str(tmp_path / "g.json")]
+    ran = CliRunner().invoke(application(), args)
+    assert ran.exit_code in (0, 1)  # 1: the machine changed its speed
+    assert "µs for one sample" in ran.output
+    assert {point["items"] for point in json.loads((tmp_path / "g.json").read_text())["growth"]} == {1, 4, 16, 64}
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["psd", "abacus", "--growth"], "no operation 'abacus' to profile over its size"),
+        (["psd", "--memory-mib", "1"], "--memory-mib has no effect without --growth"),
+        (["psd", "--growth", "--quick"], "--quick has no effect with --growth"),
+    ],
+)
+def test_what_does_not_fit_is_refused(args: list[str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        CliRunner().invoke(application(), ["profile", *args], catch_exceptions=False)

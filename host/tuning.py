@@ -12,7 +12,7 @@ import numpy as np
 import pyopencl as cl
 
 from gpuvision.host.arrays import HostArray
-from gpuvision.host.bound import SHORT_BYTES, Bound
+from gpuvision.host.bound import MAX_INLINE_BYTES, Bound
 from gpuvision.host.device import Device
 from gpuvision.host.errors import GpuVisionError
 from gpuvision.host.launch import Launch, describe_launch
@@ -208,7 +208,7 @@ def _candidates(operation: Operation[Any], tunable: Tunable, default: _Trial) ->
             return describe_launch(operation, device, first.shape, first.dtype)
 
     launch = launch_of(DEFAULTS)
-    may_run_inline = launch.passes_once and launch.nbytes <= SHORT_BYTES and device.has_inline_queues
+    may_run_inline = launch.passes_once and launch.nbytes <= MAX_INLINE_BYTES and device.has_inline_queues
     inline = (None, not default.bound.inline) if may_run_inline else (None,)
     if device.prefers_vectors:
         shapes = [TunedSettings(strip=each) for each in (None, *tunable.strips)]

@@ -225,6 +225,21 @@ def test_a_bound_instance_takes_kept_settings(device: Device) -> None:
         assert readout.bind(device, (1000, 2), SINGLE).enqueue_arguments[3] == (32,)
 
 
+@pytest.mark.parametrize("inline", [True, False])
+@pytest.mark.parametrize(("megabytes", "may_run_inline"), [(0.5, True), (1.9, True), (2.1, False)])
+def test_launches_up_to_2_mib_run_inline_as_tuned(
+    device: Device, megabytes: float, may_run_inline: bool, inline: bool
+) -> None:
+    readout = PsdReadout(strip_length=6e-3, variant="vector" if device.takes_vectors else "work_item")
+    samples = int(megabytes * 2**20 / 17)  # 8 bytes of currents, 9 of position, total and status
+    pairs = np.tile(np.float32([1.0, 3.0]), (samples, 1))
+    with trial_of(TunedSettings(inline=inline)):
+        bound = readout.bind(device, pairs.shape, pairs.dtype)
+    assert bound.inline is (inline and may_run_inline and device.has_inline_queues)
+    bound.inputs[0].set(pairs)
+    np.testing.assert_allclose(bound.run().position.get(), 1.5e-3, rtol=1e-6)
+
+
 @pytest.mark.usefixtures("cache")
 def test_an_explicit_variant_stays(device: Device) -> None:
     keep_entries([entry(device, TunedSettings(variant="work_item"))], [])

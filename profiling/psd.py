@@ -1,8 +1,13 @@
-"""PSD readout, compared with a Numba loop and NumPy: position and status."""
+"""PSD readout, compared with Numba loops and NumPy: position and status.
+
+The peer ``numba`` reads a pair as one complex number or one 32-bit word, and runs chunks on all cores or the whole loop
+on one; ``numba-plain`` indexes the arrays in a parallel loop.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numba
@@ -10,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
-from gpuvision.profiling.harness import Case
+from gpuvision.profiling.harness import Case, Peer
 from gpuvision.ranging.psd import PsdReadout
 
 LENGTH, MINIMUM, SATURATION = 6e-3, 100.0, 60_000.0
 _IN_A_ROW = 8
 _FLOPS = 4  # of a sample: sum, difference, product with half of the length, quotient; without the comparisons
+_CHUNK = 8192  # samples of a chunk of the peer
+# Largest difference of two readouts that keep the stated error bound of 4 epsilon of L/2 each [m].
+_AGREEMENT = 8.0 * float(np.finfo(np.float32).eps) * LENGTH / 2
 
 
 @numba.njit(error_model="numpy")
@@ -34,7 +42,19 @@ def _read_out(a, b, half, minimum, saturation):
 
 @numba.njit(error_model="numpy")
 def _read_out_codes(a, b, half, minimum, saturation):
-    """Read out one sample of codes, which are finite and not negative."""
+    """Read out one sample of codes, which are finite and not negative.
+
+    The numbers are float32 and the flags int32, so that one vector width suits all of them until the flags are stored.
+    """
+    total = a + b
+    dark, high = total <= minimum, max(a, b) >= saturation
+    flags = (np.int32(1) if dark else np.int32(0)) | (np.int32(2) if high else np.int32(0))
+    return np.float32(np.nan) if dark | high else half * (b - a) / total, np.uint8(flags)
+
+
+@numba.njit(error_model="numpy")
+def _read_out_codes_plain(a, b, half, minimum, saturation):
+    """Read out one sample of codes, with flags as they are stored."""
     total = a + b
     dark = total <= minimum
     high = (a >= saturation) | (b >= saturation)
@@ -42,30 +62,106 @@ def _read_out_codes(a, b, half, minimum, saturation):
     return np.float32(np.nan) if dark | high else half * (b - a) / total, flags
 
 
-@numba.njit(parallel=True, error_model="numpy")
-def _numba_planar(left, right, position, status, half, minimum, saturation):
+# The loops take the arrays of both channels. A loop over pairs takes one array twice.
+def _planar(left, right, position, status, half, minimum, saturation):
     for i in numba.prange(position.shape[0]):
         position[i], status[i] = _read_out(left[i], right[i], half, minimum, saturation)
 
 
-@numba.njit(parallel=True, error_model="numpy")
-def _numba_planar_codes(left, right, position, status, half, minimum, saturation):
+def _planar_codes(left, right, position, status, half, minimum, saturation):
     for i in numba.prange(position.shape[0]):
         a, b = np.float32(left[i]), np.float32(right[i])
         position[i], status[i] = _read_out_codes(a, b, half, minimum, saturation)
 
 
-@numba.njit(parallel=True, error_model="numpy")
-def _numba_pairs(currents, position, status, half, minimum, saturation):
+def _planar_codes_plain(left, right, position, status, half, minimum, saturation):
+    for i in numba.prange(position.shape[0]):
+        a, b = np.float32(left[i]), np.float32(right[i])
+        position[i], status[i] = _read_out_codes_plain(a, b, half, minimum, saturation)
+
+
+def _complex_pairs(pairs, _, position, status, half, minimum, saturation):
+    for i in numba.prange(position.shape[0]):
+        position[i], status[i] = _read_out(pairs[i].real, pairs[i].imag, half, minimum, saturation)
+
+
+def _word_pairs(pairs, _, position, status, half, minimum, saturation):
+    for i in numba.prange(position.shape[0]):
+        a, b = np.int32(pairs[i] & np.uint32(0xFFFF)), np.int32(pairs[i] >> np.uint32(16))
+        position[i], status[i] = _read_out_codes(np.float32(a), np.float32(b), half, minimum, saturation)
+
+
+def _pairs_plain(currents, _, position, status, half, minimum, saturation):
     for i in numba.prange(position.shape[0]):
         position[i], status[i] = _read_out(currents[2 * i], currents[2 * i + 1], half, minimum, saturation)
 
 
-@numba.njit(parallel=True, error_model="numpy")
-def _numba_pairs_codes(currents, position, status, half, minimum, saturation):
+def _code_pairs_plain(currents, _, position, status, half, minimum, saturation):
     for i in numba.prange(position.shape[0]):
         a, b = np.float32(currents[2 * i]), np.float32(currents[2 * i + 1])
-        position[i], status[i] = _read_out_codes(a, b, half, minimum, saturation)
+        position[i], status[i] = _read_out_codes_plain(a, b, half, minimum, saturation)
+
+
+# Loop of an expert, and of a user, by layout and dtype of the currents.
+_LOOPS: dict[tuple[str, str], tuple[Callable[..., None], Callable[..., None]]] = {
+    ("planar", "float32"): (_planar, _planar),
+    ("planar", "uint16"): (_planar_codes, _planar_codes_plain),
+    ("pairs", "float32"): (_complex_pairs, _pairs_plain),
+    ("pairs", "uint16"): (_word_pairs, _code_pairs_plain),
+}
+
+
+def _in_chunks(one_thread: Any) -> Any:
+    """Return a loop over chunks on all cores: LLVM vectorises more of `one_thread` than of a parallel loop."""
+
+    @numba.njit(parallel=True, error_model="numpy")
+    def chunks(left, right, position, status, half, minimum, saturation):
+        count = position.shape[0]
+        for chunk in numba.prange((count + _CHUNK - 1) // _CHUNK):
+            first, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, count)
+            currents = left[first:end], right[first:end]
+            one_thread(*currents, position[first:end], status[first:end], half, minimum, saturation)
+
+    return chunks
+
+
+@functools.cache
+def _compiled(layout: str, dtype: str) -> dict[str, Any]:
+    """Return the compiled loops by the name of the form; ``plain`` is the loop of a user."""
+    expert, plain = _LOOPS[layout, dtype]
+    one_thread = numba.njit(error_model="numpy")(expert)
+    parallel = numba.njit(parallel=True, error_model="numpy")(plain)
+    return {"one-thread": one_thread, "chunks": _in_chunks(one_thread), "plain": parallel}
+
+
+def _peers(
+    currents: NDArray[Any], layout: str, repeats: int, expected: tuple[NDArray[Any], NDArray[Any]]
+) -> dict[str, Peer]:
+    """Return the peers ``numba`` and ``numba-plain``, after a comparison of their results with the expected ones."""
+    dtype = currents.dtype.name
+    flat = currents.reshape(-1)
+    pairs = flat.view(np.complex64 if dtype == "float32" else np.uint32)
+    expert = tuple(currents) if layout == "planar" else (pairs, pairs)
+    plain = tuple(currents) if layout == "planar" else (flat, flat)
+    count = len(expected[0])
+    position, status = np.empty(count, np.float32), np.empty(count, np.uint8)
+
+    constants = np.float32(LENGTH / 2), np.float32(MINIMUM), np.float32(SATURATION)
+
+    def call(loop: Any, channels: tuple[NDArray[Any], ...]) -> Callable[[], None]:
+        def run() -> None:
+            for _ in range(repeats):
+                loop(*channels, position, status, *constants)
+
+        position[:], status[:] = 0.0, 255
+        run()
+        np.testing.assert_array_equal(status, expected[1])
+        np.testing.assert_allclose(position, expected[0], rtol=0.0, atol=_AGREEMENT)
+        return run
+
+    loops = dict(_compiled(layout, dtype))
+    by_user = call(loops.pop("plain"), plain)
+    return {"numba": {name: call(loop, expert) for name, loop in loops.items()}, "numba-plain": by_user}
 
 
 def _numpy(left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -126,24 +222,11 @@ def _case(device: Device, dtype: str, count: int, name: str, layout: Any = "plan
     currents = planar if layout == "planar" else np.ascontiguousarray(planar.T)
     bound.inputs[0].set(currents)
     left, right = (currents[0], currents[1]) if layout == "planar" else (currents[:, 0], currents[:, 1])
-    position, status = np.empty(count, np.float32), np.empty(count, np.uint8)
-    constants = (np.float32(LENGTH / 2), np.float32(MINIMUM), np.float32(SATURATION))
-    loop: Any = {
-        ("planar", False): _numba_planar,
-        ("planar", True): _numba_planar_codes,
-        ("pairs", False): _numba_pairs,
-        ("pairs", True): _numba_pairs_codes,
-    }[layout, dtype == "uint16"]
-    arrays = (left, right) if layout == "planar" else (currents.reshape(-1),)
 
     def ours() -> None:
         for _ in range(repeats - 1):
             bound()
         bound.run()
-
-    def with_numba() -> None:
-        for _ in range(repeats):
-            loop(*arrays, position, status, *constants)
 
     def with_numpy() -> None:
         for _ in range(repeats):
@@ -151,10 +234,10 @@ def _case(device: Device, dtype: str, count: int, name: str, layout: Any = "plan
 
     bound().wait()
     outputs: Any = bound.outputs
-    error = _error(outputs.position.get(), outputs.status.get(), left, right)
+    position, status = outputs.position.get(), outputs.status.get()
+    peers = _peers(currents, layout, repeats, (position, status)) | {"numpy": with_numpy}
     traffic = (currents.nbytes, 5 * count)
-    peers = {"numba": with_numba, "numpy": with_numpy}
-    flops = _FLOPS * count
+    error, flops = _error(position, status, left, right), _FLOPS * count
     return Case("psd", name, ours, peers, error, traffic, repeats, flops=flops, bound=bound)
 
 

@@ -350,12 +350,13 @@ class PsdReadout(VisionOperation[PsdReading]):
         chosen = self.outputs or ()
         sheet = self.triangulation
         table = None if self.linearity is None else np.array(self.linearity, build.real)
+        word_pairs = work.vectors and self.layout == "pairs" and dtype == np.uint16
         return build.launch(
             "psd/psd.cl",
             "psd_readout",
             work=work,
             outputs=build.outputs({name: batch if name in chosen else None for name in PsdReading._fields}),
-            defines=self._defines(dtype, build.real),
+            defines={**self._defines(dtype, build.real), **flags(WORD_PAIRS=word_pairs)},
             arguments=[
                 self._packed(build.real, dtype),
                 np.int32(samples),

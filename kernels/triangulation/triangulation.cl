@@ -15,43 +15,102 @@
 #include "common/load.h"
 #include "common/sheet.h"
 
-// Triangulate the LANES points from point i on, of these sensor coordinates.
-static inline void triangulate_at(ulong i, reals position, reals sample, global real *g, global real *h,
-                                  global uchar *status, global real *sigma_g, global real *sigma_h,
-                                  constant SheetTable *sheet, real sigma_u, real sigma_v) {
+typedef struct {
+    global const INPUT *u, *v;
+    global real *g, *h;
+    global uchar *status;
+    global real *sigma_g, *sigma_h;
+    ulong points;
+    constant SheetTable *sheet;
+    real sigma_u, sigma_v;
+} Points;
+
+// Triangulate the LANES points from point i on, of these sensor coordinates; return their status.
+static inline bytes triangulate_at(ulong i, reals position, reals sample, const Points *io) {
     reals at_g, at_h;
-    store_bytes(sheet_point(position, sample, sheet, &at_g, &at_h), status + i);
-    store_reals(at_g, g + i);
-    store_reals(at_h, h + i);
+    const bytes status = sheet_point(position, sample, io->sheet, &at_g, &at_h);
+    store_reals(at_g, io->g + i);
+    store_reals(at_h, io->h + i);
+    store_bytes(status, io->status + i);
 #ifdef SHEET_SIGMAS
     reals of_g, of_h;
-    sheet_sigma(position, sample, (reals)sigma_u, (reals)sigma_v, sheet, &of_g, &of_h);
+    sheet_sigma(position, sample, (reals)io->sigma_u, (reals)io->sigma_v, io->sheet, &of_g, &of_h);
     const masks missing = mask_of(LANED(not_finite)(at_g));
-    store_reals(nan_where(missing, of_g), sigma_g + i);
-    store_reals(nan_where(missing, of_h), sigma_h + i);
+    store_reals(nan_where(missing, of_g), io->sigma_g + i);
+    store_reals(nan_where(missing, of_h), io->sigma_h + i);
 #endif
+    return status;
 }
+
+#ifdef VECTOR_VARIANT
+#define BLOCK (16 * LANES)  // points that share a test
+
+#if defined(SHEET_SIGMAS) || defined(CAMERA)
+// The tests take a small part of the time.
+static inline int triangulate_block(ulong first, const Points *io) { return 0; }
+#else
+// Mask of the places that may have a flag: all places with a flag, and without a distortion also far places.
+static inline masks suspects(const SheetPlace *at, reals w, constant SheetTable *sheet) {
+#if defined(LENS) || defined(PLANE)
+    const masks near = mask_of(at->square < SHEET_REACH);
+#else
+    // Below the square root of SHEET_REACH, with a margin for the rounding of the sum. It takes fewer instructions than
+    // the square, which is not computed.
+    const masks near = mask_of(fabs(at->x) + fabs(at->y) < (real)5e5);
+#endif
+    return ~near | mask_of(w <= sheet->horizon) | at->folded;
+}
+
+// Triangulate the points of a block as if none had a flag; return whether this is so. Flags are rare, and one test of a
+// block takes less time than a test of each vector.
+static inline int triangulate_block(ulong first, const Points *io) {
+    masks suspected = 0;
+    for (int k = 0; k < BLOCK; k += LANES) {
+        const ulong i = first + k;
+        const SheetPlace at = sheet_place(load_inputs(io->u + i), load_inputs(io->v + i), io->sheet);
+        reals at_g, at_h;
+        suspected |= suspects(&at, sheet_project(&at, io->sheet, &at_g, &at_h), io->sheet);
+        store_reals(at_g, io->g + i);
+        store_reals(at_h, io->h + i);
+        store_bytes((bytes)STATUS_OK, io->status + i);
+    }
+    return !any_lane(suspected);
+}
+#endif
+
+// Triangulate the points begin <= i < end. Points with a flag often lie together: after a block with a flag, blocks are
+// computed point by point until one has none. The last vector is moved back to end with the last point, and some points
+// are computed twice with the same result: this costs less than a test for the end in every vector.
+static inline void triangulate_range(ulong begin, ulong end, const Points *io) {
+    int is_clean = 1;
+    for (ulong first = begin; first < end; first += BLOCK) {
+        const ulong stop = min(first + BLOCK, end);
+        if (is_clean && stop == first + BLOCK && triangulate_block(first, io)) continue;
+        bytes found = 0;
+        for (ulong next = first; next < stop; next += LANES) {
+            const ulong i = min(next, io->points - LANES);
+            found |= triangulate_at(i, load_inputs(io->u + i), load_inputs(io->v + i), io);
+        }
+        const ulong2 words = as_ulong2(found);
+        is_clean = (words.x | words.y) == 0;
+    }
+}
+#endif
 
 kernel void triangulate(global const INPUT *restrict u, global const INPUT *restrict v, global real *restrict g,
                         global real *restrict h, global uchar *restrict status, global real *restrict sigma_g,
                         global real *restrict sigma_h, const ulong points, const ulong each, constant SheetTable *sheet,
                         const real sigma_u, const real sigma_v) {
+    const Points io = {u, v, g, h, status, sigma_g, sigma_h, points, sheet, sigma_u, sigma_v};
 #ifdef VECTOR_VARIANT
-    // The last vector is moved back to end with the last point, and some points are computed twice with the same result.
-    // This costs less than a test for the end in every vector.
-    const ulong first = get_global_id(0) * each, end = min(first + each, points);
-    for (ulong next = first; next < end; next += LANES) {
-        const ulong i = min(next, points - LANES);
-        triangulate_at(i, load_inputs(u + i), load_inputs(v + i), g, h, status, sigma_g, sigma_h, sheet, sigma_u,
-                       sigma_v);
-    }
+    const ulong first = get_global_id(0) * each;
+    triangulate_range(first, min(first + each, points), &io);
 #else
     real4 position = load_item_samples(u, points), sample = load_item_samples(v, points);
     // Each step moves the next point to the first lane: an index that changes would put the lanes into memory.
     const ulong first = first_item_sample();
     for (int k = 0; k < ITEM_SAMPLES && first + k * item_step() < points; k++) {
-        triangulate_at(first + k * item_step(), position.x, sample.x, g, h, status, sigma_g, sigma_h, sheet, sigma_u,
-                       sigma_v);
+        triangulate_at(first + k * item_step(), position.x, sample.x, &io);
         position = position.yzww;
         sample = sample.yzww;
     }

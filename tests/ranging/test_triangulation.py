@@ -209,6 +209,28 @@ def test_huge_coordinates_are_flagged_not_invented(
         assert np.all(np.isnan(result.g))
 
 
+@pytest.mark.parametrize("lens", LENSES[:2], ids=["no lens", "k1"])
+def test_a_flag_among_good_points(device: Device, lens: Lens | None, rng: np.random.Generator) -> None:
+    """The vector variant tests blocks of 256 points for flags, and computes a block with a flag again."""
+    u, v = (rng.uniform(*bounds, 9 * 256 + 40).astype(np.float32) for bounds in REGION)
+    operation = scanner(lens=lens)
+    clean = operation(u, v, device=device)
+    assert not clean.status.any()
+    flagged = {0: np.nan, 511: np.inf, 512: -np.inf, 256 * 5 + 17: 1e30, 256 * 6 + 255: -1e30, len(u) - 1: np.nan}
+    # About 7e5 half extents: too far for the quick test, but not for the limit of NOT_FINITE.
+    for where, value in ((flagged, list(flagged.values())), ([256 * 3 + 100], [4e8])):
+        u_bad = u.copy()
+        u_bad[list(where)] = value
+        result = operation(u_bad, v, device=device)
+        alone = operation(u_bad[list(where)], v[list(where)], device=device)
+        np.testing.assert_array_equal(result.status[list(where)], alone.status)
+        good = np.delete(np.arange(len(u)), list(where))
+        for values, expected, of_one in zip(result[:3], clean[:3], alone[:3], strict=True):
+            np.testing.assert_array_equal(values[good], expected[good])
+            np.testing.assert_array_equal(values[list(where)], of_one)
+    np.testing.assert_array_equal(alone.status == 0, np.isfinite(alone.g))
+
+
 @pytest.mark.parametrize("lens", [*LENSES, Lens(k1=1e-7, k2=1e-13)], ids=["no lens", "k1", "k1 k2", "no fold"])
 def test_far_coordinates_are_finite_or_flagged(device: Device, lens: Lens | None) -> None:
     far = np.geomspace(1e3, 5e8, 500).astype(np.float32)

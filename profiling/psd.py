@@ -63,54 +63,68 @@ def _read_out_codes_plain(a, b, half, minimum, saturation):
 
 
 # The loops take the arrays of both channels. A loop over pairs takes one array twice.
+@numba.njit(error_model="numpy")
 def _planar(left, right, position, status, half, minimum, saturation):
-    for i in numba.prange(position.shape[0]):
+    for i in range(position.shape[0]):
         position[i], status[i] = _read_out(left[i], right[i], half, minimum, saturation)
 
 
+@numba.njit(error_model="numpy")
 def _planar_codes(left, right, position, status, half, minimum, saturation):
-    for i in numba.prange(position.shape[0]):
+    for i in range(position.shape[0]):
         a, b = np.float32(left[i]), np.float32(right[i])
         position[i], status[i] = _read_out_codes(a, b, half, minimum, saturation)
 
 
+@numba.njit(error_model="numpy")
+def _complex_pairs(pairs, _, position, status, half, minimum, saturation):
+    for i in range(position.shape[0]):
+        position[i], status[i] = _read_out(pairs[i].real, pairs[i].imag, half, minimum, saturation)
+
+
+@numba.njit(error_model="numpy")
+def _word_pairs(pairs, _, position, status, half, minimum, saturation):
+    for i in range(position.shape[0]):
+        a, b = np.int32(pairs[i] & np.uint32(0xFFFF)), np.int32(pairs[i] >> np.uint32(16))
+        position[i], status[i] = _read_out_codes(np.float32(a), np.float32(b), half, minimum, saturation)
+
+
+@numba.njit(parallel=True, error_model="numpy")
+def _planar_plain(left, right, position, status, half, minimum, saturation):
+    for i in numba.prange(position.shape[0]):
+        position[i], status[i] = _read_out(left[i], right[i], half, minimum, saturation)
+
+
+@numba.njit(parallel=True, error_model="numpy")
 def _planar_codes_plain(left, right, position, status, half, minimum, saturation):
     for i in numba.prange(position.shape[0]):
         a, b = np.float32(left[i]), np.float32(right[i])
         position[i], status[i] = _read_out_codes_plain(a, b, half, minimum, saturation)
 
 
-def _complex_pairs(pairs, _, position, status, half, minimum, saturation):
-    for i in numba.prange(position.shape[0]):
-        position[i], status[i] = _read_out(pairs[i].real, pairs[i].imag, half, minimum, saturation)
-
-
-def _word_pairs(pairs, _, position, status, half, minimum, saturation):
-    for i in numba.prange(position.shape[0]):
-        a, b = np.int32(pairs[i] & np.uint32(0xFFFF)), np.int32(pairs[i] >> np.uint32(16))
-        position[i], status[i] = _read_out_codes(np.float32(a), np.float32(b), half, minimum, saturation)
-
-
+@numba.njit(parallel=True, error_model="numpy")
 def _pairs_plain(currents, _, position, status, half, minimum, saturation):
     for i in numba.prange(position.shape[0]):
         position[i], status[i] = _read_out(currents[2 * i], currents[2 * i + 1], half, minimum, saturation)
 
 
+@numba.njit(parallel=True, error_model="numpy")
 def _code_pairs_plain(currents, _, position, status, half, minimum, saturation):
     for i in numba.prange(position.shape[0]):
         a, b = np.float32(currents[2 * i]), np.float32(currents[2 * i + 1])
         position[i], status[i] = _read_out_codes_plain(a, b, half, minimum, saturation)
 
 
-# Loop of an expert, and of a user, by layout and dtype of the currents.
-_LOOPS: dict[tuple[str, str], tuple[Callable[..., None], Callable[..., None]]] = {
-    ("planar", "float32"): (_planar, _planar),
+# Loop of an expert, on one core, and of a user, by layout and dtype of the currents.
+_LOOPS: dict[tuple[str, str], tuple[Any, Any]] = {
+    ("planar", "float32"): (_planar, _planar_plain),
     ("planar", "uint16"): (_planar_codes, _planar_codes_plain),
     ("pairs", "float32"): (_complex_pairs, _pairs_plain),
     ("pairs", "uint16"): (_word_pairs, _code_pairs_plain),
 }
 
 
+@functools.cache
 def _in_chunks(one_thread: Any) -> Any:
     """Return a loop over chunks on all cores: LLVM vectorises more of `one_thread` than of a parallel loop."""
 
@@ -123,15 +137,6 @@ def _in_chunks(one_thread: Any) -> Any:
             one_thread(*currents, position[first:end], status[first:end], half, minimum, saturation)
 
     return chunks
-
-
-@functools.cache
-def _compiled(layout: str, dtype: str) -> dict[str, Any]:
-    """Return the compiled loops by the name of the form; ``plain`` is the loop of a user."""
-    expert, plain = _LOOPS[layout, dtype]
-    one_thread = numba.njit(error_model="numpy")(expert)
-    parallel = numba.njit(parallel=True, error_model="numpy")(plain)
-    return {"one-thread": one_thread, "chunks": _in_chunks(one_thread), "plain": parallel}
 
 
 def _peers(
@@ -159,9 +164,9 @@ def _peers(
         np.testing.assert_allclose(position, expected[0], rtol=0.0, atol=_AGREEMENT)
         return run
 
-    loops = dict(_compiled(layout, dtype))
-    by_user = call(loops.pop("plain"), plain)
-    return {"numba": {name: call(loop, expert) for name, loop in loops.items()}, "numba-plain": by_user}
+    one_thread, by_user = _LOOPS[layout, dtype]
+    forms = {"one-thread": call(one_thread, expert), "chunks": call(_in_chunks(one_thread), expert)}
+    return {"numba": forms, "numba-plain": call(by_user, plain)}
 
 
 def _numpy(left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:

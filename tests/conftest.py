@@ -76,6 +76,7 @@ ALLOWED_SKIPS = (
     "`make docs` ran this example after the last change",
     "only PoCL 3 has such a device",
     "only Intel's runtime does so by the work's groups",
+    "no Chromium here (Debian package chromium)",
     "only root mounts a small file system",
     "only root gives files away",
     "rusticl does not share memory with the host",

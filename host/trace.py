@@ -35,6 +35,9 @@ _LANES = {
     "sink": _CONSUMER,
 }
 _COMPLETE = cl.command_execution_status.COMPLETE
+# Allowed contradiction between bounds of the offset of two clocks (chosen): [ns] for the resolution of the times, and
+# the drift of two oscillators, which are 1e-4 off at most. Mesa's rusticl 22.3 counts 0, 1, 2, 3 instead of nanoseconds.
+_OFFSET_ERROR, _CLOCK_DRIFT = 1_000_000, 1e-3
 _PENDING = 512  # events whose times are not read yet; more are read as they complete (bounds the memory)
 
 
@@ -96,7 +99,7 @@ class Trace:
         self._spans: list[_Span] = []
         self._pending: list[_Enqueued] = []
         self._executed: list[_Executed] = []
-        self._count = self._left_out = 0
+        self._count = self._left_out = self._without_times = 0
         self._lanes: dict[Hashable, str] = {}
         self._streams: set[int] = set()
         self._stream_queues: set[Any] = set()
@@ -241,6 +244,7 @@ class Trace:
                 profile = command.event.profile
                 times = _Executed(command, profile.queued, profile.start, profile.end)
             except cl.Error:  # the queue does not measure times, or the command failed
+                self._without_times += 1
                 continue
             self._executed.append(times)
             self._count += 1
@@ -251,7 +255,8 @@ class Trace:
 
         A command is queued during the call that enqueues it. Each command therefore bounds the offset between the
         clocks of a queue and of the host from both sides; the estimate is the middle of the tightest bounds. Spans of a
-        queue have one offset, so that they overlap no more than the device reports.
+        queue have one offset, so that they overlap no more than the device reports. Where bounds contradict each other,
+        the times of the queue are of no clock, and its commands are left out.
         """
         queues: dict[Any, list[_Executed]] = {}
         for each in self._executed:
@@ -260,6 +265,10 @@ class Trace:
         for number, (queue, executed) in enumerate(queues.items(), 1):
             low = max(each.command.before - each.queued for each in executed)
             high = min(each.command.after - each.queued for each in executed)
+            begun = [each.command.before for each in executed]
+            if low - high > _OFFSET_ERROR + _CLOCK_DRIFT * (max(begun) - min(begun)):
+                self._without_times += len(executed)
+                continue
             offset = (low + high) // 2
             self._lanes[queue] = f"{_DEVICE} {queue.device.name.strip()}, queue {number}"
             for each in executed:
@@ -288,7 +297,8 @@ class Trace:
             for span in inside:
                 event = {"ph": "X", "name": span.name, "pid": 1, "tid": tid, "args": span.arguments}
                 events.append(event | {"ts": (span.start - origin) / 1e3, "dur": (span.end - span.start) / 1e3})
-        tree = {"traceEvents": events, "displayTimeUnit": "ns", "otherData": {"spans beyond the limit": self._left_out}}
+        left_out = {"spans beyond the limit": self._left_out, "commands without device times": self._without_times}
+        tree = {"traceEvents": events, "displayTimeUnit": "ns", "otherData": left_out}
         Outputs("trace", overwrite=self.overwrite).write_text(self.path, json.dumps(tree))
 
 

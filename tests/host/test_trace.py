@@ -8,6 +8,7 @@ import sys
 import threading
 from collections import defaultdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -83,6 +84,8 @@ def test_device_times_lie_in_the_calls_of_the_host(tmp_path: Path, device: Devic
     waits = [each for each in lanes["host"] if each["name"] == "launch and wait"]
     assert len(waits) == 5
     computed = [each for name, spans in lanes.items() if name.startswith("device ") for each in spans]
+    if device.kind == "rusticl" and not computed:
+        return  # times that are no nanoseconds are left out: see the next test
     assert len(computed) >= 5
     for spans in lanes.values():
         check_nested(spans)
@@ -91,6 +94,43 @@ def test_device_times_lie_in_the_calls_of_the_host(tmp_path: Path, device: Devic
         begun, ended = wait["ts"] - slack, wait["ts"] + wait["dur"] + slack
         inside = [each for each in computed if begun <= each["ts"] and each["ts"] + each["dur"] <= ended]
         assert any(each["name"] == "compute" and each["args"] == {"of": "PsdReadout"} for each in inside)
+
+
+class FakeEvent:
+    """Completed event with given times of the device [ns]."""
+
+    def __init__(self, queued: int, start: int, end: int) -> None:
+        self.profile = SimpleNamespace(queued=queued, start=start, end=end)
+
+    def wait(self) -> None:
+        """Return at once."""
+
+
+def fake_trace(path: Path, times: list[tuple[int, int, int, int]]) -> None:
+    """Write a trace of commands: time before the enqueue, then the times of the device; a call lasts 1 us."""
+    trace = Trace(path)
+    queue = type("Queue", (), {"device": SimpleNamespace(name="fake")})()  # hashable, as a queue is
+    for before, queued, start, end in times:
+        trace.add_event(queue, "compute", "op", FakeEvent(queued, start, end), before, before + 1000)
+    trace.write()
+
+
+def test_the_offset_lies_between_the_bounds_of_all_commands(tmp_path: Path) -> None:
+    """The clock of the device is 5 s ahead; both commands are queued 100 and 900 ns after their calls have begun."""
+    ahead = 5_000_000_000
+    times = [(10_000, ahead + 10_100, ahead + 20_000, ahead + 30_000)]
+    times += [(50_000, ahead + 50_900, ahead + 60_000, ahead + 65_000)]
+    fake_trace(tmp_path / "t.json", times)
+    (spans,) = spans_by_lane(tmp_path / "t.json").values()
+    # Bounds of the host's time minus the device's: from -100 and -900 to 900 and 100 [ns], the middle is 0.
+    assert [each["dur"] for each in spans] == [10.0, 5.0]
+    assert spans[1]["ts"] - spans[0]["ts"] == pytest.approx(40.0)
+
+
+def test_times_that_are_of_no_clock_are_left_out(tmp_path: Path) -> None:
+    fake_trace(tmp_path / "t.json", [(10_000_000 * number, 0, 2, 3) for number in range(3)])
+    assert spans_by_lane(tmp_path / "t.json") == {}
+    assert json.loads((tmp_path / "t.json").read_text())["otherData"]["commands without device times"] == 3
 
 
 def test_copies_are_recorded_where_memory_is_not_shared(
@@ -106,7 +146,7 @@ def test_copies_are_recorded_where_memory_is_not_shared(
     order = [each["name"] for each in sorted(lanes["host"], key=lambda each: each["ts"])]
     assert order[order.index("run") :] == ["run", "upload", "launch", "download", "wait"]
     on_device = {each["name"] for name, spans in lanes.items() if name.startswith("device ") for each in spans}
-    assert {"upload", "compute", "download"} <= on_device
+    assert device.kind == "rusticl" or {"upload", "compute", "download"} <= on_device
 
 
 def test_each_thread_has_a_lane(tmp_path: Path) -> None:
@@ -226,4 +266,6 @@ with Trace({str(tmp_path / "t.json")!r}):
     subprocess.run([sys.executable, "-c", code], check=True)
     lanes = spans_by_lane(tmp_path / "t.json")
     computed = [each["name"] for name, spans in lanes.items() if name.startswith("device ") for each in spans]
-    assert computed.count("compute") >= 2  # of the bind and of the call
+    without_times = json.loads((tmp_path / "t.json").read_text())["otherData"]["commands without device times"]
+    assert computed.count("compute") + without_times >= 2  # of the bind and of the call
+    assert without_times == 0 or device.kind == "rusticl"

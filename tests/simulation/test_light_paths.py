@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from gpuvision.simulation.errors.range_error import StripErrorModel
-from gpuvision.simulation.light_paths import LightPaths, distance_from_path
+from gpuvision.simulation.light_paths import LightPaths, _widened, distance_from_path
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
@@ -211,3 +211,14 @@ def test_distance_of_the_scene_from_the_path_of_the_lens(rng):
         nearest = np.linalg.norm(across, axis=1).min()
         found = distance_from_path(corners, start, way)
         assert nearest - 0.05 < found <= nearest + 1e-12
+
+
+@pytest.mark.parametrize("bins", [0, 1, 3])
+def test_bins_beyond_the_ends_have_the_width_of_the_last_ones(bins: int) -> None:
+    """The first bin is narrower than the last one."""
+    edges = np.array([-3e-3, -2.5e-3, -1e-3, 1e-3, 2.8e-3])
+    view = sensor_view(u_edges=edges)
+    wide = _widened(view, bins).u_edges
+    np.testing.assert_array_equal(wide[bins : bins + len(edges)], edges)
+    steps = np.diff(wide)
+    np.testing.assert_allclose(steps, [*[0.5e-3] * bins, *np.diff(edges), *[1.8e-3] * bins], rtol=1e-9)

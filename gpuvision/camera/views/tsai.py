@@ -116,7 +116,8 @@ def radial_alignment(target: npt.ArrayLike, image: npt.ArrayLike, centre: tuple[
     column, row = (offset / math.sqrt(float(np.mean(offset**2)))).T
     # row * (r1 X + r2 Y + t_x) = column * (r4 X + r5 Y + t_y), solved as a homogeneous system since t_y may be 0.
     equations = np.stack([row * x, row * y, row, -column * x, -column * y, -column], axis=1)
-    _, sizes, axes = np.linalg.svd(equations, full_matrices=False)
+    # Five points have five equations: a row of zeros keeps the sixth axis, which is then the solution.
+    _, sizes, axes = np.linalg.svd(np.vstack([equations, np.zeros((1, 6))]), full_matrices=False)
     if sizes[-2] <= _SINGULAR * sizes[0]:
         raise ValueError("radial alignment leaves the pose open: its points lie on one line, or few through the centre")
     r1, r2, tx, r4, r5, ty = axes[-1]

@@ -63,6 +63,17 @@ def test_alignment_needs_neither_focal_length_nor_distortion():
             assert np.linalg.det(each) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("count", [5, 6])
+def test_five_points_determine_the_alignment(count):
+    """Five equations of six unknowns: the solution is the vector that no equation sees."""
+    rotation, translation = POSES["oblique"]
+    target, image = _view(rotation, np.array(translation))
+    few = np.array([0, 11, 50, 96, 107, 31])[:count]
+    alignment = radial_alignment(target[few], image[few], CENTRE)
+    np.testing.assert_allclose(alignment.shift, translation[:2], atol=1e-9)
+    assert min(np.abs(each - rotation).max() for each in alignment.rotations) < 1e-8
+
+
 def test_noise_moves_the_focal_length_by_its_deviation():
     rotation, translation = POSES["oblique"]
     errors, deviations = [], []

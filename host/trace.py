@@ -36,7 +36,7 @@ _LANES = {
 }
 _COMPLETE = cl.command_execution_status.COMPLETE
 # Allowed contradiction between bounds of the offset of two clocks (chosen): [ns] for the resolution of the times, and
-# the drift of two oscillators, which are 1e-4 off at most. Mesa's rusticl 22.3 counts 0, 1, 2, 3 instead of nanoseconds.
+# the drift of two oscillators, 1e-4 off at most. Mesa's rusticl 22.3 counts 0, 1, 2, 3 instead of nanoseconds.
 _OFFSET_ERROR, _CLOCK_DRIFT = 1_000_000, 1e-3
 _PENDING = 512  # events whose times are not read yet; more are read as they complete (bounds the memory)
 

@@ -9,7 +9,7 @@
 // Watertight intersection (Woop, Benthin, Wald: Watertight Ray/Triangle Intersection, JCGT 2013): the corners are
 // transformed into the ray's frame, and the sign of each edge function is the sign of the exact difference of products. No
 // ray passes between two triangles at their common edge. The host widens the boxes; BOX_SLACK covers the rounding of the
-// three operations of the slab test.
+// reciprocal and of the slab test.
 #ifndef BVH_H
 #define BVH_H
 
@@ -20,7 +20,9 @@
 #define NO_HIT (-1)
 
 typedef struct {
-    real x, y, z, per_x, per_y, per_z; // origin, reciprocal of the direction
+    real per_x, per_y, per_z;          // reciprocal of the direction
+    real enter_x, enter_y, enter_z;    // minus the origin times the reciprocal, rounded down
+    real leave_x, leave_y, leave_z;    // the same, rounded up
     int near_x, near_y, near_z;        // offsets in a node of the planes at which the ray enters a box
     int i, j, k;                       // offsets in a leaf: coordinates across (i, j) and along (k) the ray
     real at_i, at_j, at_k;             // origin in the order i, j, k
@@ -48,12 +50,20 @@ static inline real bvh_reciprocal(real d) {
     return (real)1 / (fabs(d) < least ? copysign(least, d) : d);
 }
 
+// Bounds of -origin * per: two roundings of the product and of the sum are 2^-23 of it in single precision; twice that.
+static inline void bvh_bounds(real origin, real per, real *below, real *above) {
+    const real product = -origin * per, margin = (real)2 * (real)REAL_EPSILON * fabs(product);
+    *below = product - margin, *above = product + margin;
+}
+
 static inline bvh_ray bvh_ray_of(real x, real y, real z, real dx, real dy, real dz, real start, real end) {
     const real ax = fabs(dx), ay = fabs(dy), az = fabs(dz);
     const int along_z = az >= ax && az >= ay, along_y = !along_z && ay >= ax;
     bvh_ray ray;
-    ray.x = x, ray.y = y, ray.z = z;
     ray.per_x = bvh_reciprocal(dx), ray.per_y = bvh_reciprocal(dy), ray.per_z = bvh_reciprocal(dz);
+    bvh_bounds(x, ray.per_x, &ray.enter_x, &ray.leave_x);
+    bvh_bounds(y, ray.per_y, &ray.enter_y, &ray.leave_y);
+    bvh_bounds(z, ray.per_z, &ray.enter_z, &ray.leave_z);
     ray.near_x = ray.per_x < 0 ? 3 * WIDTH : 0;
     ray.near_y = (ray.per_y < 0 ? 3 * WIDTH : 0) + WIDTH;
     ray.near_z = (ray.per_z < 0 ? 3 * WIDTH : 0) + 2 * WIDTH;
@@ -70,16 +80,17 @@ static inline bvh_ray bvh_ray_of(real x, real y, real z, real dx, real dy, real 
     return ray;
 }
 
-// Slab test: boxes that the ray meets before `end`.
+// Slab test: boxes that the ray meets before `end`. A plane at p is met at (p - origin) per = p per - origin per, one fused
+// multiply-add. The product is bounded outward on either side, so no box is missed for any origin.
 INLINE masks bvh_boxes(const bvh_ray *ray, real end, global const real *node) {
     global const real *far = node + 3 * WIDTH;
-    const reals x = ray->x, y = ray->y, z = ray->z;
-    const reals in_x = (load_reals(node + ray->near_x) - x) * ray->per_x;
-    const reals in_y = (load_reals(node + ray->near_y) - y) * ray->per_y;
-    const reals in_z = (load_reals(node + ray->near_z) - z) * ray->per_z;
-    const reals out_x = (load_reals(far - ray->near_x) - x) * ray->per_x;
-    const reals out_y = (load_reals(far + 2 * WIDTH - ray->near_y) - y) * ray->per_y;
-    const reals out_z = (load_reals(far + 4 * WIDTH - ray->near_z) - z) * ray->per_z;
+    const reals per_x = (reals)ray->per_x, per_y = (reals)ray->per_y, per_z = (reals)ray->per_z;
+    const reals in_x = lane_fma(load_reals(node + ray->near_x), per_x, (reals)ray->enter_x);
+    const reals in_y = lane_fma(load_reals(node + ray->near_y), per_y, (reals)ray->enter_y);
+    const reals in_z = lane_fma(load_reals(node + ray->near_z), per_z, (reals)ray->enter_z);
+    const reals out_x = lane_fma(load_reals(far - ray->near_x), per_x, (reals)ray->leave_x);
+    const reals out_y = lane_fma(load_reals(far + 2 * WIDTH - ray->near_y), per_y, (reals)ray->leave_y);
+    const reals out_z = lane_fma(load_reals(far + 4 * WIDTH - ray->near_z), per_z, (reals)ray->leave_z);
     const reals enter = lane_max(lane_max(in_x, in_y), lane_max(in_z, (reals)ray->start));
     const reals leave = lane_min(lane_min(out_x, out_y), lane_min(out_z, (reals)end));
     return mask_of(enter <= leave * BOX_SLACK);
@@ -171,11 +182,33 @@ INLINE int bvh_next(const bvh_ray *ray, int axis, uint met) {
     return per < 0 ? 31 - (int)clz(met) : lowest_bit(met);
 }
 
-// Whether the ray meets any triangle.
-INLINE int bvh_any(const bvh_tree *tree, const bvh_ray *ray) {
+// Leaf that occluded the previous ray of a sequence, and how far the sequence can be trusted to meet it again.
+//
+// Neighbouring shadow rays are often occluded by the same leaf. A ray tests this leaf before it traverses the tree if
+// `trust` is positive. Each occluded ray adds 1 to `trust` if the same leaf occludes it again, else subtracts 1, whether
+// the leaf was tested first or not: in a sequence of unrelated rays `trust` falls, and the leaf is not tested.
+typedef struct {
+    int leaf, trust; // ~index of the leaf (0: none); between -MOST_TRUST and MOST_TRUST
+} bvh_occluder;
+
+#define NO_OCCLUDER ((bvh_occluder){0, 0})
+#define MOST_TRUST 4
+
+INLINE void bvh_remember(bvh_occluder *last, int leaf) {
+    last->trust = leaf == last->leaf ? min(last->trust + 1, MOST_TRUST) : max(last->trust - 1, -MOST_TRUST);
+    last->leaf = leaf;
+}
+
+// Whether the ray meets any triangle. The result does not depend on `last`.
+INLINE int bvh_any(const bvh_tree *tree, const bvh_ray *ray, bvh_occluder *last) {
     int nodes[BVH_DEPTH];
     uint left[BVH_DEPTH];
     int node = 0, depth = 0;
+    const int tested = last->trust > 0 ? last->leaf : 0;
+    if (tested && bvh_leaf_any(ray, tree->leaves + (size_t)~tested * (9 * WIDTH))) {
+        bvh_remember(last, tested);
+        return 1;
+    }
     uint met = bvh_met(ray, ray->end, tree->nodes);
     while (true) {
         if (!met) {
@@ -187,7 +220,10 @@ INLINE int bvh_any(const bvh_tree *tree, const bvh_ray *ray) {
         met ^= 1u << lane;
         const int child = tree->children[node * WIDTH + lane];
         if (child < 0) {
-            if (bvh_leaf_any(ray, tree->leaves + (size_t)~child * (9 * WIDTH))) return 1;
+            if (child != tested && bvh_leaf_any(ray, tree->leaves + (size_t)~child * (9 * WIDTH))) {
+                bvh_remember(last, child);
+                return 1;
+            }
             continue;
         }
         if (met) {

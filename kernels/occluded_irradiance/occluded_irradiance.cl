@@ -237,6 +237,7 @@ static void add_sampled(const bvh_tree *tree, const chunk *lit, int k, const fac
     const real ux = (real)of->along_x[k] * length, uy = (real)of->along_y[k] * length;
     const real uz = (real)of->along_z[k] * length;
     uint begun = 0, seen = 0;
+    bvh_occluder last = NO_OCCLUDER;
     for (uint n = 0; n <= samples; n++) {
         int hit = 1;
         if (n < samples) {
@@ -244,7 +245,7 @@ static void add_sampled(const bvh_tree *tree, const chunk *lit, int k, const fac
             const real dx = start[0] + t * ux - origin[0], dy = start[1] + t * uy - origin[1];
             const real dz = start[2] + t * uz - origin[2];
             const bvh_ray ray = bvh_ray_of(origin[0], origin[1], origin[2], dx, dy, dz, 0, 1);
-            hit = bvh_any(tree, &ray);
+            hit = bvh_any(tree, &ray, &last);
         }
         if (!hit) {
             begun = seen ? begun : n;

@@ -38,18 +38,20 @@ typedef struct {
 INLINE real dot_of(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 // Whether the ray is free; the first `after` and the last `before` metres are skipped (surfaces at the ends).
-static inline int is_free(const bvh_tree *tree, const real *place, const real *way, real after, real before) {
+static inline int is_free(const bvh_tree *tree, const real *place, const real *way, real after, real before,
+                          bvh_occluder *last) {
     const real per = after + before > 0 ? (real)1 / sqrt(dot_of(way, way)) : 0;
     const real start = after * per, end = 1 - before * per;
     if (!(start < end)) return 1;
     const bvh_ray ray = bvh_ray_of(place[0], place[1], place[2], way[0], way[1], way[2], start, end);
-    return !bvh_any(tree, &ray);
+    return !bvh_any(tree, &ray, last);
 }
 
 // Visible fraction of a polygon's light: rays to the middles of side x side fields, each weighted by the light that a small
 // patch there would send.
 __attribute__((noinline)) real free_part(const bvh_tree *tree, const view *own, int side, real after, real before) {
     real through = 0, whole = 0;
+    bvh_occluder last = NO_OCCLUDER;
     for (int field = 0; field < side * side; field++) {
         const real s = (field % side + (real)0.5) / side, t = (field / side + (real)0.5) / side;
         real way[3], along[3], across[3];
@@ -64,7 +66,7 @@ __attribute__((noinline)) real free_part(const bvh_tree *tree, const view *own, 
         const real square = dot_of(way, way);
         const real sent = fabs(dot_of(way, front) * dot_of(way, own->normal)) / (square * square);
         whole += sent;
-        if (is_free(tree, own->place, way, after, before)) through += sent;
+        if (is_free(tree, own->place, way, after, before, &last)) through += sent;
     }
     return whole > 0 ? through / whole : 0;
 }

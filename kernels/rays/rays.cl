@@ -20,6 +20,7 @@ AS_IT_IS kernel void any_hit(global const INPUT *restrict rays, global uchar *re
                              const ulong each) {
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
     const ulong first = get_global_id(0) * each, end = min(first + each, count);
+    bvh_occluder last = NO_OCCLUDER;
     for (ulong i = first; i < end; i++) {
         spot origin = from_middle(rays + 6 * i, middle);
         const spot to = from_middle(rays + 6 * i + 3, middle);
@@ -41,7 +42,7 @@ AS_IT_IS kernel void any_hit(global const INPUT *restrict rays, global uchar *re
             }
             if (!misses) {
                 const bvh_ray ray = ray_from(origin, direction, start, end);
-                hit = bvh_any(&tree, &ray);
+                hit = bvh_any(&tree, &ray, &last);
             }
         }
         occluded[i] = (uchar)hit;

@@ -115,6 +115,27 @@ def test_any_soup(device: Device, seed: int, count: int, size: float) -> None:
     np.testing.assert_array_equal(hits.triangle[sure], triangle[sure])
 
 
+@WAYS
+def test_occlusion_does_not_depend_on_the_order(
+    device: Device, variant: Any, dtype: Any, rng: np.random.Generator
+) -> None:
+    """Rays to neighbouring targets test the leaf that occluded the previous ray first; unrelated rays do not."""
+    corners = soup(rng, 300)
+    origins, ends = rng.uniform(-1.0, 1.0, (2, 40, 1, 3))
+    targets = ends + np.linspace(0.0, 1.0, 50)[:, None] * rng.uniform(-1.0, 1.0, (40, 1, 3))
+    fans = np.concatenate([np.broadcast_to(origins, targets.shape), targets], axis=2).reshape(-1, 6).astype(dtype)
+    any_hit = AnyHit(scene=Scene(corners), variant=variant)
+    occluded = any_hit(fans, device=device).occluded
+    order = rng.permutation(len(fans))
+    np.testing.assert_array_equal(any_hit(fans[order], device=device).occluded, occluded[order])
+    off_edges = far_from_edges(corners, np.hstack([fans[:, :3], fans[:, 3:] - fans[:, :3]]).astype(float), 3e-5)
+    near, far = (reference.occluded(corners, fans.astype(float), by) for by in (-1e-4, 1e-4))
+    sure = off_edges & (near == far)
+    np.testing.assert_array_equal(occluded[sure], near[sure])
+    assert 0.2 < occluded.mean() < 0.9
+    assert sure.mean() > 0.5
+
+
 def test_as_embree_says(device: Device, rng: np.random.Generator) -> None:
     rtcore_scene = pytest.importorskip("embreex.rtcore_scene", reason="the extra 'test' is not installed")
     construction = pytest.importorskip("embreex.mesh_construction", reason="the extra 'test' is not installed")

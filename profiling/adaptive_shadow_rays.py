@@ -194,7 +194,7 @@ def _numpy_light(
 
 
 @numba.njit(inline="always", error_model="numpy")
-def _facing(receiver, segment):
+def facing_part(receiver, segment):
     """Return the interval of a segment in front of a receiver; empty where the segment shines away from it."""
     dx, dy, dz = receiver[0] - segment[0], receiver[1] - segment[1], receiver[2] - segment[2]
     height = dx * segment[6] + dy * segment[7] + dz * segment[8]
@@ -216,7 +216,7 @@ def _numba_pairs(receivers, table):
     for i in numba.prange(receivers.shape[0]):
         n = 0
         for m in range(table.shape[0]):
-            low, high = _facing(receivers[i], table[m])
+            low, high = facing_part(receivers[i], table[m])
             n += high > low
         counts[i] = n
     ends = np.cumsum(counts)
@@ -226,7 +226,7 @@ def _numba_pairs(receivers, table):
     for i in numba.prange(receivers.shape[0]):
         at = ends[i] - counts[i]
         for m in range(table.shape[0]):
-            low, high = _facing(receivers[i], table[m])
+            low, high = facing_part(receivers[i], table[m])
             if high > low:
                 of_receiver[at], of_segment[at], lows[at], highs[at] = i, m, low, high
                 at += 1
@@ -245,23 +245,28 @@ def _numba_rays(receivers, table, receiver, segment, places, clearance):
     return start, step
 
 
+@numba.njit(inline="always", error_model="numpy")
+def part_irradiance(at, line, low, high):
+    """Return the irradiance of a receiver by the part of a segment from low to high [m], in closed form."""
+    dx, dy, dz = at[0] - line[0], at[1] - line[1], at[2] - line[2]
+    along = dx * line[3] + dy * line[4] + dz * line[5]
+    height = dx * line[6] + dy * line[7] + dz * line[8]
+    rx, ry, rz = along * line[3] - dx, along * line[4] - dy, along * line[5] - dz
+    square = rx * rx + ry * ry + rz * rz + TINY
+    a = at[3] * rx + at[4] * ry + at[5] * rz
+    b = at[3] * line[3] + at[4] * line[4] + at[5] * line[5]
+    first, last = low - along, high - along
+    step, per, rho = last - first, ONE / ((first * first + square) * (last * last + square)), np.sqrt(square)
+    arc = np.arctan2(step * rho, square + first * last)
+    value = a * (step * (square - first * last) * per + arc / rho) / square + b * step * (first + last) * per
+    return HALF * height * line[10] * value
+
+
 @numba.njit(parallel=True, error_model="numpy")
 def _numba_light(receivers, table, receiver, segment, lows, highs):
     light = np.empty(len(lows), np.float32)
     for k in numba.prange(len(lows)):
-        at, line = receivers[receiver[k]], table[segment[k]]
-        dx, dy, dz = at[0] - line[0], at[1] - line[1], at[2] - line[2]
-        along = dx * line[3] + dy * line[4] + dz * line[5]
-        height = dx * line[6] + dy * line[7] + dz * line[8]
-        rx, ry, rz = along * line[3] - dx, along * line[4] - dy, along * line[5] - dz
-        square = rx * rx + ry * ry + rz * rz + TINY
-        a = at[3] * rx + at[4] * ry + at[5] * rz
-        b = at[3] * line[3] + at[4] * line[4] + at[5] * line[5]
-        low, high = lows[k] - along, highs[k] - along
-        step, per, rho = high - low, ONE / ((low * low + square) * (high * high + square)), np.sqrt(square)
-        arc = np.arctan2(step * rho, square + low * high)
-        value = a * (step * (square - low * high) * per + arc / rho) / square + b * step * (low + high) * per
-        light[k] = HALF * height * line[10] * value
+        light[k] = part_irradiance(receivers[receiver[k]], table[segment[k]], lows[k], highs[k])
     return light
 
 

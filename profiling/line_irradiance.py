@@ -1,7 +1,8 @@
 """Light of lit lines on surfaces, all pairs without occlusion, compared with the same closed form in Numba.
 
-The peer is branch-free and vectorised by LLVM over receivers, with a polynomial arc tangent, in single precision.
-`error` and `peer_error` are relative to the largest irradiance of the case (NaN on a device without double).
+The peer `numba` is branch-free and vectorised by LLVM over receivers, with a polynomial arc tangent, in single
+precision. `numba-plain` is a loop over receivers and segments with the arc tangent of the library. `error` and
+`peer_error` are relative to the largest irradiance of the case (NaN on a device without double).
 
 ``wall``: lines that run into a wall; all pairs face each other. ``board``: patches of boxes on a board. In both cases
 the segments have few directions and surfaces, as on flat faces; our kernel exploits this. In ``closed-form-slopes``
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device, to_numpy
+from gpuvision.profiling import adaptive_shadow_rays as adaptive
 from gpuvision.profiling import occluded_irradiance, patches
 from gpuvision.profiling.harness import Case
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
@@ -82,6 +84,17 @@ def _numba(receivers, table, out):
 _PAIR_FLOPS = 45
 
 
+@numba.njit(parallel=True, error_model="numpy")
+def _numba_plain(receivers, table, out):
+    for i in numba.prange(receivers.shape[0]):
+        total = ZERO
+        for m in range(table.shape[0]):
+            low, high = adaptive.facing_part(receivers[i], table[m])
+            if high > low:
+                total += adaptive.part_irradiance(receivers[i], table[m], low, high)
+        out[i] = total
+
+
 def cases(device: Device) -> Iterator[Case]:
     """Yield a wall with many and with few lines, a board with boxes, light of patches, and light with occlusion."""
     yield _case(device, *wall(64, 20_000), "closed-form/wall/64x20000")
@@ -96,13 +109,16 @@ def _case(device: Device, segments: LitSegments, receivers: NDArray[np.float32],
     bound = LineIrradiance(segments=segments).bind(device, receivers.shape, receivers.dtype)
     bound.inputs[0].set(receivers)
     ours = to_numpy(bound.run().irradiance)
-    table, out = _peer_table(segments), np.empty(len(receivers), np.float32)
+    table, out = adaptive.segment_table(segments), np.empty(len(receivers), np.float32)
     _numba(receivers, table, out)
     exact = LineIrradiance(segments=segments, precision="double")
     truth = to_numpy(exact(receivers, device=device).irradiance) if device.has_double else np.full(len(out), np.nan)
     pairs = len(segments.exitance) * len(receivers)
     metadata = {"pairs": pairs, "peer_error": _error(out, truth)}
-    peers = {"numba": lambda: _numba(receivers, table, out)}
+    peers = {
+        "numba": lambda: _numba(receivers, table, out),
+        "numba-plain": lambda: _numba_plain(receivers, table, out),
+    }
     # On a wall all segments face all receivers; on a board pairs behind a surface are left out early.
     whole = name.startswith("closed-form/wall") and bool(np.all(ours > 0.0))
     return Case(
@@ -119,14 +135,6 @@ def _case(device: Device, segments: LitSegments, receivers: NDArray[np.float32],
 
 def _error(values: NDArray[Any], truth: NDArray[Any]) -> float:
     return float(np.max(np.abs(values - truth)) / np.max(truth))
-
-
-def _peer_table(segments: LitSegments) -> NDArray[np.float32]:
-    start = segments.ends[:, 0]
-    along = segments.ends[:, 1] - start
-    length = np.linalg.norm(along, axis=1, keepdims=True)
-    columns = [start, along / length, segments.normals, length, segments.exitance / np.pi]
-    return np.column_stack(columns).astype(np.float32)
 
 
 def wall(segments: int, receivers: int) -> tuple[LitSegments, NDArray[np.float32]]:

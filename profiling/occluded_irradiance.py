@@ -6,7 +6,8 @@ in sequence. Both errors are medians over the receivers that get light, relative
 the tests compare with rays in float64; they are NaN on a device without double. Cases ``growth/...`` have four times
 the segments or receivers of the board, or four and sixteen times its triangles. In the cases ``board/p95-...`` the peer
 computes the closed form on the visible parts of the segments, found with adaptive shadow rays, with the fewest rays for
-which the 95th percentile of its relative error is below the number in the name (devices with double only).
+which the 95th percentile of its relative error is below the number in the name (devices with double only). The Numba
+form of this peer has two forms of Embree, with and without its robust mode.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 import functools
 import itertools
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 
 from gpuvision.host import Bound, Device, to_numpy
 from gpuvision.profiling import adaptive_shadow_rays as adaptive
-from gpuvision.profiling.harness import Case
+from gpuvision.profiling.harness import Case, Peer
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LitSegments
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
@@ -121,9 +122,11 @@ def _adaptive_case(device: Device, board: Board, limit: float, name: str) -> Cas
     ours = to_numpy(bound.run().irradiance).ravel()
     truth = _truth(device, board, operation)
     receivers, table = board.receivers.reshape(-1, 6), adaptive.segment_table(board.segments)
-    free = functools.partial(trace_free, embree_of(board.scene))
+    robust, fast = (
+        functools.partial(trace_free, embree_of(board.scene, robust=is_robust)) for is_robust in (True, False)
+    )
 
-    def peer(form: adaptive.Form, setting: adaptive.Setting) -> NDArray[np.float32]:
+    def peer(form: adaptive.Form, setting: adaptive.Setting, free: adaptive.Free = robust) -> NDArray[np.float32]:
         return adaptive.irradiance_by_adaptive_rays(form, receivers, table, free, setting, CLEARANCE)
 
     of_setting = {each: error_of(peer(adaptive.NUMBA, each), truth, 0.95) for each in adaptive.SETTINGS}
@@ -138,9 +141,12 @@ def _adaptive_case(device: Device, board: Board, limit: float, name: str) -> Cas
         "peer_p95": of_setting[setting],
         "p95": error_of(ours, truth, 0.95),
     }
-    peers = {
+    peers: dict[str, Peer] = {
         "numpy+embreex": functools.partial(peer, adaptive.NUMPY, setting),
-        "numba+embreex": functools.partial(peer, adaptive.NUMBA, setting),
+        "numba+embreex": {
+            "robust": functools.partial(peer, adaptive.NUMBA, setting),
+            "fast": functools.partial(peer, adaptive.NUMBA, setting, fast),
+        },
     }
     return _finished_case(name, bound, peers, error_of(ours, truth), metadata)
 
@@ -171,7 +177,7 @@ def _sizes(board: Board) -> dict[str, Any]:
 def _finished_case(
     name: str,
     bound: Bound[Any],
-    peers: Mapping[str, Callable[[], object]],
+    peers: Mapping[str, Peer],
     error: float,
     metadata: Mapping[str, Any],
 ) -> Case:
@@ -200,9 +206,9 @@ def error_of(values: NDArray[Any], truth: NDArray[np.float64], quantile: float =
     return float(np.quantile(np.abs(values[lit] / truth[lit] - 1.0), quantile)) if lit.any() else float("nan")
 
 
-def embree_of(scene: Scene) -> Any:
-    """Return an Embree scene of the triangles."""
-    embree = EmbreeScene()
+def embree_of(scene: Scene, *, robust: bool = True) -> Any:
+    """Return an Embree scene of the triangles; `robust`: no ray passes between two triangles at their common edge."""
+    embree = EmbreeScene(robust=robust)
     TriangleMesh(embree, scene.corners.astype(np.float32))
     return embree
 

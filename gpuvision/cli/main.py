@@ -33,6 +33,7 @@ def application() -> typer.Typer:
     import typer
 
     from gpuvision.cli.calibrate import calibrate
+    from gpuvision.cli.curves import curves
     from gpuvision.cli.delay import delay
     from gpuvision.cli.demo import demo
     from gpuvision.cli.devices import devices
@@ -74,6 +75,7 @@ def application() -> typer.Typer:
         devices,
         profile,
         tune,
+        curves,
     ):
         app.command()(with_trace(command))
     return app

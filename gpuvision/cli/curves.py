@@ -1,0 +1,84 @@
+"""``gpuvision curves``: measure speed against accuracy of the settings of operations."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gpuvision.cli.arguments import Overwrite, ReportFile, echo, named_path, prints_report, write_report
+from gpuvision.host.errors import GpuVisionError
+
+if TYPE_CHECKING:
+    from gpuvision.profiling.curves.curve import Point
+
+
+def curves(
+    operations: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="OPERATION", help="Operations to measure, such as line or ruler. Default: all."),
+    ] = None,
+    device: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LABEL",
+            help="Label of an OpenCL device, see `gpuvision devices`; repeat the option for several. Default: all.",
+        ),
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="Approximate time to measure each setting [s].", min=0.01)] = 0.3,
+    as_json: ReportFile = None,
+    plots: Annotated[
+        Path | None, typer.Option(metavar="DIR", parser=named_path, help="Folder for a picture of each operation.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure speed against accuracy: time and error of the settings that a user chooses.
+
+    The data have noise and known truth. The table shows for each setting the median time, the root mean square error,
+    the 95th percentile, and the fraction of samples without a value. A star marks the best settings: no other one on
+    the same data is better in time, error or lost samples and as good in the others.
+    """
+    if importlib.util.find_spec("numba") is None:
+        raise GpuVisionError("the package numba is missing; install it: pip install 'gpuvision[profile]'")
+    from gpuvision.host import Device
+    from gpuvision.host.outputs import Outputs
+    from gpuvision.profiling.curves import curve, plot
+    from gpuvision.profiling.harness import describe_machine
+
+    outputs = Outputs("curves", overwrite=overwrite)
+    outputs.claim(as_json)
+    if plots is not None:
+        outputs.claim_folder(plots, plot.FILES)
+    devices = [Device.named(each) for each in device] if device else list(Device.all() or [Device.best()])
+    points = curve.measure_curves(
+        operations or curve.OPERATIONS, devices, seconds=seconds, progress=lambda line: echo(line, err=True)
+    )
+    report = {"machine": describe_machine(devices), "points": [point.to_dict() for point in points]}
+    write_report(as_json, report, outputs)
+    if not prints_report(as_json):
+        _show(points)
+    if plots is not None:
+        drawn = plot.draw_curves(plots, points, overwrite=overwrite)
+        echo(f"look at {', '.join(str(plots / name) for name in drawn)}", err=True)
+
+
+def _show(points: list[Point]) -> None:
+    """Print a table for each operation, data and device."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    from gpuvision.profiling.curves.plot import describe
+
+    console = Console()
+    for key in dict.fromkeys((each.operation, each.data, each.device) for each in points):
+        chosen = [each for each in points if (each.operation, each.data, each.device) == key]
+        table = Table(title=", ".join(key), title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for heading in ("setting", "time [µs]", "rms", "p95", "lost", "best"):
+            table.add_column(heading, justify="left" if heading == "setting" else "right", overflow="fold")
+        for each in chosen:
+            numbers = (f"{1e6 * each.seconds:.3g}", f"{each.rms:.2e} {each.unit}", f"{each.p95:.1e}")
+            table.add_row(describe(each, chosen), *numbers, f"{each.lost:.1%}", "*" if each.best else "")
+        console.print(table)

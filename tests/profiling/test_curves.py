@@ -1,0 +1,134 @@
+"""Speed-accuracy curves: summary of errors, Pareto front, order of measured errors, pictures and command."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip("numba", reason="the extra 'profile' is not installed")
+
+from typer.testing import CliRunner
+
+from gpuvision.cli.main import application
+from gpuvision.profiling import curves
+from gpuvision.profiling.curves import curve, plot
+
+NUMBERS = st.lists(st.tuples(*[st.integers(0, 4).map(float)] * 3), min_size=1, max_size=8)
+
+
+def test_errors_leave_out_samples_without_a_value():
+    errors = curve.Errors([3.0, -4.0, math.nan, 0.0])
+    assert errors.rms == pytest.approx(math.sqrt(25.0 / 3.0))
+    assert errors.largest == 4.0
+    assert errors.p95 == pytest.approx(3.9)
+    assert errors.lost == 0.25
+
+
+def test_errors_of_nothing_are_nan():
+    errors = curve.Errors([math.nan, math.nan])
+    assert errors.lost == 1.0
+    assert all(math.isnan(each) for each in (errors.rms, errors.p95, errors.largest))
+
+
+@given(NUMBERS)
+def test_every_setting_is_on_the_front_or_beaten_by_one_on_it(settings):
+    best = curve.pareto_front(settings)
+    front = [each for each, is_best in zip(settings, best, strict=True) if is_best]
+    assert front
+    for each, is_best in zip(settings, best, strict=True):
+        beaten = any(other != each and all(np.less_equal(other, each)) for other in front)
+        assert is_best != beaten
+
+
+def test_a_setting_without_a_value_is_not_on_the_front():
+    assert curve.pareto_front([(1.0, math.nan, 1.0), (2.0, 3.0, 0.0)]) == [False, True]
+
+
+def test_operations_are_the_modules_of_the_package():
+    files = {path.stem for path in Path(curves.__file__).parent.glob("*.py")} - {"__init__", "curve", "plot"}
+    assert set(curve.OPERATIONS) == files
+
+
+def test_an_unknown_operation_is_named():
+    with pytest.raises(ValueError, match="no curves of 'lines'; expected some of psd, line"):
+        curve.measure_curves(["lines"], [])
+
+
+def errors_of(operation, device):
+    settings = importlib.import_module(f"gpuvision.profiling.curves.{operation}").settings(device)
+    return {(each.data, *each.knobs.items()): each.errors for each in settings}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("operation", curve.OPERATIONS)
+def test_settings_are_distinct_and_measure_most_samples(operation, device):
+    settings = list(importlib.import_module(f"gpuvision.profiling.curves.{operation}").settings(device))
+    if operation == "occluded_irradiance" and not device.has_double:
+        assert not settings
+        return
+    assert len({(each.data, *each.knobs.items()) for each in settings}) == len(settings) > 3
+    for each in settings:
+        assert each.operation == operation
+        assert math.isfinite(each.errors.rms)
+        assert each.errors.lost < 0.8
+
+
+def test_a_lens_model_with_all_coefficients_leaves_rounding_only(device):
+    errors = errors_of("undistort_points", device)
+    data = "lens of 14 coefficients"
+    worst = [errors[data, ("model", model), ("precision", "single")].largest for model in ("k1", "14 coefficients")]
+    assert worst[0] > 1.0
+    assert worst[1] < 1e-3  # a few units in the last place of 1280 px
+    if device.has_double:
+        assert errors[data, ("model", "14 coefficients"), ("precision", "double")].largest < 1e-9
+
+
+def test_the_robust_loss_pays_with_outliers_only(device):
+    errors = errors_of("line_fit", device)
+
+    def rms(data, loss):
+        knobs = (("max_trials", 64), ("max_iterations", 12), ("loss", loss), ("precision", "single"))
+        return errors[data, *knobs].rms
+
+    # Least squares on points with noise of 0.05 px: standard deviation 0.05 / sqrt(20) px at the middle; u is not
+    # centred, which adds a little.
+    assert rms("0% outliers", "least_squares") == pytest.approx(0.05 / math.sqrt(20.0), rel=0.1)
+    assert rms("30% outliers", "least_squares") > 1.0 > 20.0 * rms("30% outliers", "tukey")
+
+
+def test_a_picture_for_each_operation(tmp_path):
+    common = {"operation": "psd", "unit": "m", "seconds_low": 1e-5, "seconds_high": 3e-5, "device": "pocl"}
+    points = [
+        curve.Point(**common, data=data, knobs={"least": k}, seconds=2e-5 * k, rms=1e-6 / k, p95=2e-6, largest=3e-6,
+                    lost=0.0, best=k > 1)
+        for data in ("dim", "bright") for k in (1, 2, 3)
+    ]  # fmt: skip
+    assert plot.draw_curves(tmp_path / "plots", points) == ["curve-psd.png"]
+    assert (tmp_path / "plots" / "curve-psd.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_point_is_described_by_the_knobs_that_differ():
+    common = {
+        "operation": "psd", "data": "dim", "device": "pocl", "unit": "m", "seconds": 1.0, "seconds_low": 1.0,
+        "seconds_high": 1.0, "rms": 1.0, "p95": 1.0, "largest": 1.0, "lost": 0.0, "best": True,
+    }  # fmt: skip
+    points = [curve.Point(**common, knobs={"window": 3, "method": each}) for each in ("ml", "fir")]
+    assert plot.describe(points[0], points) == "method ml"
+
+
+def test_the_command_writes_points_and_pictures(device, tmp_path):
+    options = ["--device", device.label, "--seconds", "0.01", "--json", str(tmp_path / "points.json")]
+    result = CliRunner().invoke(application(), ["curves", "pose", *options, "--plots", str(tmp_path / "plots")])
+    assert result.exit_code == 0, result.output
+    report = json.loads((tmp_path / "points.json").read_text())
+    assert list(report["machine"]["devices"]) == [device.label]
+    assert {point["operation"] for point in report["points"]} == {"pose"}
+    assert any(point["best"] for point in report["points"])
+    assert (tmp_path / "plots" / "curve-pose.png").exists()

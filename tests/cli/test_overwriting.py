@@ -183,6 +183,8 @@ ROBOT = ("locate-robot", "in.npy", "--field", "robocup_msl", "--out", "out")
         (("devices", "--json", "r.json"), "r.json"),
         (("profile", "psd", "--json", "r.json"), "r.json"),
         (("profile", "psd", "--plots", "out"), "out/growth.png"),
+        (("curves", "psd", "--json", "r.json"), "r.json"),
+        (("curves", "psd", "--plots", "out"), "out/curve-psd.png"),
         (("demo", "--out", "out"), "out/part.ply"),
         (("demo", "--out", "out"), "out/psd_line_masked/mask.txt"),
     ],

@@ -14,7 +14,7 @@ from gpuvision.profiling.curves.curve import Errors, Setting, bind_with
 
 _COUNT = 400
 _USUAL: dict[str, Any] = {"spokes": 16, "width": 1, "smoothing_px": 1.5, "passes": 2, "match": True}
-_CHANGES: tuple[dict[str, float], ...] = (
+_CHANGES: tuple[dict[str, Any], ...] = (
     {},
     *({"spokes": spokes} for spokes in (8, 12, 24, 32)),
     *({"width": width} for width in (3, 5)),

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from gpuvision.host import Bound, Device, Operation
 from gpuvision.profiling.rounds import median_interval, take_turns
 
-R = TypeVar("R")
+R = TypeVar("R", bound=tuple[Any, ...])
 OPERATIONS = (
     "psd",
     "line",

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gpuvision.host import Device, to_numpy
+from gpuvision.host.launch import Precision
 from gpuvision.profiling.curves.curve import Errors, Setting, bind_with
 from gpuvision.ranging.psd import PsdReadout
 
@@ -29,7 +30,7 @@ def settings(device: Device) -> Iterator[Setting]:
     shares = np.stack([0.5 - true / _LENGTH, 0.5 + true / _LENGTH])
     electrons = rng.poisson(shares * level / _CODES_PER_ELECTRON)
     currents = electrons * _CODES_PER_ELECTRON + rng.normal(0.0, _AMPLIFIER, shares.shape)
-    types: list[tuple[str, str | None]] = [("uint16", None), ("float32", None)]
+    types: list[tuple[str, Precision]] = [("uint16", None), ("float32", None)]
     types += [("float64", "double")] if device.has_double else []
     for dtype, precision in types:
         samples = np.clip(np.rint(currents), 0, 65_535) if dtype == "uint16" else currents

@@ -19,7 +19,7 @@ from gpuvision.profiling.ruler_accuracy import SIDE, scenes
 _IMAGES = 4  # per angle
 _NOISES = (1.0, 8.0)  # [levels]
 _USUAL = {"length": 41, "width": 5, "smoothing_px": 1.2, "step_px": 1.0}
-_CHANGES: tuple[dict[str, float], ...] = (
+_CHANGES: tuple[dict[str, Any], ...] = (
     {},
     *({"width": width} for width in (1, 3, 9, 15)),
     *({"length": length} for length in (21, 31, 64)),

@@ -269,7 +269,8 @@ class Growth:
         return (
             f"{first.operation} on {first.device}: {first.seconds * 1e6:.1f} µs for one {first.item}, "
             f"{shortest * 1e6:.1f} µs at least, twice as long from {_count(launch)}, "
-            f"beyond the cache from {_count(cache)}; {rate:.3g} {first.item}s/s and {last.bytes / last.seconds / 1e9:.2g} GB/s for {last.items}"
+            f"beyond the cache from {_count(cache)}; {rate:.3g} {first.item}s/s and "
+            f"{last.bytes / last.seconds / 1e9:.2g} GB/s for {last.items}"
         )
 
     def to_json(self) -> str:

@@ -1,4 +1,4 @@
-"""Line readout compared with Numba, in strips of 256 columns, and with NumPy: position, total and status.
+"""Line readout compared with Numba (forms of `line_peers`) and with NumPy: position, total and status.
 
 The frames have 512 rows, 1024 columns and 8 bits; the line moves over half the height of the frame.
 """
@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
@@ -17,92 +16,17 @@ from scipy import special
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, host_view, to_numpy
-from gpuvision.profiling.harness import Case
+from gpuvision.profiling.harness import Case, Peer
+from gpuvision.profiling.line_peers import expert_forms, plain_form
 from gpuvision.ranging.line import LineReadout, Method
 from gpuvision.ranging.triangulation import Triangulation
 
 ROWS, COLUMNS, THRESHOLD, SATURATION, WINDOW = 512, 1024, 25, 255, 8
 GAIN = 0.1  # gain of the noise model of the likelihood
 OUTPUTS = ("position", "total", "status")
-_STRIP = 256  # columns that a Numba task sums
+_FIT_DIFFERENCE = 2e-4  # px: largest difference between two likelihood fits of a column
 _DISTINCT = 8  # different frames in a batch
 Frames = NDArray[np.uint8]
-
-
-@numba.njit(error_model="numpy")
-def _add_row(line, totals, moments, tops, threshold):
-    """Add a row of a strip. The moment is the sum of the running totals, which needs no multiplication."""
-    for c in range(line.size):
-        x = line[c]
-        total = totals[c] + np.uint32(max(x, threshold) - threshold)
-        totals[c] = total
-        moments[c] += total
-        tops[c] = max(tops[c], x)
-
-
-@numba.njit(parallel=True, error_model="numpy")
-def _numba_centroid(frames, threshold, saturation, position, total, status):
-    count, rows, columns = frames.shape
-    strips = (columns + _STRIP - 1) // _STRIP
-    for item in numba.prange(count * strips):
-        f, first = item // strips, item % strips * _STRIP
-        n = min(_STRIP, columns - first)
-        totals, moments = np.zeros(_STRIP, np.uint32), np.zeros(_STRIP, np.uint32)
-        tops = np.zeros(_STRIP, np.uint8)
-        for r in range(rows):
-            _add_row(frames[f, r, first : first + n], totals, moments, tops, threshold)
-        for c in range(n):
-            s = totals[c]
-            dark = s == 0
-            position[f, first + c] = (
-                np.float32(np.nan) if dark else np.float32(np.uint32(rows) * s - moments[c]) / np.float32(s)
-            )
-            total[f, first + c] = s
-            status[f, first + c] = np.uint8(dark) | (np.uint8(tops[c] >= saturation) << np.uint8(1))
-
-
-@numba.njit(error_model="numpy")
-def _raise_tops(line, row, tops, at):
-    for c in range(line.size):
-        x = line[c]
-        at[c] = row if x > tops[c] else at[c]
-        tops[c] = max(tops[c], x)
-
-
-@numba.njit(error_model="numpy")
-def _add_window(line, row, at, totals, moments, threshold, window):
-    for c in range(line.size):
-        d = row - np.int32(at[c])
-        v = max(np.int32(line[c]) - threshold, 0)
-        v = v if (d <= window) & (d >= -window) else np.int32(0)
-        totals[c] += v
-        moments[c] += v * d
-
-
-@numba.njit(parallel=True, error_model="numpy")
-def _numba_windowed(frames, threshold, saturation, window, position, total, status):
-    count, rows, columns = frames.shape
-    strips = (columns + _STRIP - 1) // _STRIP
-    for item in numba.prange(count * strips):
-        f, first = item // strips, item % strips * _STRIP
-        n = min(_STRIP, columns - first)
-        tops, at = np.zeros(_STRIP, np.uint8), np.zeros(_STRIP, np.uint16)
-        for r in range(rows):
-            _raise_tops(frames[f, r, first : first + n], np.uint16(r), tops, at)
-        begin = max(np.int64(at[:n].min()) - window, 0)
-        end = min(np.int64(at[:n].max()) + window + 1, rows)
-        totals, moments = np.zeros(_STRIP, np.int32), np.zeros(_STRIP, np.int32)
-        for r in range(begin, end):
-            _add_window(frames[f, r, first : first + n], np.int32(r), at, totals, moments, threshold, window)
-        for c in range(n):
-            s = totals[c]
-            cut = (at[c] < window) | (at[c] + window >= rows)
-            flags = np.uint8(s == 0) | (np.uint8(tops[c] >= saturation) << np.uint8(1))
-            flags |= np.uint8(cut) << np.uint8(2)
-            place = np.float32(at[c]) + np.float32(moments[c]) / np.float32(max(s, 1))
-            position[f, first + c] = np.float32(np.nan) if (s == 0) | cut else place
-            total[f, first + c] = s
-            status[f, first + c] = flags
 
 
 def _numpy_centroid(frames: Frames) -> tuple[NDArray[Any], ...]:
@@ -230,27 +154,38 @@ def _case(device: Device, readout: LineReadout, count: int, name: str) -> Case:
         frames = np.ascontiguousarray(np.swapaxes(frames, 1, 2))
     bound, frames = _bound(device, readout, frames)
     across = np.swapaxes(frames, 1, 2) if readout.along == "rows" else frames
-    peers = _peers(readout, frames, across)
+    peers = _peers(readout, frames, across, bound.outputs)
     error = _error(bound.outputs, across, readout)
     return Case("line", name, bound.run, peers, error, (frames.nbytes, 9 * count * COLUMNS))
 
 
-def _peers(readout: LineReadout, frames: Frames, across: Frames) -> dict[str, Callable[[], object]]:
+def _peers(readout: LineReadout, frames: Frames, across: Frames, ours: Any) -> dict[str, Peer]:
     """Return the peers of a readout; `across` holds the frames with the profiles in columns."""
-    if readout.method in _NUMPY_FITS:
-        return {"numpy": lambda: _NUMPY_FITS[readout.method](across)}
-    is_centroid = readout.method == "centroid"
-    peers: dict[str, Callable[[], object]] = {
-        "numpy": lambda: (_numpy_centroid if is_centroid else _numpy_windowed)(across)
-    }
+    whole = {"centroid": _numpy_centroid, "windowed": _numpy_windowed} | _NUMPY_FITS
     results = tuple(np.empty((len(frames), COLUMNS), each) for each in (np.float32, np.uint32, np.uint8))
-    if readout.along == "rows":
-        return peers
-    if is_centroid:
-        peers["numba"] = lambda: _numba_centroid(frames, np.uint8(THRESHOLD), SATURATION, *results)
-    else:
-        peers["numba"] = lambda: _numba_windowed(frames, np.int32(THRESHOLD), SATURATION, WINDOW, *results)
-    return peers
+    fit = np.array([THRESHOLD, SATURATION, readout.read_noise**2, GAIN])
+    levels = fit if readout.method == "ml" else fit[:2].astype(np.uint8)
+
+    def call(form: Any, frames: Frames, levels: NDArray[Any]) -> Callable[[], object]:
+        form(frames, levels, WINDOW, *results)
+        _check_peer(readout, ours, results)
+        return lambda: form(frames, levels, WINDOW, *results)
+
+    forms = expert_forms(readout.method, readout.along, len(frames))
+    return {
+        "numpy": lambda: whole[readout.method](across),
+        "numba": {name: call(form, frames, levels) for name, form in forms.items()},
+        "numba-plain": call(plain_form(readout.method), across, fit),
+    }
+
+
+def _check_peer(readout: LineReadout, ours: Any, results: tuple[NDArray[Any], ...]) -> None:
+    """Raise an AssertionError if a peer has other results than our readout."""
+    position, total, status = (to_numpy(each) for each in (ours.position, ours.total, ours.status))
+    limit = _FIT_DIFFERENCE if readout.method == "ml" else 1e-4
+    np.testing.assert_allclose(results[0], position, rtol=0.0, atol=limit)
+    np.testing.assert_array_equal(results[1], total)
+    np.testing.assert_array_equal(results[2], status)
 
 
 _LENS = Lens(k1=4e-8, k2=1e-14, centre=(COLUMNS / 2.0, ROWS / 2.0))

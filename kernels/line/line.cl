@@ -6,7 +6,7 @@
 //     CENTROID  sum v k / sum v over the whole profile, v the light (line_centroid.h)
 //     WINDOWED  the same in a window of RADIUS samples on either side of the peak (line_window.h)
 //     GAUSS3    parabola through three logarithms, FIR zero crossing of a derivative filter (line_points.h)
-//     ML        maximum-likelihood fit of a Gaussian (line_ml.h)
+//     ML        maximum-likelihood fit of a Gaussian (line_ml.h, line_point_fit.h)
 //
 // Inputs:  frames     (frames, rows, columns) CODE [grey levels]
 //          previous   (frames, samples) real [px], under SELECT_NEAREST: earlier positions, NaN: unknown

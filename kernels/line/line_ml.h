@@ -5,10 +5,12 @@
 // gives at the current fit: read_variance + gain * level. The unknowns are the position, the logarithm of sigma, the
 // amplitude and the background. The last two are divided by the amplitude, so that all columns of the design matrix
 // have about the same size.
+//
+// Most lines are fitted faster, by the values at the middles of the pixels (line_point_fit.h).
 #ifndef LINE_ML_H
 #define LINE_ML_H
 
-#include "line/line_window.h"
+#include "line/line_point_fit.h"
 
 #define ML_STEPS 12  // largest number of iterations
 #define ML_UNKNOWNS 4
@@ -16,10 +18,6 @@
 #define ML_DAMPING 1e-4f   // fraction of the diagonal added to it: if all light falls on one pixel, sigma and
                            // amplitude cannot be separated
 #define ML_NARROWEST 0.15f  // px: smallest sigma; narrower lines fall on one or two pixels
-
-typedef struct {
-    reals position, sigma, amplitude, background;  // position relative to the middle of the window
-} Gaussian;
 
 // At a pixel edge, z sigmas from the position: exp(-z^2/2), and the fraction of the light before the edge minus 1/2.
 typedef struct {
@@ -38,21 +36,30 @@ static inline Edge edge_at(reals z) {
     return edge;
 }
 
-// Start values: background from the ends of the window; position and sigma from the samples above a quarter of the
-// amplitude, which hold 90.4 % of the light of a Gaussian (erf(sqrt(ln 4)); 2.266 = 0.904 sqrt(2 pi)).
-static inline Gaussian first_guess(const CODE *window, codes level) {
+// Start values from the light v above a quarter of the amplitude. This level is subtracted, so that a sample that crosses
+// it does not move the position by a jump. With c = sqrt(2 ln 4), a Gaussian keeps a total of v of amplitude sigma times
+// F = sqrt(2 pi) erf(c / sqrt(2)) - 2 c / 4 = 1.4336, and a variance of v of sigma^2 times 1 - c^3 / (6 F) = 0.46327.
+// Sigma follows from the variance under `by_variance`, where noise of the peak does not move it, else from the total and
+// the peak, which suits narrow lines.
+static inline Gaussian first_guess(const reals *samples, codes level, int by_variance) {
     Gaussian guess;
-    guess.background = (to_reals(window_level(window, 0)) + to_reals(window_level(window, 2 * RADIUS))) / 2;
-    guess.amplitude = fmax(to_reals(level) - guess.background, (reals)1e-6f);
-    reals total = 0, moment = 0;
+    guess.background = (samples[0] + samples[2 * RADIUS]) / 2;
+    const reals height = fmax(to_reals(level) - guess.background, (reals)1e-6f);
+    const reals least = guess.background + height / 4;
+    reals total = 0, moment = 0, square = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
-        const reals over = to_reals(window_level(window, k + RADIUS)) - guess.background;
-        const reals v = choose_reals(int_mask(over > guess.amplitude / 4), over, 0);
+        const reals v = lane_max(samples[k + RADIUS] - least, (reals)0);
         total += v;
         moment += v * (real)k;
+        square += v * (real)(k * k);
     }
-    guess.position = moment / total;
-    guess.sigma = clamp(total / (guess.amplitude * (real)2.266), (reals)0.3f, (reals)RADIUS);
+    const reals per_total = reciprocal(total);
+    guess.position = moment * per_total;
+    const reals variance = square * per_total - guess.position * guess.position;
+    const reals by_peak = total * reciprocal(height * (real)1.4336);
+    const reals sigma = by_variance ? sqrt(variance * (real)(1 / 0.46327)) : by_peak;
+    guess.sigma = clamp(sigma, (reals)0.3f, (reals)RADIUS);
+    guess.amplitude = by_variance ? total * reciprocal(guess.sigma * (real)1.4336) : height;
     return guess;
 }
 
@@ -147,30 +154,39 @@ static inline reals take_step(Gaussian *at, Normal *normal) {
     return fmax(fabs(move), fabs(by[1]) * at->sigma);
 }
 
-static inline Gaussian choose_gaussian(ints mask, Gaussian yes, Gaussian no) {
-    const Gaussian chosen = {choose_reals(mask, yes.position, no.position), choose_reals(mask, yes.sigma, no.sigma),
-                             choose_reals(mask, yes.amplitude, no.amplitude),
-                             choose_reals(mask, yes.background, no.background)};
-    return chosen;
-}
-
-// Fit every lane. Where the fit does not converge inside the window, the position is the centroid of the window, with
-// AMBIGUOUS. Converged lanes are not changed any more, so that a reading does not depend on its neighbours.
-static inline Place fit_gaussian(const CODE *window, const Profiles *profiles, const Peak *peak,
+// Fit the lanes of `wanted` to samples integrated over pixels, from the start values `at`. Converged lanes are not
+// changed any more, so that a reading does not depend on its neighbours. Return the lanes that are fitted.
+static inline ints fit_integrals(const CODE *window, Gaussian *at, ints wanted, CODE saturation,
                                  constant LineTable *table) {
-    Gaussian at = first_guess(window, peak->level);
     reals moved = 1;
-    ints moving = peak->found;
+    ints moving = wanted;
     for (int n = 0; n < ML_STEPS && any_int_lane(moving); n++) {
-        Normal normal = normal_equations(window, at, profiles->saturation, table->read_variance, table);
-        Gaussian next = at;
+        Normal normal = normal_equations(window, *at, saturation, table->read_variance, table);
+        Gaussian next = *at;
         const reals by = take_step(&next, &normal);
-        at = choose_gaussian(moving, next, at);
+        *at = choose_gaussian(moving, next, *at);
         moved = choose_reals(moving, by, moved);
         moving &= ~int_mask(moved <= ML_SETTLED);
     }
+    return int_mask(moved <= 100 * ML_SETTLED) & int_mask(fabs(at->position) <= RADIUS);
+}
+
+// Fit every lane: first with the values at the pixels' middles (line_point_fit.h), then the other lanes with integrals.
+// Where no fit converges inside the window, the position is the centroid of the window, with AMBIGUOUS.
+static inline Place fit_gaussian(const CODE *window, const Profiles *profiles, const Peak *peak,
+                                 constant LineTable *table) {
+    reals samples[WINDOW];
+    for (int k = 0; k < WINDOW; k++) samples[k] = to_reals(window_level(window, k));
+    const SampleNoise noise = {table->read_variance, table->gain, (real)profiles->saturation};
+    Gaussian at = first_guess(samples, peak->level, 1);
+    ints settled = fit_points(samples, &at, peak->found, noise);
+    const ints others = peak->found & ~settled;
+    if (any_lane(to_masks(others))) {
+        Gaussian integrals = first_guess(samples, peak->level, 0);
+        settled |= others & fit_integrals(window, &integrals, others, profiles->saturation, table);
+        at = choose_gaussian(others, integrals, at);
+    }
     Place place = window_centroid(window, RADIUS, profiles, peak, table);
-    const ints settled = int_mask(moved <= 100 * ML_SETTLED) & int_mask(fabs(at.position) <= RADIUS);
     place.at = choose_reals(settled, at.position, place.at);
     place.flags = flag_where(~settled & peak->found, STATUS_AMBIGUOUS);
 #ifdef NOISE

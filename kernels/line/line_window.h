@@ -18,8 +18,8 @@ typedef struct {
 #endif
 } Place;
 
-// Copy the window of every lane; beyond the border the sample at the border is repeated.
-static inline void gather(const Profiles *profiles, ints peak, int reach, CODE *window) {
+// Copy the window of every lane, one lane after the other; beyond the border the sample at the border is repeated.
+static inline void gather_lanes(const Profiles *profiles, ints peak, int reach, CODE *window) {
     int at[LANES];
     *(ints_at *)at = peak;
     for (int lane = 0; lane < LANES; lane++) {
@@ -36,6 +36,41 @@ static inline void gather(const Profiles *profiles, ints peak, int reach, CODE *
         }
     }
 }
+
+#if defined(VECTOR_VARIANT) && !defined(ALONG_ROWS)
+// Copy the window of every lane (see gather_lanes) by whole rows of 16 lanes, where the peaks lie within SHIFTS rows.
+//
+// The rows from the earliest window on are copied, then each lane is moved up by the rows between the earliest window
+// and its own window: by the bits of that number, from the highest bit down. A step selects between two rows in all
+// lanes at once, so that 16 windows take about 2 (2 reach + 1) + SHIFTS instructions for bytes.
+#define SHIFTS 32
+static inline void gather(const Profiles *profiles, ints peak, int reach, CODE *window) {
+    const int first = lowest_lane(peak), last = -lowest_lane(-peak), height = 2 * reach + 1;
+    if (last - first >= SHIFTS) {
+        gather_lanes(profiles, peak, reach, window);
+        return;
+    }
+    CODE rows[(2 * REACH + SHIFTS) * LANES];
+    const ints shift = peak - first;
+    const int copied = height + last - first;
+    for (int k = 0; k < copied; k++) {
+        *(codes_at *)(rows + k * LANES) = sample_of(profiles, clamp(first - reach + k, 0, profiles->length - 1));
+    }
+    for (int bit = SHIFTS / 2; bit > 0; bit >>= 1) {
+        if (bit > last - first) continue;
+        const ints moved = int_mask((shift & bit) != 0);
+        const int end = min(height + bit - 1, copied);
+        for (int k = 0; k < end; k++) {
+            const codes here = *(const codes_at *)(rows + k * LANES);
+            const codes later = *(const codes_at *)(rows + (k + bit) * LANES);
+            *(codes_at *)(rows + k * LANES) = choose_codes(moved, later, here);
+        }
+    }
+    for (int k = 0; k < height; k++) *(codes_at *)(window + k * LANES) = *(const codes_at *)(rows + k * LANES);
+}
+#else
+#define gather gather_lanes
+#endif
 
 static inline codes window_level(const CODE *window, int k) { return *(const codes_at *)(window + k * LANES); }
 

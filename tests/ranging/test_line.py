@@ -18,7 +18,15 @@ from gpuvision.host import Device
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Triangulation
-from gpuvision.reference.line import AMBIGUOUS, LOW_SIGNAL, NOT_FINITE, OUT_OF_RANGE, SATURATED, read_lines
+from gpuvision.reference.line import (
+    AMBIGUOUS,
+    LOW_SIGNAL,
+    NOT_FINITE,
+    OUT_OF_RANGE,
+    SATURATED,
+    pixel_gaussian,
+    read_lines,
+)
 from gpuvision.reference.triangulation import triangulate
 from gpuvision.status import Status
 from guard_pages import assert_within_pages
@@ -101,6 +109,32 @@ def test_fits(device, rng, method, dtype, along, variant):
     else:
         # The rounding errors of a logarithm or quotient are larger where the peak is flat.
         assert_same(reading, expected, slack=20.0)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_fits_of_lines_of_any_width(device, rng, variant):
+    """Lines narrower than 1.6 px, and wider than 12 px, are fitted by integrals; the others by values at pixels."""
+    k, parameters = np.arange(120)[:, None], {"method": "ml", "window": 30, "read_noise": 2.0, "gain": 0.1}
+    for sigmas in ((0.7, 1.5, 1.7, 2.0), (3.0, 7.0, 11.5, 12.5)):
+        place, sigma = 60 + rng.uniform(-0.5, 0.5, 16), np.tile(sigmas, 4)
+        light = pixel_gaussian(k, place, sigma, 180.0 / np.maximum(1.0, sigma / 4.0), 12.0)
+        frame = np.rint(light + rng.normal(0.0, 0.5, light.shape)).astype(np.uint8)
+        reading = LineReadout(variant=variant, **parameters)(frame, device=device)
+        expected = read_lines(frame, **parameters)
+        np.testing.assert_array_equal(reading.status & ~np.uint8(SATURATED), 0)
+        np.testing.assert_allclose(reading.position, expected["position"], atol=1e-4)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_fit_does_not_depend_on_its_neighbours(device, rng, variant):
+    k, place, sigma = np.arange(60)[:, None], rng.uniform(18, 42, 96), rng.uniform(0.6, 4.0, 96)
+    light = pixel_gaussian(k, place, sigma, 150.0, 12.0)
+    frame = np.clip(light + rng.normal(0.0, 5.0, light.shape), 0, 255).astype(np.uint8)
+    order, readout = rng.permutation(96), LineReadout(method="ml", window=8, gain=0.1, variant=variant)
+    position, status = readout(frame, device=device).position, readout(frame, device=device).status
+    moved = readout(np.ascontiguousarray(frame[:, order]), device=device)
+    np.testing.assert_array_equal(moved.position, position[order])
+    np.testing.assert_array_equal(moved.status, status[order])
 
 
 @pytest.mark.parametrize("peak_selection", ["first", "last", "nearest", "strongest"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -95,6 +96,7 @@ def _centroid_strip(add, frame, first, levels, position, total, status):
     _finish_centroid(sums, tops, n, frame.shape[0], levels[1], position[first:end], total[first:end], status[first:end])
 
 
+@functools.cache
 def _centroid_form(add, parallel):
     @numba.njit(parallel=parallel, error_model="numpy")
     def centroid(frames, levels, window, position, total, status):
@@ -235,6 +237,7 @@ def _fir_columns(frame, first, n, tops, at, levels, window, position, total):
         total[column] = _window_sums(frame, column, middle, levels[0], window)[0]
 
 
+@functools.cache
 def _peak_form(find, read, parallel):
     """Return a readout of frames: `levels` are threshold and saturation."""
 
@@ -397,6 +400,7 @@ def _peak_by_parts(line):
     return top, part
 
 
+@functools.cache
 def _row_form(find):
     @numba.njit(parallel=True, error_model="numpy")
     def readout(frames, levels, window, position, total, status):
@@ -526,6 +530,7 @@ def _plain_ml(x, levels, window):
     return at + place, total, status
 
 
+@functools.cache
 def _plain_form(method):
     @numba.njit(parallel=True)
     def readout(frames, levels, window, position, total, status):

@@ -97,7 +97,7 @@ def _centroid_strip(add, frame, first, levels, position, total, status):
 
 
 @functools.cache
-def _centroid_form(add, parallel):
+def _centroid_form(add: Any, parallel: bool) -> Any:
     @numba.njit(parallel=parallel, error_model="numpy")
     def centroid(frames, levels, window, position, total, status):
         strips = (frames.shape[2] + _STRIP - 1) // _STRIP
@@ -238,7 +238,7 @@ def _fir_columns(frame, first, n, tops, at, levels, window, position, total):
 
 
 @functools.cache
-def _peak_form(find, read, parallel):
+def _peak_form(find: Any, read: Any, parallel: bool) -> Any:
     """Return a readout of frames: `levels` are threshold and saturation."""
 
     @numba.njit(parallel=parallel, error_model="numpy")
@@ -401,7 +401,7 @@ def _peak_by_parts(line):
 
 
 @functools.cache
-def _row_form(find):
+def _row_form(find: Any) -> Any:
     @numba.njit(parallel=True, error_model="numpy")
     def readout(frames, levels, window, position, total, status):
         count, rows, length = frames.shape
@@ -421,7 +421,7 @@ def _row_form(find):
                     moment += v * np.int32(k - middle)
                 flags = _flags(top, middle, length, window, levels[0], levels[1])
                 total[f, r], status[f, r] = s, flags
-                place = _F(middle) + _F(moment) / _F(max(s, 1))
+                place = _F(middle) + _F(moment) / _F(max(s, np.int32(1)))
                 position[f, r] = _F(np.nan) if flags & np.uint8(5) else place
 
     return readout
@@ -531,7 +531,7 @@ def _plain_ml(x, levels, window):
 
 
 @functools.cache
-def _plain_form(method):
+def _plain_form(method: Any) -> Any:
     @numba.njit(parallel=True)
     def readout(frames, levels, window, position, total, status):
         for f in numba.prange(frames.shape[0]):

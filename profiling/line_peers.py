@@ -430,7 +430,7 @@ def _row_form(find: Any) -> Any:
 # ---- first loops of a user: one column after the other, in plain Python operations ---------------------------------
 
 
-@numba.njit
+@numba.njit()
 def _plain_window(x, levels, window):
     """Return the row of the peak, the total in the window and the status of a column."""
     at = np.argmax(x)
@@ -445,7 +445,7 @@ def _plain_window(x, levels, window):
     return at, total, (total == 0.0) * 1 + (top >= levels[1]) * 2 + (cut and total > 0.0) * 4
 
 
-@numba.njit
+@numba.njit()
 def _plain_centroid(x, levels, window):
     total, moment, top = 0.0, 0.0, 0.0
     for k in range(len(x)):
@@ -457,7 +457,7 @@ def _plain_centroid(x, levels, window):
     return (moment / total if total > 0.0 else np.nan), total, status
 
 
-@numba.njit
+@numba.njit()
 def _plain_windowed(x, levels, window):
     at, total, status = _plain_window(x, levels, window)
     if status & 5:
@@ -468,7 +468,7 @@ def _plain_windowed(x, levels, window):
     return at + moment / total, total, status
 
 
-@numba.njit
+@numba.njit()
 def _plain_gauss3(x, levels, window):
     at, total, status = _plain_window(x, levels, window)
     if status & 5:
@@ -477,7 +477,7 @@ def _plain_gauss3(x, levels, window):
     return at + 0.5 * (a - c) / (a - 2.0 * b + c), total, status
 
 
-@numba.njit
+@numba.njit()
 def _plain_fir(x, levels, window):
     at, total, status = _plain_window(x, levels, window)
     if status & 5:
@@ -492,7 +492,7 @@ def _plain_fir(x, levels, window):
     return at + best, total, status
 
 
-@numba.njit
+@numba.njit()
 def _plain_ml(x, levels, window):
     """Fisher scoring of a Gaussian integrated over pixels, until a step moves less than 1e-4 px."""
     at, total, status = _plain_window(x, levels, window)

@@ -100,9 +100,8 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
     """
 
     Result: ClassVar[type[Any]] = SheetPoints
-    tunable: ClassVar[Tunable | None] = Tunable(
-        strips=(512, 1024, 2048, 4096, 8192, 16384), groups=(32, 64, 128, 256), variants=True
-    )
+    # Not the variant: the variants round differently.
+    tunable: ClassVar[Tunable | None] = Tunable(strips=(512, 1024, 2048, 4096, 8192, 16384), groups=(32, 64, 128, 256))
 
     precision: Precision = None
     variant: Variant = "auto"

@@ -1,4 +1,4 @@
-"""Blob measurement compared with one fused Numba function of the same method, and with OpenCV blob by blob.
+"""Blob measurement compared with fused Numba functions of the same method, and with OpenCV blob by blob.
 
 The 8-bit frame shows bright discs with a radius of 8 px, a blur of 1 px, a contrast of 100 and noise of 2 grey levels,
 each up to 2 px from its nominal position. Numba uses the same rulers, start, robust fit, match of the pixels, centre of
@@ -9,6 +9,7 @@ deviation of `findContours` with `fitEllipse`.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -20,14 +21,19 @@ from numpy.typing import NDArray
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.blob import TUNING_CONSTANT, FindBlobs
-from gpuvision.profiling.harness import Case
+from gpuvision.profiling.harness import Case, Peer
 
 CELL, RADIUS, BLUR, CONTRAST, NOISE, OFF = 40, 8.0, 1.0, 100.0, 2.0, 2.0
+_DIFFERENCE = 0.01  # px: largest difference of a centre, a match that takes a step more or less
 SPOKES, SEARCH, REACH, THRESHOLD = 16, 4.0, 5, 20.0
 LENGTH = 2 * (math.ceil(SEARCH) + REACH) + 3
 _SLOPES, _PIXELS, _UNKNOWNS = LENGTH - 2 * REACH, 1024, 8
 _PATTERNS = np.array([[4, 8], [5, 10], [3, 6], [2, 6]])
 _F = np.float32
+# Edges of the triples whose circles are start values: 16 triples for each pattern.
+_TRIPLES = len(_PATTERNS) * SPOKES
+_FIRST = np.tile(np.arange(SPOKES), len(_PATTERNS))
+_SECOND, _THIRD = ((_FIRST + np.repeat(_PATTERNS[:, k], SPOKES)) % SPOKES for k in (0, 1))
 _SUMS = {"contract", "reassoc", "nsz", "arcp"}
 
 
@@ -97,6 +103,44 @@ def _start(ex, ey, there, count, shape, reach):
             if loss < least:
                 least, best_x, best_y, best_r = loss, x, y, r
     return best_x, best_y, best_r
+
+
+@numba.njit(error_model="numpy", fastmath=_SUMS)
+def _start_in_lanes(ex, ey, there, count, shape, reach):
+    """Return the same circle as `_start`: the circles of all triples of edges side by side, as elements of vectors."""
+    lanes, one = np.empty((11, _TRIPLES), np.float32), _F(1.0)
+    for n in range(_TRIPLES):
+        i, j, k = _FIRST[n], _SECOND[n], _THIRD[n]
+        lanes[0, n], lanes[1, n], lanes[2, n], lanes[3, n] = ex[i], ey[i], ex[j], ey[j]
+        lanes[4, n], lanes[5, n], lanes[10, n] = ex[k], ey[k], there[i] * there[j] * there[k]
+    for n in range(_TRIPLES):
+        x, y, r = shape[0], shape[1], shape[2]
+        for _ in range(3):
+            ux, uy, vx, vy = lanes[0, n] - x, lanes[1, n] - y, lanes[2, n] - x, lanes[3, n] - y
+            wx, wy = lanes[4, n] - x, lanes[5, n] - y
+            u, v, w = math.sqrt(ux * ux + uy * uy), math.sqrt(vx * vx + vy * vy), math.sqrt(wx * wx + wy * wy)
+            ux, uy, vx, vy, wx, wy = ux / u, uy / u, vx / v, vy / v, wx / w, wy / w
+            u, v, w = u - r, v - r, w - r
+            a, b, c = vy - wy, wx - vx, vx * wy - vy * wx
+            per = one / (ux * a + uy * b + c)
+            x += per * (u * a + v * (wy - uy) + w * (uy - vy))
+            y += per * (u * b + v * (ux - wx) + w * (vx - ux))
+            r += per * (u * c + v * (wx * uy - wy * ux) + w * (ux * vy - uy * vx))
+        lanes[6, n], lanes[7, n], lanes[8, n], lanes[9, n] = x, y, r, _F(0.0)
+    most = reach * reach
+    for m in range(SPOKES):
+        at_x, at_y, found = ex[m], ey[m], there[m]
+        for n in range(_TRIPLES):
+            x, y = at_x - lanes[6, n], at_y - lanes[7, n]
+            off = math.sqrt(x * x + y * y) - lanes[8, n]
+            lanes[9, n] += found * min(off * off, most) + (one - found) * most
+    best, least = -1, _F(SPOKES) * most
+    for n in range(_TRIPLES):
+        if lanes[10, n] > _F(0.0) and lanes[9, n] < least:
+            best, least = n, lanes[9, n]
+    if best < 0:
+        return shape[0], shape[1], shape[2]
+    return lanes[6, best], lanes[7, best], lanes[8, best]
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
@@ -347,49 +391,56 @@ def _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, 
     found[5] = noise_sum / _F(SPOKES // 2)
 
 
-@numba.njit(parallel=True, error_model="numpy", fastmath=_SUMS)
-def _find(image, places, table, directions, noise, found, covariance, status):
-    """Fill blobs (n, 13): x, y, size, residual, inliers, symmetry, gravity, distance, contrast, blur, shift."""
-    pixels, pitch = image.reshape(-1), np.uint32(image.shape[1])
-    for n in numba.prange(places.shape[0]):
-        profile, slopes = np.empty(LENGTH, np.float32), np.empty(_SLOPES, np.float32)
-        edges, sums = np.empty((7, SPOKES), np.float32), np.empty(9, np.float32)
-        ex, ey, is_found, heights = edges[0], edges[1], edges[2], edges[3]
-        widths, noises, room = edges[4], edges[5], edges[6]
-        equation = np.empty((_UNKNOWNS + 1, _PIXELS), np.float32)
-        matrix, right = np.empty((_UNKNOWNS, _UNKNOWNS), np.float32), np.empty(_UNKNOWNS, np.float32)
-        to, shape, grey = np.empty(_UNKNOWNS, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
-        x, y, size = places[n, 0], places[n, 1], places[n, 2]
-        shape[0], shape[1], shape[2] = _F(0.0), _F(0.0), size
-        blur, scale, count = _F(0.0), _F(0.0), _F(0.0)
-        for step in range(2):
-            from_x, from_y, from_r = shape[0], shape[1], shape[2]
-            count = _F(0.0)
-            for m in range(SPOKES):
-                c, s = directions[m, 0], directions[m, 1]
-                at_x, at_y = from_x + from_r * c, from_y + from_r * s
-                place, heights[m], widths[m], noises[m] = _edge(
-                    pixels, pitch, x + at_x, y + at_y, c, s, table, profile, slopes
-                )
-                ex[m], ey[m] = at_x + place * c, at_y + place * s
-                off = abs(math.sqrt(ex[m] * ex[m] + ey[m] * ey[m]) - size)
-                is_found[m] = _F(1.0) if heights[m] != _F(0.0) and off <= _F(SEARCH) else _F(0.0)
-                count += is_found[m]
-            if count < _F(SPOKES // 2):
-                break
-            if step == 0:
-                shape[0], shape[1], shape[2] = _start(ex, ey, is_found, count, shape, _F(0.6))
-            blur, scale = _fit(ex, ey, is_found, widths, noises, shape, count, sums, room)
-            if (shape[0] - from_x) ** 2 + (shape[1] - from_y) ** 2 + (shape[2] - from_r) ** 2 < _F(4.0):
-                break
-        _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, found[n])
-        _match(pixels, pitch, x, y, shape, grey, noise, equation, matrix, right, to, covariance[n])
-        heavy_x, heavy_y = _gravity(pixels, pitch, x + shape[0], y + shape[1], shape[2] + _F(2.5) * grey[2] + _F(1.0))
-        found[n, 0], found[n, 1], found[n, 2] = x + shape[0], y + shape[1], shape[2]
-        found[n, 6], found[n, 7] = found[n, 0] + heavy_x, found[n, 1] + heavy_y
-        found[n, 8] = math.sqrt(shape[0] ** 2 + shape[1] ** 2)
-        found[n, 9], found[n, 10], found[n, 11], found[n, 12] = grey[1], grey[2], shape[0], shape[1]
-        status[n] = np.uint8(found[n, 4] < _F(SPOKES // 2))
+def _find_form(start: Any, parallel: bool) -> Any:
+    """Return a function that measures all blobs: `start` finds the first circle, on all cores under `parallel`."""
+
+    @numba.njit(parallel=parallel, error_model="numpy", fastmath=_SUMS)
+    def find(image, places, table, directions, noise, found, covariance, status):
+        """Fill blobs (n, 13): x, y, size, residual, inliers, symmetry, gravity, distance, contrast, blur, shift."""
+        pixels, pitch = image.reshape(-1), np.uint32(image.shape[1])
+        for n in numba.prange(places.shape[0]):
+            profile, slopes = np.empty(LENGTH, np.float32), np.empty(_SLOPES, np.float32)
+            edges, sums = np.empty((7, SPOKES), np.float32), np.empty(9, np.float32)
+            ex, ey, is_found, heights = edges[0], edges[1], edges[2], edges[3]
+            widths, noises, room = edges[4], edges[5], edges[6]
+            equation = np.empty((_UNKNOWNS + 1, _PIXELS), np.float32)
+            matrix, right = np.empty((_UNKNOWNS, _UNKNOWNS), np.float32), np.empty(_UNKNOWNS, np.float32)
+            to, shape, grey = np.empty(_UNKNOWNS, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
+            x, y, size = places[n, 0], places[n, 1], places[n, 2]
+            shape[0], shape[1], shape[2] = _F(0.0), _F(0.0), size
+            blur, scale, count = _F(0.0), _F(0.0), _F(0.0)
+            for step in range(2):
+                from_x, from_y, from_r = shape[0], shape[1], shape[2]
+                count = _F(0.0)
+                for m in range(SPOKES):
+                    c, s = directions[m, 0], directions[m, 1]
+                    at_x, at_y = from_x + from_r * c, from_y + from_r * s
+                    place, heights[m], widths[m], noises[m] = _edge(
+                        pixels, pitch, x + at_x, y + at_y, c, s, table, profile, slopes
+                    )
+                    ex[m], ey[m] = at_x + place * c, at_y + place * s
+                    off = abs(math.sqrt(ex[m] * ex[m] + ey[m] * ey[m]) - size)
+                    is_found[m] = _F(1.0) if heights[m] != _F(0.0) and off <= _F(SEARCH) else _F(0.0)
+                    count += is_found[m]
+                if count < _F(SPOKES // 2):
+                    break
+                if step == 0:
+                    shape[0], shape[1], shape[2] = start(ex, ey, is_found, count, shape, _F(0.6))
+                blur, scale = _fit(ex, ey, is_found, widths, noises, shape, count, sums, room)
+                if (shape[0] - from_x) ** 2 + (shape[1] - from_y) ** 2 + (shape[2] - from_r) ** 2 < _F(4.0):
+                    break
+            _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, found[n])
+            _match(pixels, pitch, x, y, shape, grey, noise, equation, matrix, right, to, covariance[n])
+            heavy_x, heavy_y = _gravity(
+                pixels, pitch, x + shape[0], y + shape[1], shape[2] + _F(2.5) * grey[2] + _F(1.0)
+            )
+            found[n, 0], found[n, 1], found[n, 2] = x + shape[0], y + shape[1], shape[2]
+            found[n, 6], found[n, 7] = found[n, 0] + heavy_x, found[n, 1] + heavy_y
+            found[n, 8] = math.sqrt(shape[0] ** 2 + shape[1] ** 2)
+            found[n, 9], found[n, 10], found[n, 11], found[n, 12] = grey[1], grey[2], shape[0], shape[1]
+            status[n] = np.uint8(found[n, 4] < _F(SPOKES // 2))
+
+    return find
 
 
 def _cut(image: NDArray[Any], place: NDArray[Any]) -> tuple[NDArray[Any], int, int]:
@@ -463,10 +514,12 @@ def _case(device: Device, count: int) -> Case:
     found, covariance = np.empty((count, 13), np.float32), np.empty((count, 3, 3), np.float32)
     status, noise = np.empty(count, np.uint8), _F(math.hypot(NOISE, math.sqrt(1.0 / 12.0)))
 
-    def fused() -> None:
-        _find(image, places, numbers, directions, noise, found, covariance, status)
-
-    fused()
+    calls: dict[str, Callable[[], object]] = {}
+    for name, form in _FORMS.items():
+        calls[name] = functools.partial(form, image, places, numbers, directions, noise, found, covariance, status)
+        found[...], status[...] = np.nan, 255
+        calls[name]()
+        _check_peer(blobs, found, status)
     ours = np.stack([to_numpy(blobs.x), to_numpy(blobs.y)], axis=-1)
     metadata = {
         "blobs": count,
@@ -475,8 +528,26 @@ def _case(device: Device, count: int) -> Case:
         "opencv_deviation_px": _deviation(_moments(image, places), true),
         "ellipse_deviation_px": _deviation(_ellipses(image, places), true),
     }
-    peers: dict[str, Callable[[], object]] = {"numba": fused, "opencv": lambda: _moments(image, places)}
+    peers: dict[str, Peer] = {
+        "numba": calls,
+        "numba-plain": calls["triples"],
+        "opencv": lambda: _moments(image, places),
+    }
     return Case("blob", str(count), bound.run, peers, float(np.max(np.abs(ours - true))), metadata=metadata)
+
+
+# Forms of the Numba peer: how the first circle is found, on all cores or on one.
+_find_triples = _find_form(_start, True)
+_find_lanes = _find_form(_start_in_lanes, True)
+_find_lanes_serial = _find_form(_start_in_lanes, False)
+_FORMS = {"triples": _find_triples, "lanes": _find_lanes, "lanes-serial": _find_lanes_serial}
+
+
+def _check_peer(blobs: Any, found: NDArray[Any], status: NDArray[Any]) -> None:
+    """Raise an AssertionError if a peer has other results than our measurement."""
+    np.testing.assert_array_equal(status, to_numpy(blobs.status))
+    for column, name in ((0, "x"), (1, "y")):
+        np.testing.assert_allclose(found[:, column], to_numpy(getattr(blobs, name)), rtol=0.0, atol=_DIFFERENCE)
 
 
 def _deviation(found: NDArray[Any], true: NDArray[Any]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -279,8 +280,10 @@ def test_group_sizes_odd_counts_and_unaligned_arrays(name: str, group_size: int,
     planar = name == "psd planar"
     inputs = [np.ascontiguousarray(each[:, :count] if planar else each[:count]) for each in whole]
     outputs = trace(operation, inputs, group_size=group_size, offset=offset).outputs
+    # The interpreter runs the work-item variant. The vector variant of the triangulation rounds once more.
+    expected = replace(operation, variant="work_item")(*inputs)
     for field, value in outputs.items():
-        np.testing.assert_array_equal(value, getattr(operation(*inputs), field))
+        np.testing.assert_array_equal(value, getattr(expected, field))
 
 
 @needs_compilers

@@ -70,8 +70,7 @@ class Bound(Generic[R]):
         self.operation, self.device = operation, device
         self.queue = device.queue if queue is None else queue
         self._launch = launch
-        self._computed_specs = {name: spec for name, spec in launch.outputs.items() if spec is not None}
-        self._input_specs = launch.inputs
+        self._set_specs(launch.inputs, launch.outputs)
         self._global, self._local = launch.global_size, launch.local_size  # `fit_work` may halve the groups
         # `Device.wait` with its branch on the runtime resolved here: a short call takes only a few microseconds in
         # total.
@@ -83,9 +82,6 @@ class Bound(Generic[R]):
         after_inputs = enumerate(launch.outputs.values(), len(launch.inputs))
         # Indices of the input and output arrays among the kernel's arguments.
         self._places = [*range(len(launch.inputs)), *(place for place, spec in after_inputs if spec is not None)]
-        fields = operation.Result._fields
-        self._absent = [launch.outputs.get(name) is None for name in fields]
-        self._computed_fields = [fields.index(name) for name in self._computed_specs]
         self._own_outputs = self._computed(self.outputs)
         self._own = (*self.inputs, *self._own_outputs)
         self._array_specs = (*launch.inputs, *self._computed_specs.values())
@@ -95,6 +91,14 @@ class Bound(Generic[R]):
             self._enqueue(self._own).wait()
         except cl.Error as error:
             self._raise(error)
+
+    def _set_specs(self, inputs: Sequence[Spec], outputs: Mapping[str, Spec | None]) -> None:
+        """Set the specifications of the arrays, and which fields of the result are computed."""
+        self._input_specs = inputs
+        self._computed_specs = {name: spec for name, spec in outputs.items() if spec is not None}
+        fields = self.operation.Result._fields
+        self._absent = [outputs.get(name) is None for name in fields]
+        self._computed_fields = [fields.index(name) for name in self._computed_specs]
 
     def _connect(self, launch: Launch) -> None:
         """Upload the tables, and build the kernel for calls that run inline."""

@@ -133,8 +133,7 @@ class BoundSequence(Bound[R]):
         self.queue = device.queue if queue is None else queue
         self._empty = False
         self._layout = layout
-        self._input_specs = specs.inputs
-        self._computed_specs = {field: spec for field, spec in specs.outputs.items() if spec is not None}
+        self._set_specs(specs.inputs, specs.outputs)
         self.inputs = tuple(inputs) or self._new_inputs(specs.inputs)
         arrays: dict[str, Any] = dict(zip(layout.inputs, self.inputs, strict=True))
         self.stages: dict[str, Bound[Any]] = {}

@@ -1,0 +1,123 @@
+"""Sequences called on NumPy arrays and device arrays, with and without shared memory, against NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from gpuvision.host import Device, Launch, LaunchBuilder, Layout, Operation, OperationSequence, Stage, Trace
+
+# Integers, whose results do not depend on rounding.
+SOURCE = """
+kernel void scale(global const int *in, global int *scaled, global int *parity, const int factor, const int count) {
+    const int i = get_global_id(0);
+    if (i >= count) return;
+    scaled[i] = factor * in[i];
+    if (parity) parity[i] = in[i] & 1;
+}
+"""
+FRAME = np.arange(-5, 95, dtype=np.int32)
+
+
+class Scaled(NamedTuple):
+    """Result of `Scale`."""
+
+    scaled: Any
+    parity: Any
+
+
+@dataclass(frozen=True)
+class Scale(Operation[Scaled]):
+    """Integers times a factor, and their parities."""
+
+    Result = Scaled
+    factor: int = 2
+    with_parity: bool = True
+
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        build = LaunchBuilder(self, device, shape, dtype, variant="work_item")
+        shapes = {"scaled": shape, "parity": shape if self.with_parity else None}
+        return build.launch(
+            "scale.cl",
+            "scale",
+            work=build.work(shape[0], each=1, group=8),
+            outputs=build.outputs(shapes, scaled=np.int32, parity=np.int32),
+            arguments=[np.int32(self.factor), np.int32(shape[0])],
+        )
+
+
+class Chained(NamedTuple):
+    """Result of `Chain`, whose fields are not in the order of its stages."""
+
+    last: Any
+    nothing: Any
+    parity: Any
+    first: Any
+
+
+@dataclass(frozen=True)
+class Chain(OperationSequence[Chained]):
+    """Twice the input, its parity, and six times the input."""
+
+    Result = Chained
+
+    def layout(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Layout:
+        stages = [
+            Stage("double", Scale(), ("frame",)),
+            Stage("triple", Scale(3, with_parity=False), ("double.scaled",)),
+        ]
+        outputs = {"last": "triple.scaled", "nothing": None, "parity": "double.parity", "first": "double.scaled"}
+        return Layout({"frame": (shape, dtype)}, stages, outputs)
+
+
+@pytest.fixture(autouse=True)
+def _kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "scale.cl").write_text(SOURCE)
+    monkeypatch.setattr(Scale, "kernel_folder", tmp_path)
+
+
+def check(result: Chained, frame: Any) -> None:
+    np.testing.assert_array_equal(result.first, 2 * frame)
+    np.testing.assert_array_equal(result.last, 6 * frame)
+    np.testing.assert_array_equal(result.parity, frame % 2)
+    assert result.nothing is None
+
+
+def test_numpy_arrays(memory: dict[str, Any]) -> None:
+    device = memory["device"]
+    check(Chain()(FRAME, device=device), FRAME)
+    bound = Chain().bind(device, FRAME.shape, FRAME.dtype)
+    for frame in (FRAME, FRAME[::-1].copy()):
+        check(bound.on_host([frame]), frame)
+
+
+def test_given_outputs_are_written(memory: dict[str, Any]) -> None:
+    last, parity, first = (np.full_like(FRAME, -99) for _ in range(3))
+    out = Chained(last, None, parity, first)
+    assert Chain()(FRAME, device=memory["device"], out=out) is out
+    check(out, FRAME)
+
+
+def test_outputs_that_are_missing_or_not_computed_are_refused(device: Device) -> None:
+    bound = Chain().bind(device, FRAME.shape, FRAME.dtype)
+    last, nothing, parity, first = (np.empty_like(FRAME) for _ in range(4))
+    with pytest.raises(ValueError, match=r"out.nothing is not computed; expected None"):
+        bound.on_host([FRAME], Chained(last, nothing, parity, first))
+    with pytest.raises(ValueError, match=r"out.first is missing"):
+        bound.on_host([FRAME], Chained(last, None, parity, None))
+
+
+def test_device_arrays(device: Device) -> None:
+    bound = Chain().bind(device, FRAME.shape, FRAME.dtype)
+    bound.inputs[0].set(FRAME)
+    check(Chained(*(None if each is None else each.get() for each in bound.run())), FRAME)
+
+
+def test_a_traced_sequence_gives_the_same_result(memory: dict[str, Any], tmp_path: Path) -> None:
+    with Trace(tmp_path / "trace.json"):
+        result = Chain()(FRAME, device=memory["device"])
+    check(result, FRAME)

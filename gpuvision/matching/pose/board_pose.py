@@ -426,7 +426,7 @@ class BoardPoseEstimator(OperationSequence[BoardPoseEstimate]):
         inputs: Sequence[DeviceArray],
     ) -> Bound[BoardPoseEstimate]:
         if uses_vectors(self.ruler.variant, device):
-            return Bound(self, device, shape, dtype, queue, inputs)
+            return Operation._bound_to(self, device, shape, dtype, queue, inputs)
         return super()._bound_to(device, shape, dtype, queue, inputs)
 
     @property

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ import pyopencl as cl
 import pytest
 
 from canary import Guarded
-from gpuvision.host import Device
+from gpuvision.host import Device, Trace
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.pose.board_pose import BoardPoseEstimator, place_rulers
 from gpuvision.matching.pose.pose import SolvePose, line_rows
@@ -224,6 +226,15 @@ def test_place_of_lines_on_the_board(device: Device, rng: np.random.Generator) -
     result = operation()(image, rulers, lines, device=device)
     # Two rows of a line, 24 in all: about sigma^2 / 12 in each direction, taken for independent.
     assert np.sqrt(result.covariance[0, 0]) > 1e-6 / np.sqrt(12)
+
+
+@VARIANTS
+def test_a_trace_records_the_launches(device: Device, variant: Any, rng: np.random.Generator, tmp_path: Path) -> None:
+    with Trace(tmp_path / "trace.json"):
+        operation(variant)(picture(rng), *board_rulers(), device=device)
+    events = json.loads((tmp_path / "trace.json").read_text())["traceEvents"]
+    found = {(each["name"], each["args"].get("of")) for each in events}
+    assert ("run", "BoardPoseEstimator") in found
 
 
 def test_work_items_have_no_single_launch() -> None:

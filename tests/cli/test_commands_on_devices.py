@@ -126,6 +126,7 @@ JOBS: dict[str, Callable[[Path], Words]] = {
     "devices": lambda _: [],
     "profile": lambda _: ["psd", "--seconds", 0.01],
     "curves": lambda _: ["pose", "--seconds", 0.01],
+    "tune": lambda _: ["merge_heights", "--dry-run"],
 }
 # Jobs whose result is refused, in one line, because a driver computes it wrongly; see `driver_faults`.
 REFUSED = {("rusticl", "22.3"): ("locate", "place")}
@@ -142,7 +143,7 @@ def test_each_command_has_a_job() -> None:
 def test_a_command_does_its_job_or_gives_the_reason_in_one_line(job: str, label: str, tmp_path: Path) -> None:
     device = Device.named(label)
     words = [job.split()[0], *map(str, JOBS[job](tmp_path))]
-    if words[0] in ("profile", "curves"):  # without the option it measures all devices
+    if words[0] in ("profile", "curves", "tune"):  # without the option it measures all devices
         words += ["--device", label]
     code = SHORTER.get(job, "") + MAIN
     environment = os.environ | {"GPUVISION_DEVICE": label}

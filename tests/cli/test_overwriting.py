@@ -185,6 +185,7 @@ ROBOT = ("locate-robot", "in.npy", "--field", "robocup_msl", "--out", "out")
         (("profile", "psd", "--plots", "out"), "out/growth.png"),
         (("curves", "psd", "--json", "r.json"), "r.json"),
         (("curves", "psd", "--plots", "out"), "out/curve-psd.png"),
+        (("tune", "psd", "--json", "r.json"), "r.json"),
         (("demo", "--out", "out"), "out/part.ply"),
         (("demo", "--out", "out"), "out/psd_line_masked/mask.txt"),
     ],

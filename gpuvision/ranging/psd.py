@@ -218,8 +218,9 @@ class PsdReadout(VisionOperation[PsdReading]):
     """
 
     Result: ClassVar[type[Any]] = PsdReading
+    # Not the variant: with a triangulation the variants round differently.
     tunable: ClassVar[Tunable | None] = Tunable(
-        strips=(1024, 2048, 4096, 8192, 16384, 65536), groups=(32, 64, 128, 256), variants=True
+        strips=(1024, 2048, 4096, 8192, 16384, 65536), groups=(32, 64, 128, 256)
     )
 
     strip_length: float

@@ -25,7 +25,9 @@ from gpuvision.host.tuned_settings import (
 )
 from gpuvision.host.tuning import TuningResult, tune
 from gpuvision.profiling import tuning_inputs
+from gpuvision.ranging.merge_heights import MergeHeights
 from gpuvision.ranging.psd import PsdReadout
+from gpuvision.ranging.triangulation import Triangulation
 
 SINGLE = np.dtype(np.float32)
 # `doubled` is right for every group. `wrong` depends on the group, is not written in groups of 32, and is not
@@ -201,6 +203,12 @@ def test_all_offered_settings_give_the_default_result(name: str, device: Device)
         assert result.best == DEFAULTS
 
 
+@pytest.mark.parametrize("operation", [PsdReadout, Triangulation])
+def test_variants_that_round_differently_are_not_offered(operation: type[Operation[Any]]) -> None:
+    assert operation.tunable is not None
+    assert not operation.tunable.allows(TunedSettings(variant="work_item"))
+
+
 def entry(device: Device, settings: TunedSettings, **changes: Any) -> TunedEntry:
     return replace(entry_of(PsdReadout(strip_length=6e-3), device, (1000, 2), SINGLE, settings, 1.5), **changes)
 
@@ -260,9 +268,10 @@ def test_launches_up_to_2_mib_run_inline_as_tuned(
 
 @pytest.mark.usefixtures("cache")
 def test_an_explicit_variant_stays(device: Device) -> None:
-    keep_entries([entry(device, TunedSettings(variant="work_item"))], [])
+    merge = MergeHeights(tolerance=1e-5)
+    keep_entries([entry_of(merge, device, (1000,), SINGLE, TunedSettings(variant="work_item"), 1.5)], [])
     auto, explicit = (
-        LaunchBuilder(PsdReadout(strip_length=1.0), device, (1000, 2), SINGLE, variant=variant)
+        LaunchBuilder(merge, device, (1000,), SINGLE, variant=variant)
         for variant in ("auto", "vector" if device.takes_vectors else "work_item")
     )
     assert not auto.uses_vectors

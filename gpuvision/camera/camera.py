@@ -205,9 +205,17 @@ class Camera:
         with np.errstate(over="ignore"):
             return np.concatenate(parts).astype(real)
 
-    def newton_steps(self, real: npt.DTypeLike) -> int:
-        """Return CAMERA_STEPS for ``camera_undistort``: Newton steps after which most pixels have converged."""
-        return _inverse_start(self, self._principal_region).newton_steps(real)
+    def undistort_defines(self, real: npt.DTypeLike) -> dict[str, Define]:
+        """Return the defines of ``kernels/common/camera.h`` for ``camera_undistort``, in addition to `defines`.
+
+        If the number of Newton steps after which most points have converged is enough for every point in the image,
+        the kernel takes these steps without a test.
+        """
+        start = _inverse_start(self, self._principal_region)
+        steps, settled = start.newton_steps(real), start.settled_steps(real)
+        if settled is None or settled > steps:
+            return {"CAMERA_STEPS": steps}
+        return {"CAMERA_STEPS": settled, **flags(CAMERA_SURE=True)}
 
     def correction_defines(self, real: npt.DTypeLike, unit: float, region: Region | None = None) -> dict[str, Define]:
         """Return the defines of ``kernels/common/camera.h`` for ``camera_correction``.

@@ -138,14 +138,19 @@ class InverseStart:
         return np.array(iterates)
 
     @cached_property
-    def _largest_errors(self) -> Float64:
-        """Largest error of a displacement before the kernel's steps and after each, on points between the fit's own."""
+    def _test_points(self) -> tuple[Float64, Float64, Float64]:
+        """Points (n, 2) between the points of the fit, their exact displacements, and their radii (n,)."""
         radii = np.sqrt(self._reach) * (np.arange(_TEST_RADII) + 1.0) / _TEST_RADII
         angles = (np.arange(_TEST_DIRECTIONS) + 0.5) * (2.0 * math.pi / _TEST_DIRECTIONS)
         points = (radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1)).reshape(-1, 2)
-        exact = invert_displacement(self._lens, points) - points
-        errors = np.max(np.abs(self._iterates(points) - exact), axis=(1, 2))
-        return np.asarray(np.where(np.isfinite(errors), errors, math.inf))
+        return points, invert_displacement(self._lens, points) - points, np.repeat(radii, _TEST_DIRECTIONS)
+
+    @cached_property
+    def _test_errors(self) -> Float64:
+        """Errors on the test points before the kernel's steps and after each, (1 + steps, points, 2)."""
+        points, exact, _ = self._test_points
+        errors = np.abs(self._iterates(points) - exact)
+        return np.where(np.isfinite(errors), errors, math.inf)
 
     def sure_steps(self, tolerance: float) -> int | None:
         """Return the number of steps, possibly 0, after which every point within the reach is exact to ``tolerance``.
@@ -160,8 +165,21 @@ class InverseStart:
         int or None
             None if no number of steps suffices: a part of the reach lies close to the fold.
         """
-        enough = np.flatnonzero(self._largest_errors <= tolerance)
-        return int(enough[0]) if len(enough) else None
+        return _first(np.max(self._test_errors, axis=(1, 2)) <= tolerance)
+
+    def settled_steps(self, real: npt.DTypeLike) -> int | None:
+        """Return the number of steps after which every point within the reach passes the kernel's test of convergence.
+
+        The test accepts errors up to sqrt(CAMERA_LEFT) times the radius of the point. The errors on the polar grid,
+        in float64, are held to half of this.
+
+        Returns
+        -------
+        int or None
+            None if no number of steps suffices.
+        """
+        relative = np.hypot(*np.moveaxis(self._test_errors, -1, 0)) / self._test_points[2]
+        return _first(np.max(relative, axis=1) <= 0.5 * math.sqrt(_LEFT[np.dtype(real)][0]))
 
     @cached_property
     def _shrinkage(self) -> float:
@@ -170,6 +188,11 @@ class InverseStart:
         with np.errstate(all="ignore"):
             ratios = np.sqrt(errors[0] / np.maximum(sizes[0], np.finfo(np.float64).tiny))
         return float(np.clip(np.nanquantile(ratios, _CONVERGED_SHARE), 1e-4, 1.0))
+
+
+def _first(enough: npt.NDArray[np.bool_]) -> int | None:
+    """Return the index of the first true element; None if there is none."""
+    return int(np.argmax(enough)) if np.any(enough) else None
 
 
 def _values(z: Float64, terms: Any) -> Float64:

@@ -15,9 +15,9 @@
 // Options: only terms that are not zero are compiled. CAMERA; CAMERA_RADIAL and CAMERA_RATIONAL: number of coefficients
 //          (0 to 3) of k1.. and k4..; CAMERA_DECENTRED: p and s; CAMERA_PRISM: s2 and s4; CAMERA_TILTED;
 //          CAMERA_MATRICES: the ideal pixels have another camera matrix; CAMERA_STEPS: Newton steps after which most
-//          points have converged (Camera.newton_steps); it compiles camera_undistort. CAMERA_SURE: the host has verified
-//          that these steps, possibly 0, reach rounding within the reach of the start polynomials
-//          (Camera.correction_options); the steps are not tested then.
+//          points have converged (Camera.undistort_defines); it compiles camera_undistort. CAMERA_SURE: the host has
+//          verified that these steps, possibly 0, are enough on a grid of points within the reach of the start
+//          polynomials (Camera.undistort_defines and correction_defines); the steps are not tested then.
 // Tables:  Camera.packed in camera.py, one per direction, with the entries CAMERA_...
 #ifndef CAMERA_H
 #define CAMERA_H

@@ -48,8 +48,16 @@ def _points(rng: np.random.Generator, camera: Camera, reach: float) -> tuple[np.
     return distorted[within], (ideal - distorted)[within]
 
 
-def _largest_errors(device: Device, camera: Camera, points: np.ndarray, back: np.ndarray, steps: int) -> list[float]:
-    """Return the largest error of the kernel after 0, 1, ... steps."""
+def _largest_errors(
+    device: Device,
+    camera: Camera,
+    points: np.ndarray,
+    back: np.ndarray,
+    steps: int,
+    *,
+    unit: object = 1.0,
+) -> list[float]:
+    """Return the largest error of the kernel after 0, 1, ... steps, in a unit, which may differ between the points."""
     table = camera.packed(np.float64, "undistort")
     defines = {**camera.defines(), "CAMERA_SURE": None, "REAL_IS_DOUBLE": None}
     defines["CAMERA_STEPS"] = f"(int)camera[{len(table)}]"
@@ -59,7 +67,7 @@ def _largest_errors(device: Device, camera: Camera, points: np.ndarray, back: np
     for count in range(steps):
         entries = cl.array.to_device(queue, np.append(table, float(count)))
         approach(queue, (len(points),), None, m.data, moved.data, entries.data)
-        found.append(float(np.max(np.abs(moved.get() - back))))
+        found.append(float(np.max(np.abs(moved.get() - back) / unit)))
     return found
 
 
@@ -85,3 +93,32 @@ def test_each_step_is_as_exact_as_the_host_says(
             assert start.sure_steps(1.1 * error) <= count
             assert start.sure_steps(0.9 * error) == count + 1
     assert start.sure_steps(1e-18) is None
+
+
+@pytest.mark.double
+@pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
+@pytest.mark.parametrize("coefficients", [RADIAL, DECENTRED], ids=["radial", "decentred"])
+def test_steps_without_a_test_leave_errors_that_the_test_accepts(
+    device: Device, coefficients: tuple[float, ...], rng: np.random.Generator
+) -> None:
+    """The test in single precision accepts squared errors of CAMERA_LEFT, 1e-15 of the squared radius."""
+    camera = _camera(coefficients)
+    steps = camera.inverse_start(REGION).settled_steps(np.float32)
+    reach = 1.0 / camera.packed(np.float64, "undistort")[31]
+    points, back = _points(rng, camera, reach)
+    radius = np.hypot(*points.T)[:, None]
+    errors = _largest_errors(device, camera, points, back, steps + 1, unit=radius)
+    assert errors[steps] < math.sqrt(1e-15)
+    fewer = errors[steps - 1] if steps else math.inf
+    assert fewer > 0.5 * math.sqrt(1e-15)
+
+
+def test_a_lens_without_distortion_needs_no_step() -> None:
+    assert _camera((1e-12,)).inverse_start(REGION).settled_steps(np.float32) == 0
+
+
+def test_a_strong_lens_is_tested() -> None:
+    """Near the fold, the steps after which most points have converged are not enough for all."""
+    camera = _camera((-0.9, 0.0, 0.02, -0.03))
+    assert "CAMERA_SURE" not in camera.undistort_defines(np.float32)
+    assert camera.undistort_defines(np.float32)["CAMERA_STEPS"] > 1

@@ -182,7 +182,7 @@ class CameraFeatures:
     def model_defines(self, real: np.dtype[Any]) -> dict[str, Define]:
         """Return the build options of ``feature_lens.h``."""
         if isinstance(self.model, Camera):
-            return {**self.model.defines(), "CAMERA_STEPS": self.model.newton_steps(real)}
+            return {**self.model.defines(), **self.model.undistort_defines(real)}
         return {} if self.model is None else dict(self.model.defines)
 
     def model_table(self, real: np.dtype[Any], direction: Direction) -> npt.NDArray[Any] | None:

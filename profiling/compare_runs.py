@@ -1,7 +1,8 @@
 """Comparison of two benchmark runs: whether their ratios agree within their confidence intervals.
 
-``python -m gpuvision.profiling.compare_runs FIRST.json SECOND.json`` lists the rows that do not agree, and the share of
-the rows that do. The exit code is 1 if fewer than 90 % agree.
+``python -m gpuvision.profiling.compare_runs FIRST.json SECOND.json`` lists the rows that are not compared, with the
+reason, the rows that do not agree, and the share of the rows that do. The exit code is 1 if fewer than 90 % agree, or
+if a run is invalid because the machine changed its speed.
 
 Two medians with 95 % confidence intervals of rounds within a run agree if the intervals overlap. The intervals hold the
 spread within a run; the spread between runs (place of the arrays in memory, frequency) comes on top.
@@ -15,7 +16,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-_CONFIDENCE = 0.95
+from gpuvision.profiling.rounds import stated_interval
+
 _AGREEING = 0.9  # smallest share of agreeing rows
 _KEYS = ("operation", "case", "device", "peer")
 
@@ -41,25 +43,36 @@ class Change(NamedTuple):
 
 def compare(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[Change]:
     """Return the change of each row that both runs contain with 95 % confidence and with the same form of the peer."""
-    others = {_key(row): row for row in second["rows"] if _stated(row)}
-    return [
-        Change(
-            " ".join(_key(row)[:-1]),
-            row["ratio"],
-            other["ratio"],
-            row["ratio_low"] <= other["ratio_high"] and other["ratio_low"] <= row["ratio_high"],
-        )
-        for row in first["rows"]
-        if _stated(row) and (other := others.get(_key(row)))
-    ]
+    one, other = _by_name(first), _by_name(second)
+    changes = []
+    for name in one.keys() & other.keys():
+        mine, theirs = stated_interval(one[name]), stated_interval(other[name])
+        if mine is not None and theirs is not None and _form(one[name]) == _form(other[name]):
+            agree = mine[0] <= theirs[1] and theirs[0] <= mine[1]
+            changes.append(Change(name, one[name]["ratio"], other[name]["ratio"], agree))
+    return sorted(changes)
 
 
-def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
-    return (*(row[name] for name in _KEYS), row.get("form", ""))
+def left_out(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    """Return a line with the reason for each row that `compare` leaves out."""
+    one, other = _by_name(first), _by_name(second)
+    lines = [f"{name}: only in the first run" for name in sorted(one.keys() - other.keys())]
+    lines += [f"{name}: only in the second run" for name in sorted(other.keys() - one.keys())]
+    for name in sorted(one.keys() & other.keys()):
+        forms = _form(one[name]), _form(other[name])
+        if forms[0] != forms[1]:
+            lines.append(f"{name}: the fastest form is {forms[0]!r} in the first run, {forms[1]!r} in the second one")
+        elif any(stated_interval(each[name]) is None for each in (one, other)):
+            lines.append(f"{name}: no interval with 95 % confidence")
+    return lines
 
 
-def _stated(row: Mapping[str, Any]) -> bool:
-    return (row.get("confidence") or 0.0) >= _CONFIDENCE
+def _by_name(run: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    return {" ".join(row[key] for key in _KEYS): row for row in run["rows"]}
+
+
+def _form(row: Mapping[str, Any]) -> str:
+    return str(row.get("form", ""))
 
 
 def report(changes: Sequence[Change]) -> list[str]:
@@ -74,9 +87,14 @@ def report(changes: Sequence[Change]) -> list[str]:
 
 def main(paths: Sequence[str]) -> int:
     """Print the report of two files; return the exit code."""
-    changes = compare(*(json.loads(Path(path).read_text()) for path in paths))
-    print("\n".join(report(changes)))
-    return int(sum(each.agree for each in changes) < _AGREEING * len(changes) or not changes)
+    first, second = (json.loads(Path(path).read_text()) for path in paths)
+    changes = compare(first, second)
+    invalid = [path for path, run in zip(paths, (first, second), strict=True) if not run["valid"]]
+    lines = [f"{path} is not valid: the machine changed its speed during the measurement" for path in invalid]
+    lines += [f"not compared: {line}" for line in left_out(first, second)]
+    print("\n".join([*lines, *report(changes)]))
+    agreeing = sum(each.agree for each in changes) >= _AGREEING * len(changes)
+    return int(bool(invalid) or not changes or not agreeing)
 
 
 if __name__ == "__main__":

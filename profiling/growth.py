@@ -31,7 +31,7 @@ from gpuvision.profiling import (
     triangulation,
     undistort_points,
 )
-from gpuvision.profiling.harness import Probe, describe_machine, probe_of
+from gpuvision.profiling.harness import Failure, Probe, bind_with, describe_machine, failure_of, probe_of
 from gpuvision.profiling.rounds import median_interval, take_turns
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.merge_heights import MergeHeights
@@ -43,7 +43,6 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance
 
 Inputs = Sequence[NDArray[Any]]
-Prepare = Callable[[int], tuple[Operation[Any], Inputs]]
 _DISTINCT = 1 << 16  # items that differ; larger inputs repeat them
 _GROWTH = 4  # factor from one size to the next
 _LONGEST = 1.0  # duration of a call after which an operation is not measured with more items [s]
@@ -57,12 +56,30 @@ class Workload:
     ----------
     item
         Name of an item.
-    prepare
-        Function that returns the operation and its inputs for a number of items.
+    operation
+        Function that returns the operation for a number of items.
+    samples
+        Inputs with items that differ. Larger inputs repeat them.
+    axes
+        Axis of the items in each input; None: the input is the same for each number of items.
     """
 
     item: str
-    prepare: Prepare
+    operation: Callable[[int], Operation[Any]]
+    samples: Inputs
+    axes: Sequence[int | None]
+
+    def first_shape(self, items: int) -> tuple[int, ...]:
+        """Return the shape of the first input for a number of items."""
+        shape, axis = self.samples[0].shape, self.axes[0]
+        return shape if axis is None else (*shape[:axis], items, *shape[axis + 1 :])
+
+    def inputs(self, items: int) -> Inputs:
+        """Return the inputs for a number of items."""
+        return [
+            each if axis is None else np.ascontiguousarray(np.take(each, np.arange(items), axis=axis, mode="wrap"))
+            for each, axis in zip(self.samples, self.axes, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -91,23 +108,15 @@ class Point:
     high: float
 
 
-def _repeated(
-    operation: Operation[Any], inputs: Inputs, axis: int = 0
-) -> Callable[[int], tuple[Operation[Any], Inputs]]:
-    """Return a function that repeats the items of some inputs along an axis."""
-
-    def prepare(items: int) -> tuple[Operation[Any], Inputs]:
-        which = np.arange(items) % inputs[0].shape[axis]
-        return operation, [np.ascontiguousarray(np.take(each, which, axis=axis)) for each in inputs]
-
-    return prepare
+def _repeated(item: str, operation: Operation[Any], samples: Inputs, axis: int = 0) -> Workload:
+    """Return the workload of an operation that is the same for each number of items."""
+    return Workload(item, lambda _: operation, samples, [axis] * len(samples))
 
 
-def _rulers(items: int) -> tuple[Operation[Any], Inputs]:
-    operation = RulerEdges(
+def _rulers(items: int) -> Operation[Any]:
+    return RulerEdges(
         threshold=ruler.THRESHOLD, length=ruler.LENGTH, width=ruler.WIDTH, smoothing_px=ruler.SMOOTHING, count=items
     )
-    return operation, ruler.scene(items)
 
 
 def _heights() -> Inputs:
@@ -137,17 +146,17 @@ def workloads() -> dict[str, Workload]:
     segments, receivers = line_irradiance.wall(64, _DISTINCT)
     lines = FitLines(scale=1.0, weighted=True, max_trials=line_fit.TRIALS, max_iterations=line_fit.STEPS)
     return {
-        "psd": Workload("sample", _repeated(readout, [psd.scan_currents("float32", _DISTINCT)], axis=1)),
-        "line": Workload("frame", _repeated(LineReadout(method="centroid"), [line.line_frames(4)])),
-        "triangulation": Workload("point", _repeated(sheet, places)),
-        "merge_heights": Workload("cell", _repeated(MergeHeights(sigma=False, tolerance=1e-4), _heights())),
-        "points": Workload("point", _repeated(UndistortPoints(model=undistort_points.STANDARD), [pixels])),
-        "line_fit": Workload("line", _repeated(lines, line_fit.scene(20))),
-        "ruler": Workload("ruler", _rulers),
-        "reflectance": Workload("direction", _repeated(Reflectance(model=Ggx(alpha=0.2, f0=0.9)), [directions])),
-        "reflections": Workload("receiver", _repeated(LineIrradiance(segments=segments), [receivers])),
-        "any_hit": Workload("ray", _repeated(AnyHit(scene=scene), [shadow])),
-        "closest_hit": Workload("ray", _repeated(ClosestHit(scene=scene), [view])),
+        "psd": _repeated("sample", readout, [psd.scan_currents("float32", _DISTINCT)], axis=1),
+        "line": _repeated("frame", LineReadout(method="centroid"), [line.line_frames(4)]),
+        "triangulation": _repeated("point", sheet, places),
+        "merge_heights": _repeated("cell", MergeHeights(sigma=False, tolerance=1e-4), _heights()),
+        "points": _repeated("point", UndistortPoints(model=undistort_points.STANDARD), [pixels]),
+        "line_fit": _repeated("line", lines, line_fit.scene(20)),
+        "ruler": Workload("ruler", _rulers, ruler.scene(_DISTINCT), (None, 0)),
+        "reflectance": _repeated("direction", Reflectance(model=Ggx(alpha=0.2, f0=0.9)), [directions]),
+        "reflections": _repeated("receiver", LineIrradiance(segments=segments), [receivers]),
+        "any_hit": _repeated("ray", AnyHit(scene=scene), [shadow]),
+        "closest_hit": _repeated("ray", ClosestHit(scene=scene), [view]),
     }
 
 
@@ -160,6 +169,8 @@ def measure_growth(
     progress: Callable[[str], None] = lambda line: None,
 ) -> Growth:
     """Measure operations from one item to a limit of memory.
+
+    An operation that raises an exception is added to the failures; the other operations are still measured.
 
     Parameters
     ----------
@@ -176,27 +187,34 @@ def measure_growth(
     """
     points: list[Point] = []
     probes: list[Probe] = []
+    failures: list[Failure] = []
     known = workloads()
+    machine = describe_machine(devices)  # before the measurement: a device without times fails at once
     for name in operations or known:
         for device in devices:
             progress(f"{name} on {device.label}")
-            before = ceiling.flop_rate(device)
-            points += _curve(name, known[name], device, memory, seconds)
-            probes.append(probe_of(name, device, before))
-    caches = {each.label: int(each.handle.global_mem_cache_size) for each in devices}
-    return Growth(points, probes, caches, describe_machine(devices))
+            try:
+                before = ceiling.flop_rate(device)
+                curve = list(_curve(name, known[name], device, memory, seconds))
+                probes.append(probe_of(name, device, before))
+            except Exception as error:
+                failures.append(failure_of(name, device, error))
+                progress(f"  failed: {failures[-1].reason}")
+                continue
+            points += curve
+            if not curve:
+                progress(f"  not measured: inputs and outputs of one {known[name].item} exceed {memory} bytes")
+    return Growth(points, probes, {each.label: each.cache_bytes for each in devices}, machine, failures)
 
 
 def _curve(name: str, workload: Workload, device: Device, memory: int, seconds: float) -> Iterator[Point]:
     items = 1
     while True:
-        operation, inputs = workload.prepare(items)
-        size = operation.specs(device, inputs[0].shape, inputs[0].dtype).nbytes
+        operation = workload.operation(items)
+        size = operation.specs(device, workload.first_shape(items), workload.samples[0].dtype).nbytes
         if size > memory:
             return
-        bound = operation.bind(device, inputs[0].shape, inputs[0].dtype)
-        for array, values in zip(bound.inputs, inputs, strict=True):
-            array.set(values)
+        bound = bind_with(operation, device, *workload.inputs(items))
         times = take_turns({"": bound.run}, seconds, always="")[""]
         interval = median_interval(times)
         median = float(np.median(times))
@@ -221,7 +239,12 @@ def launch_knee(points: Sequence[Point]) -> float | None:
 
 
 def cache_knee(points: Sequence[Point], cache: int) -> float | None:
-    """Return the number of items whose inputs and outputs fill a cache [bytes]; None if all of them fit."""
+    """Return the number of items whose inputs and outputs fill a cache [bytes]; None if all of them fit.
+
+    If already the first point exceeds the cache, its number of items is returned.
+    """
+    if points[0].bytes >= cache:
+        return float(points[0].items)
     for before, after in itertools.pairwise(points):
         if after.bytes >= cache > before.bytes:
             return float(np.interp(cache, [before.bytes, after.bytes], [before.items, after.items]))
@@ -239,15 +262,18 @@ class Growth:
     probes
         Speed of the machine before and after each curve.
     caches
-        Largest cache by the label of the device, as its runtime reports it [bytes].
+        Last-level cache by the label of the device, at least 32 MiB: see `Device.cache_bytes` [bytes].
     machine
         Description of the machine, see `harness.describe_machine`.
+    failures
+        Operations without points, because their measurement raised an exception.
     """
 
     points: Sequence[Point]
     probes: Sequence[Probe]
     caches: Mapping[str, int]
     machine: Mapping[str, Any]
+    failures: Sequence[Failure] = ()
 
     @property
     def curves(self) -> dict[tuple[str, str], list[Point]]:
@@ -279,6 +305,7 @@ class Growth:
             "machine": self.machine,
             "caches": self.caches,
             "probes": [asdict(probe) for probe in self.probes],
+            "failures": [asdict(failure) for failure in self.failures],
             "growth": [asdict(point) for point in self.points],
         }
         return json.dumps(table, indent=1) + "\n"

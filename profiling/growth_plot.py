@@ -32,7 +32,14 @@ def draw_growth(folder: str | Path, growth: Growth, *, overwrite: bool = False) 
     """Draw the curves into a folder, as PNG; return the name of the file.
 
     A triangle marks the launch knee of a curve, a square its cache knee.
+
+    Raises
+    ------
+    ValueError
+        There are no points.
     """
+    if not growth.points:
+        raise ValueError("no points to draw: no size of the operations was measured")
     devices = list(dict.fromkeys(point.device for point in growth.points))
     names = list(dict.fromkeys(point.operation for point in growth.points))
     figure = new_figure(*_SIZE)

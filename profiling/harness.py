@@ -19,16 +19,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.host import Bound, Device
+from gpuvision.host import Bound, Device, Operation
 from gpuvision.host.outputs import Outputs
 from gpuvision.profiling import ceiling, numba_cache
 from gpuvision.profiling.device_times import DeviceTimes, Recorder
-from gpuvision.profiling.rounds import median_interval, take_turns
+from gpuvision.profiling.rounds import median_interval, stated_interval, take_turns
 from gpuvision.profiling.time_plan import TimePlan
 
 # Benchmarked operations: name in the rows, and module of this package that measures it. Some modules also yield cases
@@ -91,6 +91,7 @@ MEASURED = {
 QUICK_CASES = {"psd": "float32/1e6", "line": "whole/16", "triangulation": "float32/1e6", "ruler": "100", "blob": "100"}
 _STEADY = 0.2  # largest relative change of the FLOP rate during a valid section
 _ATTEMPTS = 4  # measurements of a section before the run is marked invalid
+R = TypeVar("R", bound=tuple[Any, ...])
 _Call = tuple[str, str]  # names of a peer and of its form
 _OURS: _Call = ("", "")
 _CEILING: _Call = ("ceiling", "")
@@ -174,6 +175,7 @@ class Row:
         Confidence interval of the ratio, from the spread over the rounds: see `rounds.median_interval`.
     confidence
         Confidence of the interval: at least 0.95, less for a peer so slow that it took part in fewer than 6 rounds.
+        See `interval`.
     rounds
         Number of rounds in which the peer took part.
     device_seconds
@@ -184,7 +186,8 @@ class Row:
     flops, bytes
         Floating-point operations and least traffic of one call, as the case declares them [1], [bytes].
     flop_fraction
-        Rate of the declared operations over the rate of multiply-adds that the speed probe has measured.
+        Rate of the declared operations over the rate of multiply-adds in single precision that the speed probe has
+        measured, also where the operation computes in double precision.
     metadata
         Additional columns.
     """
@@ -212,6 +215,11 @@ class Row:
     flop_fraction: float | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Confidence interval of the ratio; None if its confidence is below 95 %."""
+        return stated_interval(vars(self))
+
     def to_dict(self) -> dict[str, Any]:
         """Return the columns by name; the columns of the metadata are the last ones."""
         table = asdict(self)
@@ -220,7 +228,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Failure:
-    """Operation whose benchmark raised an exception. Its rows on the device are missing.
+    """Operation whose benchmark raised an exception.
+
+    Its rows on the device are missing, or those of an earlier measurement during which the machine changed its speed.
 
     Attributes
     ----------
@@ -304,6 +314,15 @@ class Run:
         With `overwrite` it may replace a file that no earlier profile wrote.
         """
         Outputs("profile", overwrite=overwrite).write_text(path, self.to_json())
+
+
+def bind_with(operation: Operation[R], device: Device, *inputs: NDArray[Any]) -> Bound[R]:
+    """Return a bound instance with these inputs, after one run."""
+    bound = operation.bind(device, inputs[0].shape, inputs[0].dtype)
+    for target, source in zip(bound.inputs, inputs, strict=True):
+        target.set(source)
+    bound.run()
+    return bound
 
 
 def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:
@@ -421,56 +440,56 @@ def profile(
     rows: list[Row] = []
     failures: list[Failure] = []
     probes: list[Probe] = []
+    machine = describe_machine(devices)
     plan = TimePlan(total, seconds, len(operations) * len(devices))
     for operation in operations:
         for device in devices:
             progress(f"{operation} on {device.label}")
+            kept: list[Row] = []
             try:
                 with plan.section():
-                    rows += _steady_section(operation, device, plan, quick, probes, progress)
+                    for measured, probe in _attempts(operation, device, plan, quick, progress):
+                        kept = measured
+                        probes.append(probe)
             except Exception as error:
-                failures.append(_failure(operation, device, error))
+                failures.append(failure_of(operation, device, error))
                 progress(f"  failed: {failures[-1].reason}")
+            rows += kept  # of the last attempt that ended
     last = {(probe.operation, probe.device): probe.steady for probe in probes}
-    return Run(rows, all(last.values()), describe_machine(devices), failures, probes, plan.elapsed)
+    return Run(rows, all(last.values()), machine, failures, probes, plan.elapsed)
 
 
-def _failure(operation: str, device: Device, error: Exception) -> Failure:
+def failure_of(operation: str, device: Device, error: Exception) -> Failure:
+    """Return the description of an exception that the measurement of an operation raised."""
     reason = "".join(traceback.format_exception_only(error)).strip()
     return Failure(operation, device.label, reason, "".join(traceback.format_exception(error)))
 
 
-def _steady_section(
-    operation: str,
-    device: Device,
-    plan: TimePlan,
-    quick: bool,
-    probes: list[Probe],
-    progress: Callable[[str], None],
-) -> list[Row]:
+def _attempts(
+    operation: str, device: Device, plan: TimePlan, quick: bool, progress: Callable[[str], None]
+) -> Iterator[tuple[list[Row], Probe]]:
     """Measure an operation on a device; again if the machine changed its speed meanwhile and the time suffices.
 
-    Returns
-    -------
-    list of Row
-        Rows of the last measurement. Its probe is the last one in `probes`.
+    Yields
+    ------
+    tuple of list of Row, and Probe
+        Rows of each measurement, and speed of the machine before and after it.
     """
-    rows: list[Row] = []
     for attempt in range(_ATTEMPTS):
-        if attempt and not plan.allows_repetition():
-            break
+        if attempt:
+            if not plan.allows_repetition():
+                break
+            plan.repeat()
         before = ceiling.flop_rate(device)
         rows = []
         for case in _cases(operation, device, quick):
             rows += measure(case, device, seconds=plan.grant())
         probe = probe_of(operation, device, before)
-        rows = [_with_flop_fraction(row, 0.5 * (before + probe.after)) for row in rows]
-        probes.append(probe)
+        yield [_with_flop_fraction(row, 0.5 * (before + probe.after)) for row in rows], probe
         if probe.steady:
             break
         change = f"{before / 1e9:.0f} -> {probe.after / 1e9:.0f} GFLOP/s"
         progress(f"  {change}: the machine changed its speed ({attempt + 1})")
-    return rows
 
 
 def probe_of(operation: str, device: Device, before: float) -> Probe:
@@ -491,7 +510,10 @@ def _cases(operation: str, device: Device, quick: bool) -> Iterator[Case]:
         yield from module.cases(device)
         return
     chosen = QUICK_CASES.get(operation)
-    yield from itertools.islice((case for case in module.cases(device) if chosen in (None, case.name)), 1)
+    found = list(itertools.islice((case for case in module.cases(device) if chosen in (None, case.name)), 1))
+    if chosen is not None and not found:
+        raise LookupError(f"{operation} has no case {chosen!r} on {device.label}, see QUICK_CASES")
+    yield from found
 
 
 def describe_machine(devices: Sequence[Device]) -> dict[str, Any]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
+import time
 import warnings
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +14,8 @@ import numba
 from numba.core.registry import CPUDispatcher
 
 from gpuvision.host.cache import cache_folder
+
+_KEPT = 30 * 24 * 3600.0  # time for which compiled functions of other sources are kept [s]
 
 
 def keep_compiled(module: ModuleType) -> None:
@@ -24,9 +28,21 @@ def keep_compiled(module: ModuleType) -> None:
     if loops:
         # A function that uses large global arrays is compiled in each run.
         warnings.filterwarnings("ignore", "Cannot cache compiled function", category=numba.NumbaWarning)
-        numba.config.CACHE_DIR = os.fspath(cache_folder() / f"numba-{_sources_hash()}")  # type: ignore[attr-defined]
+        folder = cache_folder() / f"numba-{_sources_hash()}"
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)  # the time of the last use
+        _remove_old_siblings(folder)
+        numba.config.CACHE_DIR = os.fspath(folder)  # type: ignore[attr-defined]
         for loop in loops:
             loop.enable_caching()
+
+
+def _remove_old_siblings(folder: Path) -> None:
+    """Remove the folders of other sources that no run has used for 30 days."""
+    oldest = time.time() - _KEPT
+    for each in folder.parent.glob("numba-*"):
+        if each != folder and each.stat().st_mtime < oldest:
+            shutil.rmtree(each, ignore_errors=True)
 
 
 def _sources_hash() -> str:

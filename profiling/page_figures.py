@@ -72,7 +72,9 @@ def _drawn(run: Run) -> Iterator[tuple[str, str, str, Any]]:
     """Yield name, title, caption and figure of matplotlib."""
     rows = run.rows
     if rows:
-        caption = "A point for each case; the bar is the confidence interval. Right of the line gpuvision is faster."
+        caption = (
+            "A point for each case; the bar is the 95 % interval of the ratio. Right of the line gpuvision is faster."
+        )
         yield "ratios", "Time of the peer over our time", caption, _ratios(rows)
     if any(_positive(row.fraction) for row in rows):
         caption = "Time of a copy with the same traffic over our time. Above 1 the data come from the caches."
@@ -117,10 +119,7 @@ def _ratios(rows: Sequence[Row]) -> Any:
         return f"{row.operation}: {row.peer}"
 
     figure, axes, places = _strip(rows, line, lambda row: row.ratio, "ratio")
-    _points_of_devices(axes, rows, places, line, lambda row: row.ratio)
-    for row in rows:
-        if _positive(row.ratio_low) and row.ratio_high is not None and line(row) in places:
-            axes.plot([row.ratio_low, row.ratio_high], [places[line(row)]] * 2, color=_INK, linewidth=0.7, alpha=0.6)
+    _points_of_devices(axes, rows, places, line, lambda row: row.ratio, lambda row: row.interval)
     return figure
 
 
@@ -136,7 +135,9 @@ def _points_of_devices(
     places: Mapping[str, int],
     line_of: Callable[[Row], str],
     value_of: Callable[[Row], float | None],
+    interval_of: Callable[[Row], tuple[float, float] | None] = lambda row: None,
 ) -> None:
+    """Draw a point for each row, and a bar for its interval; the devices have colours and offsets."""
     devices = list(dict.fromkeys(row.device for row in rows))
     for number, device in enumerate(devices):
         chosen = [row for row in rows if row.device == device and _positive(value_of(row))]
@@ -145,6 +146,10 @@ def _points_of_devices(
         colour = _COLOURS[number % len(_COLOURS)]
         values = [value_of(row) for row in chosen]
         axes.plot(values, heights, "o", color=colour, markersize=3.5, alpha=0.8, label=_plain(device))
+        for row, height in zip(chosen, heights, strict=True):
+            interval = interval_of(row)
+            if interval is not None and _positive(interval[0]):
+                axes.plot(interval, [height] * 2, color=colour, linewidth=0.9, alpha=0.6)
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
@@ -196,4 +201,5 @@ def _svg(figure: Any, name: str) -> str:
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = re.sub(r'href="#', f'href="#{name}-', text)
     text = re.sub(r"url\(#", f"url(#{name}-", text)
-    return re.sub(r'^(<svg[^>]*?) width="[^"]*"|^(<svg[^>]*?) height="[^"]*"', r"\1\2", text)
+    # Without a size the page scales the figure to its width.
+    return re.sub(r"^<svg[^>]*>", lambda tag: re.sub(r' (?:width|height)="[^"]*"', "", tag.group()), text)

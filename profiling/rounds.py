@@ -17,7 +17,7 @@ _CALLS_PER_TURN = 3
 # A call of 10 ms is timed once in a turn: its time hardly depends on a single interrupt. A call of 100 ms has no
 # untimed call before it: loading caches of some 10 MB takes about 1 % of its time.
 _LONG_CALL, _LONGEST_WARMED_CALL = 0.01, 0.1  # [s]
-_CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # least confidence of an interval that is shown
 
 K = TypeVar("K", bound=Hashable)
 
@@ -55,10 +55,17 @@ def median_interval(values: NDArray[Any]) -> MedianInterval:
     outside, rank, confidence = 0.0, 1, 1.0 - 2.0 ** (1 - count)
     for k in range(1, count // 2 + 1):
         outside += math.comb(count, k - 1) * 2.0 ** (1 - count)
-        if 1.0 - outside < _CONFIDENCE:
+        if 1.0 - outside < CONFIDENCE:
             break
         rank, confidence = k, 1.0 - outside
     return MedianInterval(float(ordered[rank - 1]), float(ordered[-rank]), confidence)
+
+
+def stated_interval(row: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Return the confidence interval of the ratio of a row by columns; None if its confidence is below 95 %."""
+    low, high = row.get("ratio_low"), row.get("ratio_high")
+    sure = (row.get("confidence") or 0.0) >= CONFIDENCE
+    return (low, high) if sure and low is not None and high is not None else None
 
 
 def take_turns(calls: Mapping[K, Callable[[], object]], seconds: float, always: K) -> dict[K, NDArray[Any]]:

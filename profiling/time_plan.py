@@ -15,8 +15,8 @@ _LEAST = 0.05  # shortest time to measure a case [s]
 class TimePlan:
     """Plan of the time of a run. A section is one operation on one device.
 
-    Numbers of cases and times of preparation are not known before a section has run: those of the sections to come are
-    assumed to be the mean of the sections that have ended.
+    Numbers of cases and times of preparation are not known before a section has run. Those of the running section and
+    of the sections to come are assumed to be the mean of the sections that have ended.
 
     Parameters
     ----------
@@ -30,13 +30,11 @@ class TimePlan:
 
     def __init__(self, total: float, longest: float, sections: int) -> None:
         self.total, self.longest = total, longest
-        self._left = sections
-        self._ended = 0
-        self._cases = 0
-        self._granted = 0.0  # time for the measurement of the cases so far [s]
+        self._left = sections  # with the running one
+        # Of the sections that have ended: their number, their cases, and their time beside the measurement [s].
+        self._ended, self._ended_cases, self._ended_preparation = 0, 0, 0.0
         self._begun = time.perf_counter()
-        self._section_begun = self._begun
-        self._busy = 0.0  # time of the sections that have ended [s]
+        self._begin_section()
 
     @property
     def elapsed(self) -> float:
@@ -46,28 +44,47 @@ class TimePlan:
     @contextmanager
     def section(self) -> Iterator[None]:
         """Count a section, from its beginning to its end."""
-        self._section_begun = time.perf_counter()
+        self._begin_section()
         try:
             yield
         finally:
-            self._busy += time.perf_counter() - self._section_begun
+            self._ended_preparation += self._prepared()
+            self._ended_cases += self._cases
             self._ended += 1
             self._left -= 1
 
+    def _begin_section(self) -> None:
+        self._section_begun = time.perf_counter()
+        self._granted = 0.0  # time for the measurement of the cases of the section so far [s]
+        self._begin_attempt()
+
+    def _begin_attempt(self) -> None:
+        self._attempt_begun = time.perf_counter()
+        self._cases = 0  # of the attempt so far
+
     def grant(self) -> float:
         """Count a case, and return the time for which it may be measured [s]."""
-        cases = self._cases / self._ended if self._ended else _CASES
-        free = self.total - self.elapsed - self._preparation() * self._left
-        seconds = min(max(free / (max(cases, 1.0) * self._left), _LEAST), self.longest)
+        expected = max(self._ended_cases / self._ended, 1.0) if self._ended else _CASES
+        cases = max(expected - self._cases, 1.0) + expected * (self._left - 1)
+        preparation = max(self._preparation() - self._prepared(), 0.0) + self._preparation() * (self._left - 1)
+        seconds = min(max((self.total - self.elapsed - preparation) / cases, _LEAST), self.longest)
         self._granted += seconds
         self._cases += 1
         return seconds
 
     def allows_repetition(self) -> bool:
-        """Return whether the time suffices to repeat the section that runs now."""
-        so_far = time.perf_counter() - self._section_begun
-        return self.total - self.elapsed - self._preparation() * (self._left - 1) > so_far
+        """Return whether the time suffices to repeat the last attempt of the section that runs now."""
+        last = time.perf_counter() - self._attempt_begun
+        return self.total - self.elapsed - self._preparation() * (self._left - 1) > last
+
+    def repeat(self) -> None:
+        """Begin another attempt of the section that runs now."""
+        self._begin_attempt()
+
+    def _prepared(self) -> float:
+        """Return the time of the running section so far beside the measurement [s]."""
+        return max(time.perf_counter() - self._section_begun - self._granted, 0.0)
 
     def _preparation(self) -> float:
         """Return the expected time of a section beside the measurement [s]: references, compilation, probes."""
-        return max(self._busy - self._granted, 0.0) / self._ended if self._ended else _PREPARATION
+        return self._ended_preparation / self._ended if self._ended else _PREPARATION

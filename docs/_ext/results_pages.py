@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from gpuvision.profiling.rounds import stated_interval
 from pages import table, title, toctree, write_pages
 
 FOLDER = "results/runs"
@@ -35,7 +36,6 @@ _COLUMNS = (
     "device_seconds",
 )
 _PROBED = ("before", "after")
-_CONFIDENCE = 0.95  # of the intervals that are shown; a peer measured once or twice has none
 
 
 def _time(seconds: float) -> str:
@@ -72,10 +72,9 @@ def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
 def _ratio(row: Mapping[str, Any]) -> str:
     """Return the ratio, bold if the peer is faster, and its interval where the run states one."""
     ratio = f"{row['ratio']:.2f}"
-    interval = ""
-    if (row.get("confidence") or 0.0) >= _CONFIDENCE:
-        interval = f" ({row['ratio_low']:.2f} to {row['ratio_high']:.2f})"
-    return (f"**{ratio}**" if row["ratio"] < 1.0 else ratio) + interval
+    interval = stated_interval(row)
+    limits = "" if interval is None else f" ({interval[0]:.2f} to {interval[1]:.2f})"
+    return (f"**{ratio}**" if row["ratio"] < 1.0 else ratio) + limits
 
 
 _HEADER = ("case", "device", "time", "peer", "peer's time", "ratio", "error", "of limit", "metadata")

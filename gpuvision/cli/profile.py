@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 _SECONDS, _QUICK_SECONDS = 2.0, 0.3  # longest time to measure a case [s]
 _MINUTES, _QUICK_MINUTES = 20.0, 3.0
 _MEMORY_MIB = 256.0
-_CONFIDENCE = 0.95
 _NO_PLOTS = (
     "no plots: no series over size or tolerance, no declared operations; try light_clustering, reflections or psd"
 )
@@ -274,9 +273,9 @@ def _cells(row: Row) -> tuple[str, ...]:
 
 def _ratio(row: Row) -> str:
     """Return the ratio, and the larger half of its interval unless this has less than 95 % confidence."""
-    if row.ratio_low is None or row.ratio_high is None or (row.confidence or 0.0) < _CONFIDENCE:
+    if row.interval is None:
         return f"{row.ratio:.2f}"
-    half = max(row.ratio_high - row.ratio, row.ratio - row.ratio_low)
+    half = max(row.interval[1] - row.ratio, row.ratio - row.interval[0])
     return f"{row.ratio:.2f} ±{100 * half / row.ratio:.0f}%"
 
 

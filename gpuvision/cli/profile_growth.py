@@ -19,7 +19,10 @@ def profile_growth(
     *,
     overwrite: bool,
 ) -> None:
-    """Measure the curves, print a line for each one, and exit with 1 if the machine changed its speed."""
+    """Measure the curves and print a line for each one.
+
+    The exit code is 1 if the machine changed its speed, an operation failed, or no size was measured.
+    """
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.profiling.growth import measure_growth, workloads
@@ -44,10 +47,14 @@ def profile_growth(
         outputs.write_text(as_json, growth.to_json())
     for line in growth.lines():
         echo(line, err=prints_report(as_json))
-    if plots is not None:
+    if not growth.points:
+        echo(f"nothing measured: no operation has a size within {memory_mib:g} MiB, or all failed", err=True)
+    elif plots is not None:
         echo(f"look at {plots / draw_growth(plots, growth, overwrite=overwrite)}", err=True)
     unsteady = [probe for probe in growth.probes if not probe.steady]
     for probe in unsteady:
         echo(f"not valid: the machine changed its speed during {probe.operation} on {probe.device}", err=True)
-    if unsteady:
+    for failure in growth.failures:
+        echo(f"not measured: {failure.operation} on {failure.device}: {failure.reason}", err=True)
+    if unsteady or growth.failures or not growth.points:
         raise typer.Exit(1)

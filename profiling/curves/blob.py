@@ -10,7 +10,8 @@ import numpy as np
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.blob import FindBlobs
 from gpuvision.profiling.blob import NOISE, SEARCH, THRESHOLD, scene
-from gpuvision.profiling.curves.curve import Errors, Setting, bind_with
+from gpuvision.profiling.curves.curve import Errors, Setting, distance
+from gpuvision.profiling.harness import bind_with
 
 _COUNT = 400
 _USUAL: dict[str, Any] = {"spokes": 16, "width": 1, "smoothing_px": 1.5, "passes": 2, "match": True}
@@ -29,8 +30,8 @@ def settings(device: Device) -> Iterator[Setting]:
     """Yield the settings on blurred discs with noise."""
     image, places, true = scene(_COUNT)
     for change in _CHANGES:
-        knobs: dict[str, Any] = {**_USUAL, **change}
-        operation = FindBlobs(threshold=THRESHOLD, search_px=SEARCH, noise=NOISE, count=_COUNT, **knobs)
+        parameters: dict[str, Any] = {**_USUAL, **change}
+        operation = FindBlobs(threshold=THRESHOLD, search_px=SEARCH, noise=NOISE, count=_COUNT, **parameters)
         bound = bind_with(operation, device, image, places)
         found = np.stack([to_numpy(bound.outputs.x), to_numpy(bound.outputs.y)], axis=-1)
-        yield Setting("blob", "discs with noise", knobs, bound.run, Errors(found - true), "px")
+        yield Setting("blob", "discs with noise", parameters, bound.run, Errors(distance(found, true)), "px")

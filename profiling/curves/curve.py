@@ -6,15 +6,14 @@ import importlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Bound, Device, Operation
+from gpuvision.host import Device
 from gpuvision.profiling.rounds import median_interval, take_turns
 
-R = TypeVar("R", bound=tuple[Any, ...])
 OPERATIONS = (
     "psd",
     "line",
@@ -36,7 +35,8 @@ class Errors:
     Parameters
     ----------
     deviation : (n,) float64
-        Result minus truth. NaN where the operation gave no value (flagged).
+        Result minus truth; of points and poses the distance, see `distance`. NaN where the operation gave no value
+        (flagged).
 
     Attributes
     ----------
@@ -56,13 +56,9 @@ class Errors:
         self.largest = float(size.max()) if found else math.nan
 
 
-def bind_with(operation: Operation[R], device: Device, *inputs: npt.NDArray[Any]) -> Bound[R]:
-    """Return a bound instance with these inputs, after one run."""
-    bound = operation.bind(device, inputs[0].shape, inputs[0].dtype)
-    for target, source in zip(bound.inputs, inputs, strict=True):
-        target.set(source)
-    bound.run()
-    return bound
+def distance(found: npt.ArrayLike, true: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return the Euclidean distances (n,) of points (n, d)."""
+    return np.asarray(np.linalg.norm(np.subtract(found, true, dtype=np.float64), axis=-1))
 
 
 @dataclass(frozen=True)
@@ -75,7 +71,7 @@ class Setting:
         Name of the operation, as in `OPERATIONS`.
     data : str
         Description of the data: settings are compared on equal data only.
-    knobs : mapping
+    parameters : mapping
         Values that a user chooses, by their names in the operation.
     run : callable
         Function that does the work and waits until it is finished.
@@ -87,7 +83,7 @@ class Setting:
 
     operation: str
     data: str
-    knobs: Mapping[str, Any]
+    parameters: Mapping[str, Any]
     run: Callable[[], object]
     errors: Errors
     unit: str
@@ -99,7 +95,7 @@ class Point:
 
     Attributes
     ----------
-    operation, data, knobs, unit
+    operation, data, parameters, unit
         See `Setting`.
     device : str
         Label of the device.
@@ -115,7 +111,7 @@ class Point:
 
     operation: str
     data: str
-    knobs: Mapping[str, Any]
+    parameters: Mapping[str, Any]
     device: str
     seconds: float
     seconds_low: float
@@ -129,7 +125,7 @@ class Point:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the columns by name."""
-        return asdict(self) | {"knobs": dict(self.knobs)}
+        return asdict(self) | {"parameters": dict(self.parameters)}
 
 
 def measure_curves(
@@ -157,10 +153,11 @@ def measure_curves(
     ValueError
         An operation has no curves.
     """
+    unknown = next((each for each in operations if each not in OPERATIONS), None)
+    if unknown is not None:
+        raise ValueError(f"no curves of {unknown!r}; expected some of {', '.join(OPERATIONS)}")
     points: list[Point] = []
     for operation in operations:
-        if operation not in OPERATIONS:
-            raise ValueError(f"no curves of {operation!r}; expected some of {', '.join(OPERATIONS)}")
         for device in devices:
             progress(f"curves of {operation} on {device.label}")
             points += _measure(operation, device, seconds)
@@ -190,7 +187,7 @@ def _point(setting: Setting, durations: npt.NDArray[np.float64], best: bool, dev
     return Point(
         operation=setting.operation,
         data=setting.data,
-        knobs=setting.knobs,
+        parameters=setting.parameters,
         device=device,
         seconds=float(np.median(durations)),
         seconds_low=interval.low,

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from gpuvision.host import Device, to_numpy
-from gpuvision.profiling.curves.curve import Errors, Setting, bind_with
+from gpuvision.profiling.curves.curve import Errors, Setting
+from gpuvision.profiling.harness import bind_with
 from gpuvision.ranging.line import LineReadout
 
 _FRAMES, _ROWS, _COLUMNS = 4, 256, 1024
@@ -46,8 +47,8 @@ def settings(device: Device) -> Iterator[Setting]:
                 )
                 bound = bind_with(operation, device, frames)
                 position = to_numpy(bound.outputs.position).astype(np.float64)
-                knobs = {**change, "precision": precision}
-                yield Setting("line", f"peak {peak:.0f} levels", knobs, bound.run, Errors(position - true), "px")
+                parameters = {**change, "precision": precision}
+                yield Setting("line", f"peak {peak:.0f} levels", parameters, bound.run, Errors(position - true), "px")
 
 
 def _frames(peak: float) -> tuple[np.ndarray[Any, np.dtype[np.uint8]], np.ndarray[Any, np.dtype[np.float64]]]:

@@ -9,7 +9,8 @@ import numpy as np
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.line_fit import FitLines
-from gpuvision.profiling.curves.curve import Errors, Setting, bind_with
+from gpuvision.profiling.curves.curve import Errors, Setting
+from gpuvision.profiling.harness import bind_with
 
 _LINES, _POINTS = 2000, 20
 _SIGMA = 0.05  # [px]
@@ -35,9 +36,9 @@ def settings(device: Device) -> Iterator[Setting]:
                 of_fit, distance = to_numpy(fits.normal).astype(np.float64), to_numpy(fits.distance)
                 side = np.sign(np.sum(of_fit * normal, axis=-1))
                 deviation = side * (np.sum(of_fit * middle, axis=-1) - distance)
-                knobs = {"max_trials": 64, "max_iterations": 12, **change}
-                knobs["precision"] = "single" if dtype == "float32" else "double"
-                yield Setting("line_fit", f"{outliers:.0%} outliers", knobs, bound.run, Errors(deviation), "px")
+                parameters = {"max_trials": 64, "max_iterations": 12, **change}
+                parameters["precision"] = "single" if dtype == "float32" else "double"
+                yield Setting("line_fit", f"{outliers:.0%} outliers", parameters, bound.run, Errors(deviation), "px")
 
 
 def _lines(outliers: float) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:

@@ -20,7 +20,7 @@ FILES = tuple(f"curve-{operation}.png" for operation in OPERATIONS)
 def draw_curves(folder: str | Path, points: Sequence[Point], *, overwrite: bool = False) -> list[str]:
     """Draw a PNG for each operation into a folder, with a panel for each device; return the names of the files.
 
-    Settings of the Pareto front are filled and joined by a line; their knobs that differ between the settings are
+    Settings of the Pareto front are filled and joined by a line; their parameters that differ between the settings are
     named. With `overwrite` existing files may be replaced that no earlier command wrote.
     """
     operations = list(dict.fromkeys(point.operation for point in points))
@@ -60,9 +60,9 @@ def _draw_curve(axes: Any, points: Sequence[Point], colour: str) -> None:
 
 
 def describe(point: Point, points: Sequence[Point]) -> str:
-    """Return the knobs of a point that differ between the points, as ``name value``."""
+    """Return the parameters of a point that differ between the points, as ``name value``."""
     return ", ".join(
         f"{name} {value}"
-        for name, value in point.knobs.items()
-        if any(other.knobs.get(name) != value for other in points)
+        for name, value in point.parameters.items()
+        if any(other.parameters.get(name) != value for other in points)
     )

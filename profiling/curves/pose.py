@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.pose.pose import SolvePose, line_rows
-from gpuvision.profiling.curves.curve import Errors, Setting, bind_with
+from gpuvision.profiling.curves.curve import Errors, Setting, distance
+from gpuvision.profiling.harness import bind_with
 
 _POSES, _EDGES, _WRONG = 200, 60, 12
 _HALF = 5e-3  # half of the size of the board [m]
@@ -30,11 +31,11 @@ def settings(device: Device) -> Iterator[Setting]:
     rows, true = _rows()
     for change in _CHANGES:
         for dtype in ("float32", "float64") if device.has_double else ("float32",):
-            knobs = {"loss": "tukey", "max_trials": 64, "max_iterations": 12, **change}
-            bound = bind_with(SolvePose(placement=_PLACEMENT, **knobs), device, rows.astype(dtype))
-            deviation = to_numpy(bound.outputs.placement) - true
-            knobs["precision"] = "single" if dtype == "float32" else "double"
-            yield Setting("pose", "a fifth of the edges wrong", knobs, bound.run, Errors(deviation), "m")
+            parameters = {"loss": "tukey", "max_trials": 64, "max_iterations": 12, **change}
+            bound = bind_with(SolvePose(placement=_PLACEMENT, **parameters), device, rows.astype(dtype))
+            deviation = distance(to_numpy(bound.outputs.placement), true)
+            parameters["precision"] = "single" if dtype == "float32" else "double"
+            yield Setting("pose", "a fifth of the edges wrong", parameters, bound.run, Errors(deviation), "m")
 
 
 def _rows() -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:

@@ -13,7 +13,8 @@ import numpy as np
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.launch import Precision
-from gpuvision.profiling.curves.curve import Errors, Setting, bind_with
+from gpuvision.profiling.curves.curve import Errors, Setting
+from gpuvision.profiling.harness import bind_with
 from gpuvision.ranging.psd import PsdReadout
 
 _LENGTH = 6e-3  # of the strip [m]
@@ -41,5 +42,5 @@ def settings(device: Device) -> Iterator[Setting]:
             )  # fmt: skip
             bound = bind_with(operation, device, samples.astype(dtype))
             deviation = to_numpy(bound.outputs.position) - true
-            knobs = {"dtype": dtype, "precision": precision or "single", "minimum_total": least}
-            yield Setting("psd", "light levels 1:1000", knobs, bound.run, Errors(deviation), "m")
+            parameters = {"dtype": dtype, "precision": precision or "single", "minimum_total": least}
+            yield Setting("psd", "light levels 1:1000", parameters, bound.run, Errors(deviation), "m")

@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.ruler import RulerEdges
-from gpuvision.profiling.curves.curve import Errors, Setting, bind_with
+from gpuvision.profiling.curves.curve import Errors, Setting
+from gpuvision.profiling.harness import bind_with
 from gpuvision.profiling.ruler_accuracy import SIDE, scenes
 
 _IMAGES = 4  # per angle
@@ -35,11 +36,11 @@ def settings(device: Device) -> Iterator[Setting]:
     for noise in _NOISES:
         image, rulers, true = _one_image(noise)
         for change in _CHANGES:
-            knobs: dict[str, Any] = {**_USUAL, **change}
-            operation = RulerEdges(threshold=20.0, noise=noise, count=len(rulers), **knobs)
+            parameters: dict[str, Any] = {**_USUAL, **change}
+            operation = RulerEdges(threshold=20.0, noise=noise, count=len(rulers), **parameters)
             bound = bind_with(operation, device, image, rulers)
             deviation = to_numpy(bound.outputs.position) - true
-            yield Setting("ruler", f"SNR {100.0 / noise:.0f}", knobs, bound.run, Errors(deviation), "px")
+            yield Setting("ruler", f"SNR {100.0 / noise:.0f}", parameters, bound.run, Errors(deviation), "px")
 
 
 def _one_image(noise: float) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32], npt.NDArray[np.float64]]:

@@ -11,7 +11,8 @@ import numpy as np
 
 from gpuvision.camera.camera import Camera
 from gpuvision.host import Device, to_numpy
-from gpuvision.profiling.curves.curve import Errors, Setting, bind_with
+from gpuvision.profiling.curves.curve import Errors, Setting, distance
+from gpuvision.profiling.harness import bind_with
 from gpuvision.ranging.triangulation import Triangulation
 
 _COUNT = 200_000
@@ -41,5 +42,7 @@ def settings(device: Device) -> Iterator[Setting]:
             )
             bound = bind_with(operation, device, *(np.ascontiguousarray(measured[:, k], dtype) for k in (1, 0)))
             found = np.stack([to_numpy(bound.outputs.g), to_numpy(bound.outputs.h)], axis=-1)
-            knobs = {"lens": model, "precision": "single" if dtype == "float32" else "double"}
-            yield Setting("triangulation", "lens of 5 coefficients", knobs, bound.run, Errors(found - true), "m")
+            parameters = {"lens": model, "precision": "single" if dtype == "float32" else "double"}
+            yield Setting(
+                "triangulation", "lens of 5 coefficients", parameters, bound.run, Errors(distance(found, true)), "m"
+            )

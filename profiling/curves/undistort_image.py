@@ -14,7 +14,8 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.undistort_image import UndistortImage
 from gpuvision.host import Device, to_numpy
-from gpuvision.profiling.curves.curve import Errors, Setting, bind_with
+from gpuvision.profiling.curves.curve import Errors, Setting
+from gpuvision.profiling.harness import bind_with
 
 _SIZE = 512
 _CAMERA = Camera(
@@ -39,13 +40,13 @@ def settings(device: Device) -> Iterator[Setting]:
         noisy = seen + np.random.default_rng(11).normal(0.0, _NOISE, seen.shape)
         image = np.rint(noisy).astype(np.uint8)
         for interpolation in ("bilinear", "bicubic"):
-            for knobs in _SOURCES if device.has_double else _SOURCES[:2]:
-                operation: Any = UndistortImage(model=_CAMERA, interpolation=interpolation, **knobs)
+            for parameters in _SOURCES if device.has_double else _SOURCES[:2]:
+                operation: Any = UndistortImage(model=_CAMERA, interpolation=interpolation, **parameters)
                 bound = bind_with(operation, device, image)
                 deviation = to_numpy(bound.outputs.image).astype(np.float64) - true
                 deviation[to_numpy(bound.outputs.status) != 0] = np.nan
                 inner = Errors(deviation[_BORDER:-_BORDER, _BORDER:-_BORDER])
-                named = {"interpolation": interpolation, **knobs}
+                named = {"interpolation": interpolation, **parameters}
                 yield Setting("undistort_image", f"period {period:.0f} px", named, bound.run, inner, "levels")
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.host import Device, to_numpy
-from gpuvision.profiling.curves.curve import Errors, Setting, bind_with
+from gpuvision.profiling.curves.curve import Errors, Setting, distance
+from gpuvision.profiling.harness import bind_with
 
 _COUNT = 100_000
 _SIZE = (1280.0, 1024.0)
@@ -28,6 +29,6 @@ def settings(device: Device) -> Iterator[Setting]:
         camera = Camera(matrix=_MATRIX, distortion=_DISTORTION[:terms] + (14 - terms) * (0.0,))
         for dtype in ("float32", "float64") if device.has_double else ("float32",):
             bound = bind_with(UndistortPoints(model=camera), device, measured.astype(dtype))
-            deviation = np.hypot(*(to_numpy(bound.outputs.points) - ideal).T)
-            knobs = {"model": model, "precision": "single" if dtype == "float32" else "double"}
-            yield Setting("undistort_points", "lens of 14 coefficients", knobs, bound.run, Errors(deviation), "px")
+            deviation = distance(to_numpy(bound.outputs.points), ideal)
+            parameters = {"model": model, "precision": "single" if dtype == "float32" else "double"}
+            yield Setting("undistort_points", "lens of 14 coefficients", parameters, bound.run, Errors(deviation), "px")

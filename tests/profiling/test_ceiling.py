@@ -2,8 +2,25 @@
 
 from __future__ import annotations
 
+import pyopencl as cl
+
 from gpuvision.profiling import ceiling
 
 
 def test_the_flop_rate_is_that_of_multiply_adds(device):
     assert 1e8 < ceiling.flop_rate(device, seconds=0.01) < 1e15
+
+
+def test_without_times_of_events_the_clock_of_the_host_measures_copies(device, monkeypatch):
+    class Event:
+        def wait(self):
+            pass
+
+        @property
+        def profile(self):
+            raise cl.RuntimeError("clGetEventProfilingInfo failed: PROFILING_INFO_NOT_AVAILABLE")
+
+    monkeypatch.setattr(ceiling, "SIZES", (1 << 16,))
+    monkeypatch.setattr(ceiling, "mover", lambda *_: Event)
+    (rate,) = ceiling.bandwidths(device).values()
+    assert 0.0 < rate < float("inf")

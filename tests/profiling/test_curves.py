@@ -56,14 +56,22 @@ def test_operations_are_the_modules_of_the_package():
     assert set(curve.OPERATIONS) == files
 
 
-def test_an_unknown_operation_is_named():
+def test_an_unknown_operation_is_named_before_another_one_is_measured(device):
+    lines = []
     with pytest.raises(ValueError, match="no curves of 'lines'; expected some of psd, line"):
-        curve.measure_curves(["lines"], [])
+        curve.measure_curves(["pose", "lines"], [device], progress=lines.append)
+    assert lines == []
+
+
+def test_errors_of_points_are_distances():
+    distances = curve.distance([[3.0, 4.0], [math.nan, 0.0], [1.0, 1.0]], [[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
+    assert distances[[0, 2]].tolist() == [5.0, 0.0]
+    assert math.isnan(distances[1])
 
 
 def errors_of(operation, device):
     settings = importlib.import_module(f"gpuvision.profiling.curves.{operation}").settings(device)
-    return {(each.data, *each.knobs.items()): each.errors for each in settings}
+    return {(each.data, *each.parameters.items()): each.errors for each in settings}
 
 
 @pytest.mark.slow
@@ -73,7 +81,7 @@ def test_settings_are_distinct_and_measure_most_samples(operation, device):
     if operation == "occluded_irradiance" and not device.has_double:
         assert not settings
         return
-    assert len({(each.data, *each.knobs.items()) for each in settings}) == len(settings) > 3
+    assert len({(each.data, *each.parameters.items()) for each in settings}) == len(settings) > 3
     for each in settings:
         assert each.operation == operation
         assert math.isfinite(each.errors.rms)
@@ -94,8 +102,8 @@ def test_the_robust_loss_pays_with_outliers_only(device):
     errors = errors_of("line_fit", device)
 
     def rms(data, loss):
-        knobs = (("max_trials", 64), ("max_iterations", 12), ("loss", loss), ("precision", "single"))
-        return errors[data, *knobs].rms
+        parameters = (("max_trials", 64), ("max_iterations", 12), ("loss", loss), ("precision", "single"))
+        return errors[data, *parameters].rms
 
     # Least squares on points with noise of 0.05 px: standard deviation 0.05 / sqrt(20) px at the middle; u is not
     # centred, which adds a little.
@@ -106,20 +114,20 @@ def test_the_robust_loss_pays_with_outliers_only(device):
 def test_a_picture_for_each_operation(tmp_path):
     common = {"operation": "psd", "unit": "m", "seconds_low": 1e-5, "seconds_high": 3e-5, "device": "pocl"}
     points = [
-        curve.Point(**common, data=data, knobs={"least": k}, seconds=2e-5 * k, rms=1e-6 / k, p95=2e-6, largest=3e-6,
-                    lost=0.0, best=k > 1)
+        curve.Point(**common, data=data, parameters={"least": k}, seconds=2e-5 * k, rms=1e-6 / k, p95=2e-6,
+                    largest=3e-6, lost=0.0, best=k > 1)
         for data in ("dim", "bright") for k in (1, 2, 3)
     ]  # fmt: skip
     assert plot.draw_curves(tmp_path / "plots", points) == ["curve-psd.png"]
     assert (tmp_path / "plots" / "curve-psd.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_point_is_described_by_the_knobs_that_differ():
+def test_a_point_is_described_by_the_parameters_that_differ():
     common = {
         "operation": "psd", "data": "dim", "device": "pocl", "unit": "m", "seconds": 1.0, "seconds_low": 1.0,
         "seconds_high": 1.0, "rms": 1.0, "p95": 1.0, "largest": 1.0, "lost": 0.0, "best": True,
     }  # fmt: skip
-    points = [curve.Point(**common, knobs={"window": 3, "method": each}) for each in ("ml", "fir")]
+    points = [curve.Point(**common, parameters={"window": 3, "method": each}) for each in ("ml", "fir")]
     assert plot.describe(points[0], points) == "method ml"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from typing import Any
 
@@ -35,6 +36,7 @@ def test_the_launch_knee_is_at_twice_the_shortest_time() -> None:
 def test_the_cache_knee_is_where_the_arrays_fill_the_cache() -> None:
     assert growth.cache_knee(curve(1.0, 1.0, 1.0), 160) == pytest.approx(10.0)
     assert growth.cache_knee(curve(1.0, 1.0, 1.0), 1000) is None
+    assert growth.cache_knee(curve(1.0, 1.0, 1.0), 10) == 1.0  # one item does not fit
 
 
 def test_a_curve_goes_from_one_item_to_the_limit_of_memory(device: Any) -> None:
@@ -46,15 +48,59 @@ def test_a_curve_goes_from_one_item_to_the_limit_of_memory(device: Any) -> None:
     assert all(0.0 < point.low <= point.seconds <= point.high for point in points)
     assert json.loads(found.to_json())["growth"][3]["items"] == 64
     assert len(found.probes) == 1
+    assert found.caches == {device.label: device.cache_bytes}
 
 
 @pytest.mark.parametrize("name", sorted(growth.workloads()))
-def test_the_items_of_a_workload_are_repeated(name: str) -> None:
+def test_the_items_of_a_workload_are_repeated(name: str, device: Any) -> None:
     """More items than differ: the first ones come again; the operation accepts the shapes."""
     workload = growth.workloads()[name]
-    few, many = (workload.prepare(items)[1] for items in (1, 5))
-    assert [each.dtype for each in few] == [each.dtype for each in many]
-    assert sum(each.nbytes for each in few) < sum(each.nbytes for each in many)
+    place = next(k for k, axis in enumerate(workload.axes) if axis is not None)
+    different = workload.samples[place].shape[workload.axes[place]]
+    inputs = workload.inputs(different + 3)
+    assert inputs[0].shape == workload.first_shape(different + 3)
+    for values, samples, axis in zip(inputs, workload.samples, workload.axes, strict=True):
+        if axis is None:
+            assert np.array_equal(values, samples)
+            continue
+        assert values.shape[axis] == different + 3
+        parts = np.split(values, [different], axis=axis)
+        assert np.array_equal(parts[0], samples)
+        assert np.array_equal(parts[1], np.take(samples, range(3), axis=axis))
+    specs = workload.operation(different + 3).specs(device, inputs[0].shape, inputs[0].dtype)
+    assert [(tuple(shape), dtype) for shape, dtype in specs.inputs] == [(each.shape, each.dtype) for each in inputs]
+
+
+def test_inputs_beyond_the_limit_of_memory_are_not_made(monkeypatch: pytest.MonkeyPatch, device: Any) -> None:
+    made: list[int] = []
+    inputs = growth.Workload.inputs
+    monkeypatch.setattr(growth.Workload, "inputs", lambda self, items: made.append(items) or inputs(self, items))
+    growth.measure_growth(["psd"], [device], memory=13 * 4**2, seconds=0.002)
+    assert made == [1, 4, 16]
+
+
+def test_the_other_workloads_are_measured_when_one_fails(monkeypatch: pytest.MonkeyPatch, device: Any) -> None:
+    known = growth.workloads()
+    broken = dataclasses.replace(known["line"], samples=[np.zeros((4, 0, 0), np.uint8)])
+    monkeypatch.setattr(growth, "workloads", lambda: known | {"line": broken})
+    lines: list[str] = []
+    found = growth.measure_growth(
+        ["psd", "line", "triangulation"], [device], memory=1000, seconds=0.002, progress=lines.append
+    )
+    assert [name for name, _ in found.curves] == ["psd", "triangulation"]
+    (failure,) = found.failures
+    assert (failure.operation, failure.device) == ("line", device.label)
+    assert f"  failed: {failure.reason}" in lines
+    assert json.loads(found.to_json())["failures"][0]["reason"] == failure.reason
+
+
+def test_without_points_a_message_says_so(tmp_path: Any, device: Any) -> None:
+    lines: list[str] = []
+    found = growth.measure_growth(["psd"], [device], memory=12, progress=lines.append)
+    assert found.lines() == []
+    assert lines[-1] == "  not measured: inputs and outputs of one sample exceed 12 bytes"
+    with pytest.raises(ValueError, match="no points to draw"):
+        draw_growth(tmp_path, found)
 
 
 def test_a_slow_operation_is_not_measured_with_more_items(monkeypatch: pytest.MonkeyPatch, device: Any) -> None:
@@ -78,10 +124,16 @@ def test_the_picture_has_the_curves_and_their_knees(tmp_path: Any, monkeypatch: 
     ]
 
 
-def test_the_command_measures_and_writes(tmp_path: Any) -> None:
+@pytest.mark.parametrize(("after", "code"), [(101e9, 0), (55e9, 1)])
+def test_the_command_measures_and_writes(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch, device: Any, after: float, code: int
+) -> None:
+    rates = iter((100e9, 100e9, after))  # description of the machine, before and after the measurement
+    monkeypatch.setattr(growth.ceiling, "flop_rate", lambda *_: next(rates))
     args = ["profile", "psd", "--growth", "--memory-mib", "0.001", "--json", str(tmp_path / "g.json")]
-    ran = CliRunner().invoke(application(), args)
-    assert ran.exit_code in (0, 1)  # 1: the machine changed its speed
+    ran = CliRunner().invoke(application(), [*args, "--device", device.label], catch_exceptions=False)
+    assert ran.exit_code == code
+    assert ("the machine changed its speed during psd" in ran.output) == bool(code)
     assert "µs for one sample" in ran.output
     assert {point["items"] for point in json.loads((tmp_path / "g.json").read_text())["growth"]} == {1, 4, 16, 64}
 

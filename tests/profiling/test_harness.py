@@ -88,6 +88,7 @@ def test_a_row_states_the_spread_of_the_ratio_over_the_rounds(clock, device):
         assert row.ratio == pytest.approx(500.0, rel=0.21)
         assert 199.0 < row.ratio_low < row.ratio < row.ratio_high < 801.0
         assert 0.95 <= row.confidence < 1.0
+        assert row.interval == (row.ratio_low, row.ratio_high)
     assert few.rounds < many.rounds <= 101
     assert many.ratio_high - many.ratio_low < few.ratio_high - few.ratio_low
 
@@ -107,6 +108,7 @@ def test_a_slow_peer_is_measured_once_or_twice(clock, device):
     once, twice = harness.measure(case(ours=clock.work(0.01), peers=peers), device, seconds=1.0)
     assert (once.rounds, twice.rounds) == (1, 2)
     assert (once.confidence, twice.confidence) == (0.0, 0.5)
+    assert (once.interval, twice.interval) == (None, None)
     assert calls == {"numba": 3, "numpy": 4}  # the first call compiles, the second one gives the expected duration
     assert once.ratio == pytest.approx(500.0, rel=0.02)
 
@@ -167,7 +169,7 @@ def fake(monkeypatch):
 
     def set_speeds(*values):
         nonlocal speeds
-        speeds = iter(values)
+        speeds = iter((100.0, *values))  # the first one is for the description of the machine
 
     monkeypatch.setattr(ceiling, "flop_rate", lambda device, **_: next(speeds, 100.0))
     return set_speeds
@@ -184,6 +186,31 @@ def test_a_section_is_measured_again_when_the_machine_changed_its_speed(fake, de
         (100.0, 55.0, False),
         (100.0, 99.0, True),
     ]
+
+
+def test_a_repeated_section_that_fails_keeps_the_earlier_rows(fake, monkeypatch, device):
+    attempts = iter((lambda: [case()], lambda: 1 / 0))
+    module = types.SimpleNamespace(cases=lambda device: next(attempts)())
+    monkeypatch.setattr(harness.importlib, "import_module", lambda name: module)
+    fake(100.0, 55.0)
+    run = harness.profile(["psd"], [device], seconds=0.01)
+    assert [row.case for row in run.rows] == ["float32/16"]
+    assert not run.valid
+    assert [failure.reason for failure in run.failures] == ["ZeroDivisionError: division by zero"]
+
+
+def test_a_quick_run_names_a_case_that_its_module_does_not_have(fake, device):
+    run = harness.profile(["psd"], [device], seconds=0.01, quick=True)
+    assert run.rows == []
+    reason = f"LookupError: psd has no case 'float32/1e6' on {device.label}, see QUICK_CASES"
+    assert [failure.reason for failure in run.failures] == [reason]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("operation", sorted(harness.QUICK_CASES))
+def test_the_modules_have_the_cases_of_a_quick_run(operation, device):
+    (found,) = harness._cases(operation, device, quick=True)
+    assert found.name == harness.QUICK_CASES[operation]
 
 
 def test_a_section_is_not_repeated_when_the_time_is_over(fake, device):

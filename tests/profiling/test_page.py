@@ -171,6 +171,37 @@ def test_figures_show_the_points_and_the_line_of_equal_times() -> None:
     )
 
 
+def test_intervals_below_95_percent_are_not_shown_and_bars_have_the_colour_and_place_of_their_device() -> None:
+    both = {"ratio_low": 2.25, "ratio_high": 2.75, "fraction": None, "error": 0.0}
+    sure, unsure = both | {"confidence": 0.95}, both | {"confidence": 0.5}
+    pages = [
+        page(Run([row(**first), row(device="intel", **second)], True, MACHINE))
+        for first, second in ((sure, sure), (unsure, sure), (unsure, unsure))
+    ]
+    assert [check_offline(text).text.count("2.25 to 2.75") for text in pages] == [2, 1, 0]
+    bars = [_bars(text) for text in pages]
+    assert [set(each) for each in bars] == [{"#2a85c7", "#d55e00"}, {"#d55e00"}, set()]
+    assert bars[0]["#2a85c7"][1] != bars[0]["#d55e00"][1]
+    for colour, (left, _, right, height) in bars[0].items():
+        x, y = _marks(pages[0], colour)[0]
+        assert left < x < right
+        assert y == pytest.approx(height, abs=1e-3)
+
+
+def _bars(text: str) -> dict[str, tuple[float, float, float, float]]:
+    """Return the ends (x, y, x, y) of the horizontal bars of the first figure by their colour."""
+    svg = text[text.index("<svg") : text.index("</svg>")]
+    found = re.findall(r'<path d="M ([\d.]+) ([\d.]+) \s*L ([\d.]+) ([\d.]+) \s*"[^>]*stroke: (#2a85c7|#d55e00)', svg)
+    return {colour: tuple(map(float, ends)) for *ends, colour in found}  # type: ignore[misc]
+
+
+def _marks(text: str, colour: str) -> list[tuple[float, float]]:
+    """Return the places (x, y) of the marks of the first figure in a colour."""
+    svg = text[text.index("<svg") : text.index("</svg>")]
+    places = re.findall(rf'<use [^>]*x="([\d.]+)" y="([\d.]+)" style="fill: {colour}', svg)
+    return [(float(x), float(y)) for x, y in places]
+
+
 def test_the_summary_of_a_peer() -> None:
     rows = [row(ratio=2.0), row(ratio=0.5), row(ratio=8.0), row(ratio=math.nan), row(ratio=3.0, peer="numpy")]
     first, second = summaries(rows)

@@ -39,8 +39,23 @@ def run(clock: Clock, plan: time_plan.TimePlan, sections: int, cases: int, prepa
 def test_a_run_ends_in_its_time(clock: Clock, cases: int, preparation: float) -> None:
     """Whatever the sections take for preparation, and however many cases they have."""
     plan = time_plan.TimePlan(600.0, 50.0, 40)
-    run(clock, plan, 40, cases, preparation)
-    assert plan.elapsed == pytest.approx(600.0, rel=0.12)
+    granted = run(clock, plan, 40, cases, preparation)
+    assert plan.elapsed == pytest.approx(600.0, rel=1e-6)
+    # All cases have the same time, except in the first section, whose number of cases is not known before.
+    assert granted[cases:] == pytest.approx([granted[-1]] * (39 * cases), rel=1e-6)
+
+
+def test_a_repeated_attempt_does_not_count_as_more_cases(clock: Clock) -> None:
+    plan = time_plan.TimePlan(100.0, 50.0, 2)
+    with plan.section():
+        for _ in range(2):
+            plan.grant()
+        clock.now += 10.0
+        plan.repeat()
+        for _ in range(2):
+            plan.grant()
+    with plan.section():
+        assert plan.grant() == pytest.approx(45.0)
 
 
 def test_no_case_is_measured_longer_than_asked_for(clock: Clock) -> None:
@@ -59,4 +74,16 @@ def test_a_section_is_repeated_only_if_the_others_still_have_time(clock: Clock) 
         clock.now += 40.0
         assert plan.allows_repetition()  # 60 s are left: 40 for the repetition, and 5 to prepare the other section
         clock.now += 15.0
+        assert not plan.allows_repetition()
+
+
+def test_the_time_of_a_repetition_is_that_of_the_last_attempt(clock: Clock) -> None:
+    plan = time_plan.TimePlan(100.0, 2.0, 1)
+    with plan.section():
+        clock.now += 40.0
+        plan.repeat()
+        clock.now += 25.0
+        assert plan.allows_repetition()  # 35 s are left for an attempt of 25 s; the section has taken 65 s
+        plan.repeat()
+        clock.now += 20.0
         assert not plan.allows_repetition()

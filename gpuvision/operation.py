@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from gpuvision.host import Operation
 
@@ -17,4 +17,4 @@ KERNEL_FOLDER = Path(str(importlib.resources.files("gpuvision.kernels")))
 class VisionOperation(Operation[R]):
     """Base of the operations whose kernels are shipped with gpuvision."""
 
-    kernel_folder = KERNEL_FOLDER
+    kernel_folder: ClassVar[Path | None] = KERNEL_FOLDER

@@ -14,6 +14,7 @@ from numpy.typing import DTypeLike
 from gpuvision.host.device import Device
 from gpuvision.host.launch import (
     Launch,
+    Launchable,
     Precision,
     Shape,
     Spec,
@@ -85,7 +86,7 @@ class LaunchBuilder:
 
     def __init__(
         self,
-        operation: object,
+        operation: Launchable,
         device: Device,
         shape: Shape,
         dtype: np.dtype[Any],

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import contextvars
 import functools
+import hashlib
 import json
 import math
 import os
@@ -22,12 +23,17 @@ import numpy as np
 
 from gpuvision.host.cache import cache_folder, read_private, write_private
 from gpuvision.host.device import Device
+from gpuvision.host.files import locked_folder
 from gpuvision.host.kept import clear_with
 from gpuvision.host.kept_numbers import driver_key
+from gpuvision.host.launch import Launchable
 
 VARIABLE = "GPUVISION_TUNING"
 _FILE = "tuned_settings.json"
-_FORMAT = 1  # changes with the meaning of an entry
+_FORMAT = 2  # changes with the meaning of an entry
+# Macros that depend on the size of the input, and not on the parameters of the operation.
+_SIZE_MACROS = frozenset({"PAST_CACHES"})
+Key = tuple[str, str, str, int, str]
 _REMEDY = "defaults apply; run `gpuvision tune` again"
 
 
@@ -97,12 +103,16 @@ _trial: contextvars.ContextVar[TunedSettings | None] = contextvars.ContextVar("t
 
 @dataclass(frozen=True, kw_only=True)
 class TunedEntry:
-    """Settings that were faster than the defaults, with what they were measured on.
+    """Settings that were faster than the defaults, and the operation, input, device and versions of the measurement.
 
     Attributes
     ----------
-    operation, dtype, device, version : str
-        Class of the operation, dtype of its first input, label of the device, version of gpuvision.
+    operation : str
+        Module and qualified name of the operation's class.
+    program : str
+        Digest of the program, see `program_digest`.
+    dtype, device, version : str
+        Dtype of the first input, label of the device, version of gpuvision.
     size_class : int
         See `size_class`.
     driver : tuple of str
@@ -113,6 +123,7 @@ class TunedEntry:
     """
 
     operation: str
+    program: str
     dtype: str
     size_class: int
     device: str
@@ -122,9 +133,9 @@ class TunedEntry:
     gain: float
 
     @property
-    def key(self) -> tuple[str, str, int, str]:
-        """What the entry is found by; driver and version are compared after that."""
-        return (self.operation, self.dtype, self.size_class, self.device)
+    def key(self) -> Key:
+        """Key under which the entry is kept; a lookup compares driver and version after it has found the entry."""
+        return (self.operation, self.program, self.dtype, self.size_class, self.device)
 
     @property
     def origin(self) -> tuple[tuple[str, ...], str]:
@@ -143,12 +154,28 @@ def size_class(shape: Sequence[int]) -> int:
     return max((math.prod(shape).bit_length() - 1) // 2, 0)
 
 
+def program_digest(operation: Launchable, device: Device, shape: Sequence[int], dtype: Any) -> str:
+    """Return a digest of the program that an operation runs with the default settings.
+
+    It covers the kernel, its macros and the dtypes of its outputs. Values of kernel arguments are left out: they do not
+    change the code. Equal digests mean that settings checked for one operation hold for the other.
+    """
+    with trial_of(DEFAULTS):
+        launch = operation.launch(device, tuple(shape), np.dtype(dtype))
+    macros = sorted((name, str(value)) for name, value in launch.defines.items() if name not in _SIZE_MACROS)
+    outputs = [(name, None if spec is None else spec[1].str) for name, spec in launch.outputs.items()]
+    text = repr((launch.source, launch.kernel, macros, outputs))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
 def entry_of(
-    operation: object, device: Device, shape: Sequence[int], dtype: Any, settings: TunedSettings, gain: float
+    operation: Launchable, device: Device, shape: Sequence[int], dtype: Any, settings: TunedSettings, gain: float
 ) -> TunedEntry:
     """Return the entry of an operation for inputs of one size class on a device with its present driver."""
+    kind = type(operation)
     return TunedEntry(
-        operation=type(operation).__name__,
+        operation=f"{kind.__module__}.{kind.__qualname__}",
+        program=program_digest(operation, device, shape, dtype),
         dtype=np.dtype(dtype).name,
         size_class=size_class(shape),
         device=device.label,
@@ -169,15 +196,16 @@ def trial_of(settings: TunedSettings) -> Iterator[None]:
         _trial.reset(token)
 
 
-def settings_for(operation: object, device: Device, shape: Sequence[int], dtype: Any) -> TunedSettings:
+def settings_for(operation: Launchable, device: Device, shape: Sequence[int], dtype: Any) -> TunedSettings:
     """Return the settings of a launch: the kept ones if they fit driver and version, otherwise the defaults.
 
     Warns
     -----
     RuntimeWarning
-        The file of settings is damaged, or its settings are of another driver or version; once per process.
+        The file of settings is damaged, its settings are of another driver or version, or the operation does not offer
+        them; each of these once per process and device.
     """
-    tunable = getattr(type(operation), "tunable", None)
+    tunable: Tunable | None = getattr(type(operation), "tunable", None)
     if tunable is None:
         return DEFAULTS
     trial = _trial.get()
@@ -189,14 +217,20 @@ def settings_for(operation: object, device: Device, shape: Sequence[int], dtype:
     kept = _kept().get(now.key)
     if kept is None:
         return DEFAULTS
-    if kept.origin != now.origin or not tunable.allows(kept.settings):
-        _warn_stale(device.label)
+    if kept.origin != now.origin:
+        _warn_once(f"tuned settings of device {device.label} are of another driver or version of gpuvision")
+        return DEFAULTS
+    if not tunable.allows(kept.settings):
+        name = type(operation).__name__
+        _warn_once(f"{name} does not offer the tuned settings of device {device.label} ({kept.settings})")
         return DEFAULTS
     return kept.settings
 
 
-def keep_entries(entries: Sequence[TunedEntry], tuned: Sequence[tuple[str, str, int, str]]) -> Path:
+def keep_entries(entries: Sequence[TunedEntry], tuned: Sequence[Key]) -> Path:
     """Write entries to the cache folder, in place of the entries of all tuned keys; return the path of the file.
+
+    Processes that keep entries at the same time wait for each other, so that no entry is lost.
 
     Raises
     ------
@@ -204,15 +238,17 @@ def keep_entries(entries: Sequence[TunedEntry], tuned: Sequence[tuple[str, str, 
         The folder is not writable.
     """
     path = cache_folder() / _FILE
-    others = [each for each in _read(path)[0].values() if each.key not in tuned]
-    listed = [asdict(each) for each in (*others, *entries)]
-    write_private(path, json.dumps({"format": _FORMAT, "entries": listed}, indent=1))
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with locked_folder(path.parent):
+        others = [each for each in _read(path)[0].values() if each.key not in tuned]
+        listed = [asdict(each) for each in (*others, *entries)]
+        write_private(path, json.dumps({"format": _FORMAT, "entries": listed}, indent=1))
     _forget()
     return path
 
 
 @functools.cache
-def _kept() -> Mapping[tuple[str, str, int, str], TunedEntry]:
+def _kept() -> Mapping[Key, TunedEntry]:
     """Return the kept entries by their keys, read once per process; warn where the file is damaged."""
     path = cache_folder() / _FILE
     entries, is_damaged = _read(path)
@@ -222,21 +258,20 @@ def _kept() -> Mapping[tuple[str, str, int, str], TunedEntry]:
 
 
 @functools.cache
-def _warn_stale(label: str) -> None:
-    """Warn once per device."""
-    text = f"tuned settings of device {label} are of another driver or version of gpuvision: {_REMEDY}"
-    warnings.warn(text, RuntimeWarning, stacklevel=2)
+def _warn_once(defect: str) -> None:
+    """Warn once of each defect."""
+    warnings.warn(f"{defect}: {_REMEDY}", RuntimeWarning, stacklevel=2)
 
 
 def _forget() -> None:
     _kept.cache_clear()
-    _warn_stale.cache_clear()
+    _warn_once.cache_clear()
 
 
 clear_with(_forget)
 
 
-def _read(path: Path) -> tuple[dict[tuple[str, str, int, str], TunedEntry], bool]:
+def _read(path: Path) -> tuple[dict[Key, TunedEntry], bool]:
     """Return the valid entries of the file, and whether anything in it is damaged."""
     if not os.path.lexists(path):
         return {}, False
@@ -257,7 +292,7 @@ def _entry(read: Any) -> TunedEntry | None:
         return None
     chosen = entry.settings
     is_valid = (
-        all(isinstance(each, str) for each in (entry.operation, entry.dtype, entry.device, entry.version))
+        all(isinstance(each, str) for each in (*entry.key[:3], entry.device, entry.version))
         and all(isinstance(each, str) for each in entry.driver)
         and type(entry.size_class) is int
         and isinstance(entry.gain, float)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,8 @@ from gpuvision.host.tuned_settings import DEFAULTS, Tunable, TunedEntry, TunedSe
 
 # Duration of the calls of one turn [s], and rounds of turns (chosen): a class takes about 0.2 s and 5 ms a candidate.
 _TURN, _SCREENING_ROUNDS, _FINAL_ROUNDS = 5e-4, 5, 41
-# Byte that fills the outputs before a launch: no result of a correct kernel, as float a number of -3e-16.
+# Byte that fills the outputs before a launch. Four such bytes are -2.9e-16 as float32, which no kernel computes from
+# the inputs.
 _POISON = 0xA5
 
 # Runs a call with some settings for a while and returns the time of one call [s].
@@ -124,8 +125,13 @@ def tune(
     default = reference[1]
     trials: dict[TunedSettings, _Trial] = {}
     rejected: dict[TunedSettings, str] = {}
-    for settings in _candidates(operation, tunable, default):
+    seen = {_work_of(default.launch())}
+    for settings in _candidates(tunable, default):
         try:
+            work = _work_of(default.launch(settings))
+            if work in seen:  # the launch of earlier settings
+                continue
+            seen.add(work)
             checked = [_Trial(operation, device, each, settings) for each in inputs]
             reasons = [each.difference(e, tunable) for each, e in zip(checked, expected, strict=True)]
             reason = next(filter(None, reasons), "")
@@ -166,9 +172,14 @@ class _Trial:
         first = inputs[0]
         with trial_of(settings):
             self.bound: Bound[Any] = operation.bind(device, first.shape, first.dtype)
-        self.settings = settings
         for array, values in zip(self.bound.inputs, inputs, strict=True):
             array.set(np.ascontiguousarray(values))
+
+    def launch(self, settings: TunedSettings = DEFAULTS) -> Launch:
+        """Return the launch of the operation with some settings for the inputs of this instance."""
+        first = self.bound.inputs[0]
+        with trial_of(settings):
+            return describe_launch(self.bound.operation, self.bound.device, first.shape, first.dtype)
 
     def result(self) -> dict[str, HostArray]:
         """Launch and return the computed fields. The outputs are filled first, so that a missing write shows."""
@@ -200,15 +211,9 @@ def _agree(values: HostArray, expected: HostArray, tolerance: float) -> bool:
     return bool(others and np.all(np.abs(values[is_finite] - expected[is_finite]) <= limit))
 
 
-def _candidates(operation: Operation[Any], tunable: Tunable, default: _Trial) -> Iterator[TunedSettings]:
-    """Yield settings, each with another launch than the defaults and than the settings before."""
-    device, first = default.bound.device, default.bound.inputs[0]
-
-    def launch_of(settings: TunedSettings) -> Launch:
-        with trial_of(settings):
-            return describe_launch(operation, device, first.shape, first.dtype)
-
-    launch = launch_of(DEFAULTS)
+def _candidates(tunable: Tunable, default: _Trial) -> Iterator[TunedSettings]:
+    """Yield all settings that an operation offers on a device; several may have the same launch."""
+    device, launch = default.bound.device, default.launch()
     may_run_inline = launch.passes_once and launch.nbytes <= MAX_INLINE_BYTES and device.has_inline_queues
     inline = (None, not default.bound.inline) if may_run_inline else (None,)
     if device.prefers_vectors:
@@ -218,18 +223,13 @@ def _candidates(operation: Operation[Any], tunable: Tunable, default: _Trial) ->
             shapes += [TunedSettings(variant="work_item", group=each) for each in groups]
     else:
         shapes = [TunedSettings(group=each) for each in (None, *tunable.groups)]
-    seen = {_work_of(launch)}
     for shape in shapes:
         for each in inline:
-            settings = TunedSettings(variant=shape.variant, strip=shape.strip, group=shape.group, inline=each)
-            work = _work_of(launch_of(settings))
-            if work not in seen:
-                seen.add(work)
-                yield settings
+            yield replace(shape, inline=each)
 
 
 def _work_of(launch: Launch) -> tuple[object, ...]:
-    """Return what tuned settings change in a launch."""
+    """Return the parts of a launch that tuned settings change."""
     return (launch.global_size, launch.local_size, tuple(sorted(launch.defines)), launch.inline)
 
 

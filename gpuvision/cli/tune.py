@@ -12,8 +12,7 @@ from gpuvision.cli.arguments import Overwrite, ReportFile, echo, prints_report, 
 if TYPE_CHECKING:
     from gpuvision.host.tuning import TuningResult
 
-# Size classes of 4^5 = 1024 to 4^11 = 4 million elements (chosen): smaller launches are shorter than their overhead,
-# larger ones are bound by the memory in every setting.
+# Size classes of 4^5 = 1024 to 4^11 = 4 million elements (chosen).
 _CLASSES = range(5, 11)
 
 
@@ -35,10 +34,11 @@ def tune(
 ) -> None:
     """Find faster settings of the operations on this machine: work-group sizes, strips, kernel variants.
 
-    Each operation is measured on inputs of 1 thousand to 4 million elements. Settings win only if their results are the
+    Each operation is timed on inputs of about 2400 to 2.4 million elements. Settings win only if their results are the
     results of the defaults, and if they are faster by more than the measured spread. The winners are kept in the cache
-    folder of gpuvision; every operation that is bound later uses them, until the driver or the version of gpuvision
-    changes. GPUVISION_TUNING=off ignores them.
+    folder of gpuvision. Every operation of the same configuration (class, kernel, build options, types of input and
+    results) that is bound later uses them, until the driver or the version of gpuvision changes. Other configurations,
+    for example a PSD with a triangulation, keep the defaults. GPUVISION_TUNING=off ignores the settings.
     """
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
@@ -56,16 +56,18 @@ def tune(
     for each in devices:
         for name in operations or tuning_inputs.NAMES:
             echo(f"{name} on {each.label}", err=True)
+            found: list[TuningResult] = []
             for operation, make in tuning_inputs.cases(name):
                 is_possible = each.has_double or make(2)[0].dtype != "float64"
-                results += [tuned(operation, make, each, size) for size in _CLASSES if is_possible]
+                found += [tuned(operation, make, each, size) for size in _CLASSES if is_possible]
+            results += found
+            if not dry_run:
+                # After each operation, so that an interrupted command keeps the winners found so far.
+                entries = [result.entry for result in found]
+                winners = [entry for entry in entries if entry.settings != DEFAULTS]
+                echo(f"kept in {keep_entries(winners, [entry.key for entry in entries])}", err=True)
     write_report(as_json, [_described(each) for each in results], outputs)
     _show(results, to_stderr=prints_report(as_json))
-    if dry_run:
-        return
-    entries = [each.entry for each in results]
-    path = keep_entries([each for each in entries if each.settings != DEFAULTS], [each.key for each in entries])
-    echo(f"kept in {path}", err=True)
 
 
 def _described(result: TuningResult) -> dict[str, object]:

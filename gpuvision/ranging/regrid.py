@@ -380,7 +380,7 @@ class _Pass(VisionOperation[R]):
         return self.regrid.grid.columns if self.direction[-1] == "x" else self.regrid.grid.rows
 
     def _builder(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> LaunchBuilder:
-        build = LaunchBuilder(self.regrid, device, shape, dtype, precision=self.regrid.precision)
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.regrid.precision, name="Regrid")
         build.check_dtype("float32", "float64", of="points")
         build.check_shape(len(shape) == 2 and 0 not in shape, "arrays (profiles, samples) with one sample at least")
         return build

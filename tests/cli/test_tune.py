@@ -14,6 +14,7 @@ from gpuvision.cli.main import application
 from gpuvision.host import Device, clear_cache, tuning
 from gpuvision.host.tuned_settings import TunedSettings, entry_of
 from gpuvision.host.tuning import TuningResult
+from gpuvision.ranging.merge_heights import MergeHeights
 
 STRIP = TunedSettings(strip=2048)
 
@@ -98,6 +99,23 @@ def test_a_dry_run_keeps_nothing(cache: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "strip 2048" in result.output
     assert not cache.exists()
+
+
+def test_an_interrupted_command_keeps_the_winners_of_the_operations_before(
+    cache: Path, tuned: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measure = tuning.tune
+
+    def fail(operation: Any, make: Any, device: Device, size: int) -> TuningResult:
+        if isinstance(operation, MergeHeights):
+            raise KeyboardInterrupt
+        return measure(operation, make, device, size)
+
+    monkeypatch.setattr(tuning, "tune", fail)
+    result = CliRunner().invoke(application(), ["tune", "psd", "merge_heights", "--device", Device.best().label])
+    assert result.exit_code != 0
+    assert len(tuned) == 12
+    assert {each["dtype"] for each in json.loads(cache.read_text())["entries"]} == {"uint16"}
 
 
 def test_unknown_operations_are_named(tuned: list[Any]) -> None:

@@ -132,6 +132,22 @@ def test_a_tolerance_allows_small_differences_only(scale: Scale, device: Device)
     assert {each.group for each in result.rejected} == {16, 32}
 
 
+class Refusing(Scale):
+    """Scale that describes no launch with groups of 32."""
+
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        launch = super().launch(device, shape, dtype)
+        if launch.local_size == (32,):
+            raise ValueError("no groups of 32")
+        return launch
+
+
+def test_settings_that_the_operation_refuses_are_rejected(scale: Scale, device: Device) -> None:
+    result = tune(Refusing(), ramp, tune_devices(device), 3, stopwatch=stopwatch(groups(g64=0.5)))
+    assert result.best == TunedSettings(group=64)
+    assert result.rejected[TunedSettings(group=32)] == "no groups of 32"
+
+
 def test_a_result_that_changes_during_the_timed_calls_does_not_win(scale: Scale, device: Device) -> None:
     calls = 0
 
@@ -242,10 +258,29 @@ def test_kept_settings_are_found_by_operation_type_size_and_device(device: Devic
     assert kept_for(other) == DEFAULTS
 
 
+class OtherReadout(PsdReadout):
+    """Another class with the program of `PsdReadout`."""
+
+
+@pytest.mark.usefixtures("cache")
+def test_kept_settings_hold_for_one_class_and_program(device: Device) -> None:
+    """Numbers that are arguments of the kernel do not matter; outputs and build options do."""
+    keep_entries([entry(device, STRIP)], [])
+
+    def kept(operation: PsdReadout) -> TunedSettings:
+        return settings_for(operation, device, (1000, 2), SINGLE)
+
+    assert kept(PsdReadout(strip_length=9e-3, minimum_total=1e-9)) == STRIP
+    for changes in ({"outputs": ("position",)}, {"right_gain": 1.1}, {"precision": "double"}):
+        if changes.get("precision") is None or device.has_double:
+            assert kept(PsdReadout(strip_length=6e-3, **changes)) == DEFAULTS  # type: ignore[arg-type]
+    assert kept(OtherReadout(strip_length=6e-3)) == DEFAULTS
+
+
 @pytest.mark.usefixtures("cache")
 def test_a_bound_instance_takes_kept_settings(device: Device) -> None:
     readout = PsdReadout(strip_length=6e-3, variant="work_item")
-    keep_entries([entry(device, GROUP)], [])
+    keep_entries([entry_of(readout, device, (1000, 2), SINGLE, GROUP, 1.5)], [])
     assert readout.bind(device, (1000, 2), SINGLE).enqueue_arguments[3] == (128,)
     with trial_of(TunedSettings(group=32)):
         assert readout.bind(device, (1000, 2), SINGLE).enqueue_arguments[3] == (32,)
@@ -287,7 +322,8 @@ def test_the_variable_ignores_kept_settings(device: Device, monkeypatch: pytest.
 
 @pytest.mark.usefixtures("cache")
 def test_tuning_again_replaces_only_what_was_tuned(device: Device) -> None:
-    first, second = entry(device, STRIP), entry(device, STRIP, dtype="uint16")
+    codes = entry_of(PsdReadout(strip_length=6e-3), device, (1000, 2), np.uint16, STRIP, 1.5)
+    first, second = entry(device, STRIP), codes
     keep_entries([first, second], [])
     keep_entries([], [first.key])
     assert kept_for(device) == DEFAULTS
@@ -295,18 +331,22 @@ def test_tuning_again_replaces_only_what_was_tuned(device: Device) -> None:
 
 
 @pytest.mark.usefixtures("cache")
-@pytest.mark.parametrize(
-    ("settings", "changes"),
-    [(STRIP, {"driver": ("other",)}), (STRIP, {"version": "0.0"}), (TunedSettings(strip=1000), {})],
-    ids=["driver", "version", "value"],
-)
-def test_stale_settings_are_named_once_and_not_used(
-    device: Device, settings: TunedSettings, changes: dict[str, Any]
-) -> None:
-    keep_entries([entry(device, settings, **changes)], [])
+@pytest.mark.parametrize("changes", [{"driver": ("other",)}, {"version": "0.0"}], ids=["driver", "version"])
+def test_stale_settings_are_named_once_and_not_used(device: Device, changes: dict[str, Any]) -> None:
+    keep_entries([entry(device, STRIP, **changes)], [])
     (message,) = warned(device)
     assert message == (
         f"tuned settings of device {device.label} are of another driver or version of gpuvision: defaults apply; run "
+        "`gpuvision tune` again"
+    )
+
+
+@pytest.mark.usefixtures("cache")
+def test_settings_that_the_operation_does_not_offer_are_named_once_and_not_used(device: Device) -> None:
+    keep_entries([entry(device, TunedSettings(strip=1000))], [])
+    (message,) = warned(device)
+    assert message == (
+        f"PsdReadout does not offer the tuned settings of device {device.label} (strip 1000): defaults apply; run "
         "`gpuvision tune` again"
     )
 
@@ -324,8 +364,9 @@ def damaged(text: str, **changes: Any) -> str:
         lambda _: "",
         lambda text: text[:-20],
         lambda _: "[]",
-        lambda _: '{"format": 1}',
-        lambda text: text.replace('"format": 1', '"format": 99'),
+        lambda _: '{"format": 2}',
+        lambda text: text.replace('"format": 2', '"format": 99'),
+        lambda text: damaged(text, program=5),
         lambda text: damaged(text, size_class="5"),
         lambda text: damaged(text, driver=[1]),
         lambda text: damaged(text, settings={"strip": -1}),

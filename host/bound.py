@@ -27,8 +27,8 @@ _COMPLETE = cl.command_execution_status.COMPLETE
 # Launches that move fewer bytes run inline. Measured: one core of a PC moves 1 MiB in about the time that PoCL needs to
 # wake two worker threads.
 _SHORT_BYTES = 1 << 20
-# The same where it was measured on this machine that they gain (`Launch.inline`). Chosen: half the bytes of the default
-# batch of a stream, whose host work should overlap with the kernels.
+# Limit for launches whose tuned settings ask for the calling thread (`Launch.inline`). Chosen: half the bytes of the
+# default batch of a stream, because the host work of a stream should overlap with the kernels.
 MAX_INLINE_BYTES = 2 << 20
 
 
@@ -339,8 +339,8 @@ class Bound(Generic[R]):
                 if not is_array or array.dtype != dtype or array.shape != shape or array.context != context:
                     self._check(array, shape, dtype)
                 changed.append((place, known.get(id(array)) or memory_of(array)))
-        # As many memory objects as arrays: none is shared. Fewer: an input is given twice, or arrays are empty, or an
-        # output is refused.
+        # If every array has its own memory object, no output shares memory with another array. Otherwise an input is
+        # given twice, arrays are empty (which is allowed), or an output shares memory (which is refused).
         if changed and len({id(array.base_data) for array in given}) < len(given):
             inputs = len(self.inputs)
             _check_apart(given[:inputs], given[inputs:], _same_memory)

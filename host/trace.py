@@ -36,7 +36,8 @@ _LANES = {
 }
 _COMPLETE = cl.command_execution_status.COMPLETE
 # Allowed contradiction between bounds of the offset of two clocks (chosen): [ns] for the resolution of the times, and
-# the drift of two oscillators, 1e-4 off at most. Mesa's rusticl 22.3 counts 0, 1, 2, 3 instead of nanoseconds.
+# five times the drift of two oscillators that are 1e-4 off each. Mesa's rusticl 22.3 counts 0, 1, 2, 3 instead of
+# nanoseconds.
 _OFFSET_ERROR, _CLOCK_DRIFT = 1_000_000, 1e-3
 _PENDING = 512  # events whose times are not read yet; more are read as they complete (bounds the memory)
 
@@ -101,8 +102,7 @@ class Trace:
         self._executed: list[_Executed] = []
         self._count = self._left_out = self._without_times = 0
         self._lanes: dict[Hashable, str] = {}
-        self._streams: set[int] = set()
-        self._stream_queues: set[Any] = set()
+        self._streams: dict[int, frozenset[Any]] = {}  # queues of the open streams
 
     def __enter__(self) -> Trace:
         """Check that the file can be written, and record from now on."""
@@ -186,18 +186,22 @@ class Trace:
         """Return the number of a new stream. Launches in its queues are recorded by the stream alone."""
         with self._lock:
             number = next(each for each in range(1, len(self._streams) + 2) if each not in self._streams)
-            self._streams.add(number)
-            self._stream_queues.update(queues)
+            self._streams[number] = frozenset(queues)
             return number
 
     def end_stream(self, number: int) -> None:
-        """Free the number of a stream, and with it its lanes, for the next stream."""
+        """Free the number, the lanes and the queues of a stream.
+
+        The next stream takes the number and the lanes. An operation that is bound to one of the queues from now on
+        records its launches.
+        """
         with self._lock:
-            self._streams.discard(number)
+            self._streams.pop(number, None)
 
     def is_of_stream(self, queue: Any) -> bool:
         """Return whether a queue belongs to a stream, which records its launches."""
-        return queue in self._stream_queues
+        with self._lock:
+            return any(queue in queues for queues in self._streams.values())
 
     def add(self, spans: dict[str, tuple[int, int]], number: int, count: int, *, stream: int = 1) -> None:
         """Add the stages of a batch of a stream.
@@ -226,19 +230,24 @@ class Trace:
             self._count += 1
 
     def _has_room(self, count: int) -> bool:
-        """Return whether so many spans fit the limit, and count those that do not."""
+        """Return whether `count` more spans fit the limit; if not, count them as left out."""
         fits = self._count + len(self._pending) + count <= self.limit
         self._left_out += 0 if fits else count
         return fits
 
     def _read_times(self, *, wait: bool) -> None:
-        """Read the device times of the completed commands, or wait for all commands."""
+        """Read the device times of the completed commands, or wait for all commands.
+
+        Commands of a queue complete in order: the commands after the first incomplete command are not asked.
+        """
         left: list[_Enqueued] = []
+        busy: set[Any] = set()
         for command in self._pending:
             try:
                 if wait:
                     command.event.wait()
-                elif command.event.command_execution_status > _COMPLETE:
+                elif command.queue in busy or command.event.command_execution_status > _COMPLETE:
+                    busy.add(command.queue)
                     left.append(command)
                     continue
                 profile = command.event.profile
@@ -250,31 +259,31 @@ class Trace:
             self._count += 1
         self._pending = left
 
-    def _device_spans(self) -> list[_Span]:
-        """Return the commands of all queues on the clock of the host.
+    def _device_spans(self) -> tuple[list[_Span], int]:
+        """Return the commands of all queues on the clock of the host, and the number of commands left out.
 
         A command is queued during the call that enqueues it. Each command therefore bounds the offset between the
         clocks of a queue and of the host from both sides; the estimate is the middle of the tightest bounds. Spans of a
         queue have one offset, so that they overlap no more than the device reports. Where bounds contradict each other,
-        the times of the queue are of no clock, and its commands are left out.
+        the runtime does not report clock times, and the commands of the queue are left out.
         """
         queues: dict[Any, list[_Executed]] = {}
         for each in self._executed:
             queues.setdefault(each.command.queue, []).append(each)
-        spans = []
+        spans, left_out = [], 0
         for number, (queue, executed) in enumerate(queues.items(), 1):
             low = max(each.command.before - each.queued for each in executed)
             high = min(each.command.after - each.queued for each in executed)
             begun = [each.command.before for each in executed]
             if low - high > _OFFSET_ERROR + _CLOCK_DRIFT * (max(begun) - min(begun)):
-                self._without_times += len(executed)
+                left_out += len(executed)
                 continue
             offset = (low + high) // 2
             self._lanes[queue] = f"{_DEVICE} {queue.device.name.strip()}, queue {number}"
             for each in executed:
                 arguments = {"of": each.command.subject}
                 spans.append(_Span(queue, each.command.name, each.start + offset, each.end + offset, arguments))
-        return spans
+        return spans, left_out
 
     def write(self) -> None:
         """Write the file atomically.
@@ -286,7 +295,10 @@ class Trace:
         """
         with self._lock:
             self._read_times(wait=True)
-            spans = [*self._spans, *self._device_spans()]
+            on_device, without_clock = self._device_spans()
+            spans = [*self._spans, *on_device]
+            without_times = self._without_times + without_clock
+            beyond = self._left_out
             lanes = _lanes_of(spans, self._lanes)
         origin = min((span.start for span in spans), default=0)
         events: list[dict[str, Any]] = [
@@ -297,7 +309,7 @@ class Trace:
             for span in inside:
                 event = {"ph": "X", "name": span.name, "pid": 1, "tid": tid, "args": span.arguments}
                 events.append(event | {"ts": (span.start - origin) / 1e3, "dur": (span.end - span.start) / 1e3})
-        left_out = {"spans beyond the limit": self._left_out, "commands without device times": self._without_times}
+        left_out = {"spans beyond the limit": beyond, "commands without device times": without_times}
         tree = {"traceEvents": events, "displayTimeUnit": "ns", "otherData": left_out}
         Outputs("trace", overwrite=self.overwrite).write_text(self.path, json.dumps(tree))
 

@@ -12,10 +12,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 import gpuvision as gv
 from gpuvision.host import Device, Pipeline, Trace
+from gpuvision.host import trace as trace_module
 from gpuvision.host.bound import Bound
 from gpuvision.host.outputs import Outputs
 from gpuvision.host.reading import reading
@@ -133,6 +135,39 @@ def test_times_that_are_of_no_clock_are_left_out(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "t.json").read_text())["otherData"]["commands without device times"] == 3
 
 
+def test_writing_twice_counts_commands_once(tmp_path: Path) -> None:
+    trace = Trace(tmp_path / "t.json")
+    queue = type("Queue", (), {"device": SimpleNamespace(name="fake")})()
+    for number in range(3):
+        before = 10_000_000 * number
+        trace.add_event(queue, "compute", "op", FakeEvent(0, 2, 3), before, before + 1000)
+    trace.write()
+    first = (tmp_path / "t.json").read_bytes()
+    trace.write()
+    assert (tmp_path / "t.json").read_bytes() == first
+
+
+def test_polling_stops_at_the_first_incomplete_command_of_a_queue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    class Running(FakeEvent):
+        """Command that has not completed."""
+
+        @property
+        def command_execution_status(self) -> int:
+            asked.append("running")
+            return int(cl.command_execution_status.RUNNING)
+
+    monkeypatch.setattr(trace_module, "_PENDING", 4)
+    trace = Trace(tmp_path / "t.json")
+    queues = [type("Queue", (), {"device": SimpleNamespace(name=name)})() for name in ("one", "other")]
+    for number in range(4):
+        trace.add_event(queues[number % 2], "compute", "op", Running(0, 2, 3), 0, 1000)
+    assert asked == ["running"] * 2
+
+
 def test_copies_are_recorded_where_memory_is_not_shared(
     tmp_path: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -173,6 +208,37 @@ def test_a_stream_records_its_stages_and_no_launch_twice(tmp_path: Path, device:
     assert not any(each["name"] == "launch" for each in lanes["host"])
     computed = [each for name, spans in lanes.items() if "compute" in name for each in spans]
     assert len(computed) == 8
+
+
+def test_a_stream_that_outlives_the_block_does_not_write_the_file(tmp_path: Path, device: Device) -> None:
+    with Trace(tmp_path / "t.json"):
+        stream = Pipeline(CURRENTS, READOUT, device=device, batch=2)
+        stream.__enter__()
+        next(stream)
+    written = (tmp_path / "t.json").read_bytes()
+    list(stream)
+    stream.close()
+    assert (tmp_path / "t.json").read_bytes() == written
+
+
+def test_a_stream_counts_all_stages_beyond_the_limit(tmp_path: Path, device: Device) -> None:
+    def stages(limit: int) -> tuple[int, int]:
+        file = tmp_path / f"{limit}.json"
+        Pipeline(CURRENTS, READOUT, device=device, batch=2, trace=Trace(file, limit=limit)).run()
+        left_out = json.loads(file.read_text())["otherData"]["spans beyond the limit"]
+        return sum(map(len, spans_by_lane(file).values())), left_out
+
+    total, none = stages(1000)
+    assert none == 0
+    assert stages(0) == (0, total)
+
+
+def test_the_queues_of_a_stream_are_free_after_its_end(tmp_path: Path, device: Device) -> None:
+    trace, queue = Trace(tmp_path / "t.json"), device.new_queue()
+    number = trace.begin_stream(queue)
+    assert trace.is_of_stream(queue)
+    trace.end_stream(number)
+    assert not trace.is_of_stream(queue)
 
 
 def test_streams_at_the_same_time_have_lanes_of_their_own(tmp_path: Path, device: Device) -> None:

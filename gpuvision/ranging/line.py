@@ -180,9 +180,9 @@ class LineReadout(VisionOperation[LineReading]):
     Error: integer samples are summed exactly. The rounding errors of float32 sums are kept in a second number
     (compensated summation). The rounding error of the position is a few ulp.
 
-    The position of ``"ml"`` is within 1e-4 px of the maximum of the likelihood where noise scatters it by less than
-    0.1 px. Lines with a sigma of 1.6 to 12 px are fitted as Gaussians sampled at the pixels, several times as fast as
-    the integrals over pixels of other lines.
+    The position of ``"ml"`` is within 1.5e-4 px of the maximum of the likelihood where noise scatters it by less than
+    0.1 px. Lines with a sigma from 1.6 px to the smaller of 12 px and `window` are fitted as Gaussians sampled at the
+    pixels, several times as fast as the integrals over pixels of other lines.
 
     Noise: the variance of a sample is ``read_noise**2 + gain * level``, plus 1/12 for integer frames (quantisation).
     ``sigma`` is its effect on the estimator, to first order:

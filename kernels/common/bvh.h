@@ -1,8 +1,10 @@
 // Bounding volume hierarchy (BVH): nodes with 16 children, leaves with 16 triangles; rays are traced one after the
 // other.
 //
-// One ray is tested against 16 boxes or 16 triangles at once, so unrelated rays cost as much as neighbouring rays. The 16
-// are a vector in the vector variant, else a loop. gpuvision/simulation/scene/bvh.py builds the tree.
+// One ray is tested against 16 boxes or 16 triangles at once; the 16 are a vector in the vector variant, else a loop. No
+// work is shared between rays, so bvh_closest costs the same for unrelated and for neighbouring rays. bvh_any costs less
+// for neighbouring rays: a ray first tests the leaf that occluded the ray before it (bvh_occluder).
+// gpuvision/simulation/scene/bvh.py builds the tree.
 //
 // Build options: BVH_DEPTH, not less than the number of nodes on any path from the root; REAL_IS_DOUBLE; VECTOR_VARIANT.
 //
@@ -182,7 +184,7 @@ INLINE int bvh_next(const bvh_ray *ray, int axis, uint met) {
     return per < 0 ? 31 - (int)clz(met) : lowest_bit(met);
 }
 
-// Leaf that occluded the previous ray of a sequence, and how far the sequence can be trusted to meet it again.
+// Leaf that occluded the last occluded ray of a sequence, and `trust`, a counter of repeated occluders.
 //
 // Neighbouring shadow rays are often occluded by the same leaf. A ray tests this leaf before it traverses the tree if
 // `trust` is positive. Each occluded ray adds 1 to `trust` if the same leaf occludes it again, else subtracts 1, whether
@@ -199,7 +201,14 @@ INLINE void bvh_remember(bvh_occluder *last, int leaf) {
     last->leaf = leaf;
 }
 
-// Whether the ray meets any triangle. The result does not depend on `last`.
+// Whether the ray meets any triangle.
+//
+// The result does not depend on `last` if every triangle that bvh_triangles accepts lies in boxes that bvh_boxes accepts.
+// The two round differently where a ray passes an edge or ends on a triangle. To first order, epsilon = 2^-23 in single
+// precision: bvh_triangles moves a corner across the ray by at most half an epsilon of its distance along that axis and two
+// epsilon of the ray's own travel along the axis, and t by about 6 epsilon. bvh_boxes allows 4 epsilon of the largest
+// coordinate (padding by the host), 2 epsilon of the origin (bvh_bounds), and 8 epsilon of t (BOX_SLACK). This is an
+// estimate, no proof; test_rays.py compares orders of rays to edges, corners and surfaces.
 INLINE int bvh_any(const bvh_tree *tree, const bvh_ray *ray, bvh_occluder *last) {
     int nodes[BVH_DEPTH];
     uint left[BVH_DEPTH];

@@ -20,7 +20,8 @@ kernel void distance_map(global const float *restrict at_x, global float *restri
     const size_t column = get_global_id(0), row = get_global_id(1), i = row * columns + column;
     if (column >= columns) return;
     const float x = at_x[column], y = first_y + (float)row * cell;
-    // The NEAREST smallest distances and their shapes, by insertion. The last place takes the one that drops out.
+    // The NEAREST smallest distances and their shapes, by insertion. Element NEAREST receives the shape that
+    // drops out of the list.
     float distance[NEAREST + 1];
     int which[NEAREST + 1];
     for (int place = 0; place < NEAREST; place++) {

@@ -13,7 +13,7 @@
 // line_ml.h; the next ones are Newton's method, with the second derivatives of m and the derivative of the weights.
 // Newton's method converges quadratically also with noise, so that one such step usually is enough.
 //
-// Lanes that the fit does not serve are left to fit_integrals(): narrow and very wide lines, lines far from the peak, fits
+// Other lanes are left to fit_integrals(): narrow and very wide lines, lines far from the peak, fits
 // that do not converge in POINT_STEPS.
 #ifndef LINE_POINT_FIT_H
 #define LINE_POINT_FIT_H
@@ -39,8 +39,8 @@ typedef struct {
     reals g0, g1, g2, g3, g4, h0, h1, h2, h, e0, e1, e2, e3, e4, e;
 } PointSums;
 
-// 1 / x to 14 bits, and to single precision but for one or two ulp. Intel's runtime takes about 60 cycles for a division
-// of 16 lanes, several times as long as these.
+// 1 / x. rough_reciprocal: 14 correct bits. reciprocal: one Newton step more, error at most 2 ulp. Intel's runtime takes
+// about 60 cycles for a division of 16 lanes, several times as long as these.
 #if defined(VECTOR_VARIANT) && defined(__AVX512F__) && !defined(REAL_IS_DOUBLE) && \
     __has_builtin(__builtin_ia32_rcp14ps512_mask)
 static inline reals rough_reciprocal(reals x) { return __builtin_ia32_rcp14ps512_mask(x, x, (ushort)0xffff); }
@@ -180,35 +180,37 @@ static inline Gaussian choose_gaussian(ints mask, Gaussian yes, Gaussian no) {
     return chosen;
 }
 
-// Lanes whose line this fit serves.
-static inline ints is_served(const Gaussian *at) {
+// Lanes with a width, a position and an amplitude for which this fit is accurate.
+static inline ints in_range(const Gaussian *at) {
     return int_mask(at->sigma >= (real)POINT_NARROWEST) & int_mask(at->sigma <= (real)min(RADIUS, POINT_WIDEST)) &
            int_mask(fabs(at->position) <= (real)POINT_FARTHEST) & int_mask(at->amplitude > 0);
 }
 
-// Fit the lanes of `wanted` from the start values `at`, whose sigma is replaced by the root of sigma^2 + 1/12. Return
-// the lanes that are fitted. Lanes that converged are not changed any more, so that a reading does not depend on its
-// neighbours.
+// Fit the lanes of `wanted` from the start values `at`, whose sigma is that of the samples and thus contains the variance
+// of a pixel's width. Return the lanes that are fitted. Lanes that converged are not changed any more, so that a reading
+// does not depend on its neighbours. Under NOISE, sigma and amplitude become those of the Gaussian that is integrated over
+// pixels: a smaller sigma, and a larger amplitude with the same product.
 static inline ints fit_points(const reals *samples, Gaussian *at, ints wanted, SampleNoise noise) {
-    ints moving = wanted & is_served(at);
+    ints moving = wanted & in_range(at);
     ints settled = 0;
-    at->sigma += (real)(1.0 / 24) * reciprocal(at->sigma);  // the root of sigma^2 + 1/12, nearly
     if (!any_lane(to_masks(moving))) return settled;
     PointSums sums = point_sums(samples, at, noise, 0);
     PointStep step = point_step(at, &sums, 0);
-    moving &= int_mask(step.change <= (real)POINT_LARGEST) & is_served(at);
+    moving &= int_mask(step.change <= (real)POINT_LARGEST) & in_range(at);
     for (int n = 0; n < POINT_STEPS && any_lane(to_masks(moving)); n++) {
         sums = point_sums(samples, at, noise, 1);
         Gaussian next = *at;
         step = point_step(&next, &sums, 1);
         *at = choose_gaussian(moving, next, *at);
-        moving &= int_mask(step.change <= (real)POINT_LARGEST) & is_served(at);
+        moving &= int_mask(step.change <= (real)POINT_LARGEST) & in_range(at);
         const ints now = moving & int_mask(step.move * step.change <= (real)POINT_SETTLED);
         settled |= now;
         moving &= ~now;
     }
 #ifdef NOISE
-    at->sigma = sqrt(lane_max(at->sigma * at->sigma - (real)(1.0 / 12), (reals)1));
+    const reals sampled = at->sigma;
+    at->sigma = sqrt(lane_max(sampled * sampled - (real)(1.0 / 12), (reals)1));
+    at->amplitude *= sampled / at->sigma;
 #endif
     return settled;
 }

@@ -133,6 +133,19 @@ def test_sigma_is_the_scatter(device, rng, method, draws):
         assert scatter_ratio(readout(digitised(rng, count, **line), device=device)) == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.parametrize("variant", ["vector", "work_item"])
+def test_sigma_of_the_fit_is_continuous_in_the_width(device, variant):
+    """Lines below and above 1.6 px are fitted by different models; both have the Cramer-Rao bound of the window."""
+    places = np.linspace(-0.45, 0.45, 32)
+    noise = {"read_noise": READ_NOISE, "gain": 1.0}
+    readout = LineReadout(method="ml", window=8, variant=variant, outputs=("position", "sigma"), **noise)
+    for sigma in (1.59, 1.61, 2.5):
+        light = pixel_gaussian(np.arange(LENGTH)[:, None], LENGTH // 2 + places, sigma, 2000.0, BACKGROUND)
+        reading = readout(light.astype(np.float32), device=device)
+        bounds = [cramer_rao(sigma, 2000.0, BACKGROUND, READ_NOISE, 17, [8 + place]) for place in places]
+        np.testing.assert_allclose(reading.sigma, bounds, rtol=1.5e-3)
+
+
 @pytest.mark.parametrize(
     ("method", "dtype", "along", "variant"),
     [

@@ -136,6 +136,28 @@ def test_occlusion_does_not_depend_on_the_order(
     assert sure.mean() > 0.5
 
 
+@WAYS
+def test_rays_to_edges_and_surfaces_do_not_depend_on_the_order(
+    device: Device, variant: Any, dtype: Any, rng: np.random.Generator
+) -> None:
+    """Rays that end on an edge, a corner or a surface, or pass there: rounding decides, whichever leaf is tested first."""
+    corners = soup(rng, 300)
+    weights = rng.dirichlet(np.ones(3), (80, 24))
+    weights[:, :8, 2] = 0.0  # on an edge
+    weights[:, :2] = (1.0, 0.0, 0.0)  # on a corner
+    weights /= weights.sum(axis=2, keepdims=True)
+    targets = weights @ corners[rng.integers(0, 300, 80)]
+    origins = rng.uniform(-1.0, 1.0, (80, 1, 3)) * rng.choice([1.0, 30.0], (80, 1, 1))
+    ends = origins + rng.choice([1.0, 1.0 + 1e-5, 1.5], (80, 24, 1)) * (targets - origins)
+    fans = np.concatenate([np.broadcast_to(origins, ends.shape), ends], axis=2).reshape(-1, 6).astype(dtype)
+    any_hit = AnyHit(scene=Scene(corners), variant=variant)
+    occluded = any_hit(fans, device=device).occluded
+    for order in (np.arange(len(fans))[::-1], rng.permutation(len(fans))):
+        again = any_hit(np.ascontiguousarray(fans[order]), device=device).occluded
+        np.testing.assert_array_equal(again, occluded[order])
+    assert 0.3 < occluded.mean() < 0.99
+
+
 def test_as_embree_says(device: Device, rng: np.random.Generator) -> None:
     rtcore_scene = pytest.importorskip("embreex.rtcore_scene", reason="the extra 'test' is not installed")
     construction = pytest.importorskip("embreex.mesh_construction", reason="the extra 'test' is not installed")

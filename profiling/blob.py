@@ -530,7 +530,6 @@ def _case(device: Device, count: int) -> Case:
     }
     peers: dict[str, Peer] = {
         "numba": calls,
-        "numba-plain": calls["triples"],
         "opencv": lambda: _moments(image, places),
     }
     return Case("blob", str(count), bound.run, peers, float(np.max(np.abs(ours - true))), metadata=metadata)

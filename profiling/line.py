@@ -167,6 +167,8 @@ def _peers(readout: LineReadout, frames: Frames, across: Frames, ours: Any) -> d
     levels = fit if readout.method == "ml" else fit[:2].astype(np.uint8)
 
     def call(form: Any, frames: Frames, levels: NDArray[Any]) -> Callable[[], object]:
+        for each, unset in zip(results, (0.0, 0, 255), strict=True):
+            each[...] = unset
         form(frames, levels, WINDOW, *results)
         _check_peer(readout, ours, results)
         return lambda: form(frames, levels, WINDOW, *results)

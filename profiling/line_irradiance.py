@@ -25,6 +25,8 @@ from gpuvision.profiling.harness import Case
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
 
 _BLOCK = 512
+# Largest difference of the two Numba loops over the largest irradiance: single precision, sums of up to 64 segments.
+_AGREEMENT = 1e-5
 F = np.float32
 ZERO, HALF, ONE, QUARTER, TURN, TINY = F(0.0), F(0.5), F(1.0), F(np.pi / 2.0), F(np.pi), F(1e-24)
 # Minimax polynomial in z^2 of atan(z) / z on [0, 1]; largest error 1.6e-8.
@@ -110,7 +112,11 @@ def _case(device: Device, segments: LitSegments, receivers: NDArray[np.float32],
     bound.inputs[0].set(receivers)
     ours = to_numpy(bound.run().irradiance)
     table, out = adaptive.segment_table(segments), np.empty(len(receivers), np.float32)
+    plain = np.full_like(out, np.nan)
     _numba(receivers, table, out)
+    _numba_plain(receivers, table, plain)
+    if not _error(plain, out) < _AGREEMENT:
+        raise AssertionError("the plain Numba loop and the expert's loop differ")
     exact = LineIrradiance(segments=segments, precision="double")
     truth = to_numpy(exact(receivers, device=device).irradiance) if device.has_double else np.full(len(out), np.nan)
     pairs = len(segments.exitance) * len(receivers)

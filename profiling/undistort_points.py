@@ -49,8 +49,8 @@ _TERMS = 7  # of the series of the peer
 _STEPS = {"float32": 2, "float64": 5}  # of the peer
 # Largest error of the peer [px]: in single precision two roundings of a pixel above 1024, as ours.
 _AGREEMENT = {"float32": 2.5e-4, "float64": 1e-11}
-# The plain loop subtracts the measured point from a distorted one and adds the step to a position of order 1: it has about
-# twice the roundings in single precision (measured: 2.7e-4 px for 1e6 points).
+# The plain loop subtracts the measured point from a distorted one and adds the step to a position of order 1: it has
+# about twice the roundings in single precision (measured: 2.7e-4 px for 1e6 points).
 _PLAIN_AGREEMENT = {name: 2.0 * limit for name, limit in _AGREEMENT.items()}
 _DEFAULT = (cv2.TERM_CRITERIA_COUNT, 5, 0.01)
 _CONVERGED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)

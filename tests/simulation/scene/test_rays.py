@@ -140,7 +140,7 @@ def test_occlusion_does_not_depend_on_the_order(
 def test_rays_to_edges_and_surfaces_do_not_depend_on_the_order(
     device: Device, variant: Any, dtype: Any, rng: np.random.Generator
 ) -> None:
-    """Rays that end on an edge, a corner or a surface, or pass there: rounding decides, whichever leaf is tested first."""
+    """Rays that end on or pass an edge, a corner or a surface: rounding decides, whichever leaf is tested first."""
     corners = soup(rng, 300)
     weights = rng.dirichlet(np.ones(3), (80, 24))
     weights[:, :8, 2] = 0.0  # on an edge

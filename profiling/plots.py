@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -93,7 +94,7 @@ def _growth(axes: Any, rows: Sequence[Row]) -> None:
             line[1] = bases[row.metadata["base"]]
         if row.peer == "gpuvision":
             lines.setdefault("all, all pairs", {})[int(times)] = row.peer_seconds
-    for colour, (name, line) in zip(_COLOURS, lines.items(), strict=False):
+    for colour, (name, line) in zip(itertools.cycle(_COLOURS), lines.items(), strict=False):
         times = sorted(line)
         axes.loglog(times, [1e3 * line[each] for each in times], "o-", color=colour, label=name, markersize=3)
     axes.set(xlabel="times as many", ylabel="ms")
@@ -103,7 +104,7 @@ def _tolerance(axes: Any, rows: Sequence[Row]) -> None:
     lines: dict[str, list[Row]] = {}
     for row in rows:
         lines.setdefault(row.case.split("/")[0], []).append(row)
-    for colour, (name, line) in zip(_COLOURS, lines.items(), strict=False):
+    for colour, (name, line) in zip(itertools.cycle(_COLOURS), lines.items(), strict=False):
         tolerances = sorted(
             (row for row in line if row.metadata["tolerance"] > 0.0), key=lambda row: row.metadata["tolerance"]
         )

@@ -8,6 +8,7 @@ Communications of the ACM 52(4), 2009. The sloped roofs are the rates of a copy 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -44,7 +45,7 @@ def draw_roofline(axes: Any, rows: Sequence[Row], devices: Mapping[str, Any]) ->
     for grey, (size, bandwidth) in zip(_GREYS, device["bandwidths"].items(), strict=False):
         label = f"{int(size) / 2**20:.0f} MiB: {bandwidth / 1e9:.0f} GB/s"
         axes.loglog(intensities, roof(intensities, bandwidth, rate) / 1e9, color=grey, linewidth=1.0, label=label)
-    for colour, (name, row) in zip(_COLOURS, points(rows).items(), strict=False):
+    for colour, (name, row) in zip(itertools.cycle(_COLOURS), points(rows).items(), strict=False):
         flops = row.flops or 0.0  # `points` leaves out rows without operations or traffic
         place = (flops / (row.bytes or 1), flops / row.seconds / 1e9)
         axes.loglog(*place, "o", color=colour, markersize=5, label=f"{name} {row.case}")

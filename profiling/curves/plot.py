@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,7 @@ def _draw(path: Path, points: Sequence[Point]) -> None:
     for axes, device in zip(figure.subplots(1, len(devices), squeeze=False, sharey=True)[0], devices, strict=True):
         axes.set_title(f"{points[0].operation} on {device}", fontsize=9, loc="left")
         chosen = [point for point in points if point.device == device]
-        for colour, data in zip(_COLOURS, dict.fromkeys(point.data for point in chosen), strict=False):
+        for colour, data in zip(itertools.cycle(_COLOURS), dict.fromkeys(point.data for point in chosen), strict=False):
             _draw_curve(axes, [point for point in chosen if point.data == data], colour)
         unit = f" [{points[0].unit}]" if points[0].unit else " (relative)"
         axes.set(xlabel="time [ms]", ylabel=f"root mean square error{unit}", xscale="log", yscale="log")

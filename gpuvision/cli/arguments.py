@@ -14,11 +14,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
 
 DeviceLabel = Annotated[
     str | None,
     typer.Option(metavar="LABEL", help="Label of an OpenCL device, see `gpuvision devices`. Default: the best device."),
+]
+
+DeviceLabels = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="LABEL",
+        help="Label of an OpenCL device, see `gpuvision devices`; repeat the option for several. Default: all.",
+    ),
 ]
 
 LayerNames = Annotated[
@@ -30,6 +39,19 @@ LayerNames = Annotated[
         "repeat the option for every file to read.",
     ),
 ]
+
+
+def devices_of(labels: Sequence[str] | None) -> list[Device]:
+    """Return the devices with these labels; without labels all devices that work.
+
+    Raises
+    ------
+    GpuVisionError
+        No device has a label, or no device works.
+    """
+    from gpuvision.host import Device
+
+    return [Device.named(label) for label in labels] if labels else list(Device.all() or [Device.best()])
 
 
 def named_path(text: str | Path) -> Path:

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpuvision.cli.arguments import Overwrite, ReportFile, echo, named_path, prints_report, write_report
+from gpuvision.cli.arguments import (
+    DeviceLabels,
+    Overwrite,
+    ReportFile,
+    devices_of,
+    echo,
+    named_path,
+    prints_report,
+    write_report,
+)
 from gpuvision.host.errors import GpuVisionError
 
 if TYPE_CHECKING:
@@ -20,13 +29,7 @@ def curves(
         list[str] | None,
         typer.Argument(metavar="OPERATION", help="Operations to measure, such as line or ruler. Default: all."),
     ] = None,
-    device: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="LABEL",
-            help="Label of an OpenCL device, see `gpuvision devices`; repeat the option for several. Default: all.",
-        ),
-    ] = None,
+    device: DeviceLabels = None,
     seconds: Annotated[float, typer.Option(help="Approximate time to measure each setting [s].", min=0.01)] = 0.3,
     as_json: ReportFile = None,
     plots: Annotated[
@@ -43,7 +46,6 @@ def curves(
     """
     if importlib.util.find_spec("numba") is None:
         raise GpuVisionError("the package numba is missing; install it: pip install 'gpuvision[profile]'")
-    from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.profiling.curves import curve, plot
     from gpuvision.profiling.harness import describe_machine
@@ -52,7 +54,7 @@ def curves(
     outputs.claim(as_json)
     if plots is not None:
         outputs.claim_folder(plots, plot.FILES)
-    devices = [Device.named(each) for each in device] if device else list(Device.all() or [Device.best()])
+    devices = devices_of(device)
     machine = describe_machine(devices)
     points = curve.measure_curves(
         operations or curve.OPERATIONS, devices, seconds=seconds, progress=lambda line: echo(line, err=True)

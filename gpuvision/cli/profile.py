@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from gpuvision.cli.arguments import Overwrite, ReportFile, echo, named_path, prints_report, reject_unused
+from gpuvision.cli.arguments import (
+    DeviceLabels,
+    Overwrite,
+    ReportFile,
+    devices_of,
+    echo,
+    named_path,
+    prints_report,
+    reject_unused,
+)
 from gpuvision.host.errors import GpuVisionError
 
 if TYPE_CHECKING:
@@ -28,13 +37,7 @@ def profile(
         list[str] | None,
         typer.Argument(metavar="OPERATION", help="Operations to measure, such as psd or line. Default: all."),
     ] = None,
-    device: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="LABEL",
-            help="Label of an OpenCL device, see `gpuvision devices`; repeat the option for several. Default: all.",
-        ),
-    ] = None,
+    device: DeviceLabels = None,
     seconds: Annotated[
         float | None,
         typer.Option(help="Longest time to measure each case [s]. Default: 2, with --quick 0.3.", min=0.01),
@@ -154,8 +157,7 @@ def profile(
     for name in operations or ():
         if name not in harness.OPERATIONS:
             raise ValueError(f"no operation {name!r} to profile; expected some of {', '.join(harness.OPERATIONS)}")
-    everywhere = [] if quick else Device.all()
-    devices = [Device.named(each) for each in device] if device else list(everywhere or [Device.best()])
+    devices = [Device.best()] if quick and not device else devices_of(device)
     run = harness.profile(
         operations or list(harness.OPERATIONS),
         devices,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import typer
 
-from gpuvision.cli.arguments import echo, prints_report
+from gpuvision.cli.arguments import devices_of, echo, prints_report
 
 
 def profile_growth(
@@ -23,7 +23,6 @@ def profile_growth(
 
     The exit code is 1 if the machine changed its speed, an operation failed, or no size was measured.
     """
-    from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.profiling.growth import measure_growth, workloads
 
@@ -37,7 +36,7 @@ def profile_growth(
     for name in operations:
         if name not in known:
             raise ValueError(f"no operation {name!r} to profile over its size; expected some of {', '.join(known)}")
-    devices = [Device.named(each) for each in labels] or list(Device.all() or [Device.best()])
+    devices = devices_of(labels)
     growth = measure_growth(
         operations, devices, memory=round(memory_mib * 2**20), progress=lambda line: echo(line, err=True)
     )

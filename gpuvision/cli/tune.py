@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpuvision.cli.arguments import Overwrite, ReportFile, echo, prints_report, write_report
+from gpuvision.cli.arguments import DeviceLabels, Overwrite, ReportFile, devices_of, echo, prints_report, write_report
 
 if TYPE_CHECKING:
     from gpuvision.host.tuning import TuningResult
@@ -21,13 +21,7 @@ def tune(
         list[str] | None,
         typer.Argument(metavar="OPERATION", help="Operations to tune, such as psd or points. Default: all."),
     ] = None,
-    device: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="LABEL",
-            help="Label of an OpenCL device, see `gpuvision devices`; repeat the option for several. Default: all.",
-        ),
-    ] = None,
+    device: DeviceLabels = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Measure and print, but keep nothing.")] = False,
     as_json: ReportFile = None,
     overwrite: Overwrite = False,
@@ -40,7 +34,6 @@ def tune(
     results) that is bound later uses them, until the driver or the version of gpuvision changes. Other configurations,
     for example a PSD with a triangulation, keep the defaults. GPUVISION_TUNING=off ignores the settings.
     """
-    from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.host.tuned_settings import DEFAULTS, keep_entries
     from gpuvision.host.tuning import tune as tuned
@@ -51,7 +44,7 @@ def tune(
             raise ValueError(f"no operation {name!r} to tune; expected some of {', '.join(tuning_inputs.NAMES)}")
     outputs = Outputs("tune", overwrite=overwrite)
     outputs.claim(as_json)
-    devices = [Device.named(each) for each in device] if device else list(Device.all() or [Device.best()])
+    devices = devices_of(device)
     results: list[TuningResult] = []
     for each in devices:
         for name in operations or tuning_inputs.NAMES:

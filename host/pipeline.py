@@ -96,7 +96,7 @@ class Pipeline(Generic[R]):
         Whether to measure the times on the device.
     trace : Trace, optional
         Timeline of this stream, written at its end; turns ``profile`` on. Default: the active trace, if there is one,
-            whose block writes the file.
+        whose block writes the file.
     warm_up : int, optional
         Number of batches at the start that the report leaves out; one per slot by default.
     clock : callable
@@ -133,7 +133,7 @@ class Pipeline(Generic[R]):
         self.source = _source(source)
         self.ring, self.policy = _whole(ring, "ring", 2, " slots"), policy
         self.trace = active_trace() if trace is None else trace
-        self._writes_trace = trace is not None
+        self._writes_trace = trace is not None and not trace.is_active
         self.device = Device.best() if device is None else device
         self.zero_copy = self.device.shares_memory if zero_copy is None else zero_copy
         self.inline = inline
@@ -263,7 +263,7 @@ class Pipeline(Generic[R]):
         if self.trace is not None:
             self.trace.end_stream(self._stream_number)
             # The block of an active trace writes the file, also where the stream outlives the block.
-            if self._writes_trace and not self.trace.is_active:
+            if self._writes_trace:
                 self.trace.write()
         if failure is not None and not self._reported:
             raise StreamError(f"the device failed before the stream's end: {failure}") from failure

@@ -22,6 +22,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gpuvision.host.cache import cache_folder, read_private, write_private
+from gpuvision.host.debug import flatten_includes
 from gpuvision.host.device import Device
 from gpuvision.host.files import locked_folder
 from gpuvision.host.kept import clear_with
@@ -157,14 +158,16 @@ def size_class(shape: Sequence[int]) -> int:
 def program_digest(operation: Launchable, device: Device, shape: Sequence[int], dtype: Any) -> str:
     """Return a digest of the program that an operation runs with the default settings.
 
-    It covers the kernel, its macros and the dtypes of its outputs. Values of kernel arguments are left out: they do not
-    change the code. Equal digests mean that settings checked for one operation hold for the other.
+    It covers the text of the source with its headers, the kernel, its macros and the dtypes of its outputs. Values of
+    kernel arguments are left out: equal digests mean the same code, not the same numbers.
     """
     with trial_of(DEFAULTS):
         launch = operation.launch(device, tuple(shape), np.dtype(dtype))
     macros = sorted((name, str(value)) for name, value in launch.defines.items() if name not in _SIZE_MACROS)
     outputs = [(name, None if spec is None else spec[1].str) for name, spec in launch.outputs.items()]
-    text = repr((launch.source, launch.kernel, macros, outputs))
+    folder = operation.kernel_folder or Path()
+    source = flatten_includes(folder, launch.source, operation.include_folders)
+    text = repr((source, launch.kernel, macros, outputs))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
@@ -41,8 +42,9 @@ def _remove_old_siblings(folder: Path) -> None:
     """Remove the folders of other sources that no run has used for 30 days."""
     oldest = time.time() - _KEPT
     for each in folder.parent.glob("numba-*"):
-        if each != folder and each.stat().st_mtime < oldest:
-            shutil.rmtree(each, ignore_errors=True)
+        with contextlib.suppress(FileNotFoundError):  # another run removes it at the same time
+            if each != folder and each.stat().st_mtime < oldest:
+                shutil.rmtree(each, ignore_errors=True)
 
 
 def _sources_hash() -> str:

@@ -83,9 +83,8 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
     """
 
     Result: ClassVar[type[Any]] = UndistortedPoints
-    tunable: ClassVar[Tunable | None] = Tunable(
-        strips=(512, 1024, 2048, 4096, 8192, 16384), groups=(32, 64, 128, 256), variants=True
-    )
+    # Not the variant: where the steps are tested, the lanes of a vector take as many as the slowest one.
+    tunable: ClassVar[Tunable | None] = Tunable(strips=(512, 1024, 2048, 4096, 8192, 16384), groups=(32, 64, 128, 256))
 
     model: Camera | Lens | PlanePolynomial
     inverse: bool = False

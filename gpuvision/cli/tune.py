@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +11,7 @@ import typer
 from gpuvision.cli.arguments import DeviceLabels, Overwrite, ReportFile, devices_of, echo, prints_report, write_report
 
 if TYPE_CHECKING:
+    from gpuvision.host import Device
     from gpuvision.host.tuning import TuningResult
 
 # Size classes of 4^5 = 1024 to 4^11 = 4 million elements (chosen).
@@ -35,8 +37,6 @@ def tune(
     for example a PSD with a triangulation, keep the defaults. GPUVISION_TUNING=off ignores the settings.
     """
     from gpuvision.host.outputs import Outputs
-    from gpuvision.host.tuned_settings import DEFAULTS, keep_entries
-    from gpuvision.host.tuning import tune as tuned
     from gpuvision.profiling import tuning_inputs
 
     for name in operations or ():
@@ -46,21 +46,34 @@ def tune(
     outputs.claim(as_json)
     devices = devices_of(device)
     results: list[TuningResult] = []
+    try:
+        _tune_all(devices, operations or tuning_inputs.NAMES, results, keeps=not dry_run)
+    finally:  # also what was measured before an error
+        write_report(as_json, [_described(each) for each in results], outputs)
+        _show(results, to_stderr=prints_report(as_json))
+
+
+def _tune_all(
+    devices: Sequence[Device], operations: Sequence[str], results: list[TuningResult], *, keeps: bool
+) -> None:
+    """Tune operations on devices, append the results, and keep the winners."""
+    from gpuvision.host.tuned_settings import DEFAULTS, keep_entries
+    from gpuvision.host.tuning import tune as tuned
+    from gpuvision.profiling import tuning_inputs
+
     for each in devices:
-        for name in operations or tuning_inputs.NAMES:
+        for name in operations:
             echo(f"{name} on {each.label}", err=True)
             found: list[TuningResult] = []
             for operation, make in tuning_inputs.cases(name):
                 is_possible = each.has_double or make(2)[0].dtype != "float64"
                 found += [tuned(operation, make, each, size) for size in _CLASSES if is_possible]
             results += found
-            if not dry_run:
+            if keeps:
                 # After each operation, so that an interrupted command keeps the winners found so far.
                 entries = [result.entry for result in found]
                 winners = [entry for entry in entries if entry.settings != DEFAULTS]
                 echo(f"kept in {keep_entries(winners, [entry.key for entry in entries])}", err=True)
-    write_report(as_json, [_described(each) for each in results], outputs)
-    _show(results, to_stderr=prints_report(as_json))
 
 
 def _described(result: TuningResult) -> dict[str, object]:

@@ -117,6 +117,11 @@ def test_a_lens_without_distortion_needs_no_step() -> None:
     assert _camera((1e-12,)).inverse_start(REGION).settled_steps(np.float32) == 0
 
 
+@pytest.mark.parametrize("coefficients", [RADIAL, DECENTRED], ids=["radial", "decentred"])
+def test_a_usual_lens_is_not_tested(coefficients: tuple[float, ...]) -> None:
+    assert "CAMERA_SURE" in _camera(coefficients).undistort_defines(np.float32)
+
+
 def test_a_strong_lens_is_tested() -> None:
     """Near the fold, the steps after which most points have converged are not enough for all."""
     camera = _camera((-0.9, 0.0, 0.02, -0.03))

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import pytest
 
+from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.host import Device, Launch, LaunchBuilder, Operation, Tunable, clear_cache, tuned_settings
 from gpuvision.host.tuned_settings import (
     DEFAULTS,
@@ -219,7 +220,7 @@ def test_all_offered_settings_give_the_default_result(name: str, device: Device)
         assert result.best == DEFAULTS
 
 
-@pytest.mark.parametrize("operation", [PsdReadout, Triangulation])
+@pytest.mark.parametrize("operation", [PsdReadout, Triangulation, UndistortPoints])
 def test_variants_that_round_differently_are_not_offered(operation: type[Operation[Any]]) -> None:
     assert operation.tunable is not None
     assert not operation.tunable.allows(TunedSettings(variant="work_item"))

@@ -25,7 +25,14 @@ from gpuvision.profiling.offline.targets import TARGETS, CompilerError, Usage, u
 ROOT = Path(__file__).resolve().parents[2]
 _DIRECTIVE = re.compile(r"^[ \t]*#[ \t]*(if|ifdef|ifndef|elif)\b([^\n]*)", re.MULTILINE)
 # Macros that only builds for CPUs have: vectors, stores around the caches, prefetching, PoCL.
-_OF_CPUS = {"ITEM_PER_PROFILE", "VECTOR_VARIANT", "PAST_CACHES", "PREFETCH", "POCL_DEVICE_ADDRESS_BITS"}
+_OF_CPUS = {
+    "ITEM_PER_PROFILE",
+    "VECTOR_VARIANT",
+    "PAST_CACHES",
+    "PREFETCH",
+    "POCL_DEVICE_ADDRESS_BITS",
+    "WORD_PAIRS",
+}
 PTXAS_LOG = """\
 ptxas info    : 0 bytes gmem
 ptxas info    : Compiling entry function 'one' for 'sm_90'

@@ -339,8 +339,8 @@ class Bound(Generic[R]):
                 if not is_array or array.dtype != dtype or array.shape != shape or array.context != context:
                     self._check(array, shape, dtype)
                 changed.append((place, known.get(id(array)) or memory_of(array)))
-        # If every array has its own memory object, no output shares memory with another array. Otherwise an input is
-        # given twice, arrays are empty (which is allowed), or an output shares memory (which is refused).
+        # A memory object is repeated for three reasons: the same input twice and empty arrays are allowed, an output
+        # that shares memory with another array is refused. Without a repetition the comparison of arrays is skipped.
         if changed and len({id(array.base_data) for array in given}) < len(given):
             inputs = len(self.inputs)
             _check_apart(given[:inputs], given[inputs:], _same_memory)

@@ -348,5 +348,5 @@ def active_trace() -> Trace | None:
 
 
 def records_launches(queue: Any) -> bool:
-    """Return whether an operation that is bound to a queue now has to record its launches: not those of a stream."""
+    """Return whether an operation bound to the queue must record its launches. A stream records its own launches."""
     return _active is not None and not _active.is_of_stream(queue)

@@ -231,7 +231,7 @@ def settings_for(operation: Launchable, device: Device, shape: Sequence[int], dt
 
 
 def keep_entries(entries: Sequence[TunedEntry], tuned: Sequence[Key]) -> Path:
-    """Write entries to the cache folder, in place of the entries of all tuned keys; return the path of the file.
+    """Replace the kept entries of the tuned keys by these entries; return the path of the file in the cache folder.
 
     Processes that keep entries at the same time wait for each other, so that no entry is lost.
 

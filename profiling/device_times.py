@@ -30,10 +30,10 @@ class DeviceTimes(NamedTuple):
 
 
 class Recorder:
-    """Function that launches a bound operation on its own arrays, waits, and records the times of the events.
+    """Recorder of event times: a call launches a bound operation, waits, and records the times of its events.
 
-    The kernels run in queues of the same kind as those of the operation (in the caller's thread or in the queue of the
-    device), in which profiling is enabled. Each launch waits for its event before the next one is enqueued.
+    The kernels run in new queues with profiling enabled. Like the operation, they run in the thread of the caller or in
+    the worker threads of the device. Each launch waits for its event before the next one is enqueued.
     """
 
     def __init__(self, bound: Bound[Any], device: Device) -> None:

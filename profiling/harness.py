@@ -230,7 +230,8 @@ class Row:
 class Failure:
     """Operation whose benchmark raised an exception.
 
-    Its rows on the device are missing, or those of an earlier measurement during which the machine changed its speed.
+    The run has no rows of the operation on the device. If an earlier measurement succeeded although the machine
+    changed its speed, the run keeps the rows of that measurement.
 
     Attributes
     ----------
@@ -284,7 +285,7 @@ class Run:
     failures
         Operations without rows, because their benchmark raised an exception.
     probes
-        Speed of the machine before and after each measurement, also of those that were repeated.
+        Speed of the machine before and after each measurement, including measurements that were repeated.
     seconds
         Duration of the run [s], with the preparation of the cases.
     """

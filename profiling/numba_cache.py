@@ -22,8 +22,8 @@ _KEPT = 30 * 24 * 3600.0  # time for which compiled functions of other sources a
 def keep_compiled(module: ModuleType) -> None:
     """Make Numba keep the compiled functions of a module in the cache folder of gpuvision.
 
-    Numba compiles a function again when its own file changes, but not when a function that it calls changes in another
-    file. Therefore the folder is named after a hash of all files of this package.
+    Numba compares the file of a function with the cache, but not the files of the functions that it calls. So the
+    name of the folder contains a hash of all files of this package.
     """
     loops = [each for each in vars(module).values() if isinstance(each, CPUDispatcher)]
     if loops:

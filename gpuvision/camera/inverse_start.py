@@ -191,7 +191,7 @@ class InverseStart:
 
 
 def _first(enough: npt.NDArray[np.bool_]) -> int | None:
-    """Return the index of the first true element; None if there is none."""
+    """Return the index of the first true element, or None if all elements are false."""
     return int(np.argmax(enough)) if np.any(enough) else None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -113,9 +114,9 @@ def profile(
 
     With --html DIR the run is also written as a page; with --from FILE the page shows a stored run.
 
-    With --growth each operation is measured on its own, with 1, 4, 16, ... items. A line states the time of one item,
-    the shortest time, the number of items from which a call takes twice as long as that, the number at which inputs and
-    outputs exceed the largest cache, and the rates of the largest size.
+    With --growth each operation is measured without peers, with 1, 4, 16, ... items. The report states the time of one
+    item, the shortest time, and the rates of the largest size. It also states two numbers of items: where a call takes
+    twice the shortest time, and where inputs and outputs exceed the largest cache.
 
     With --offline nothing is measured: the kernels are compiled for GPUs by Clang and NVIDIA's ptxas. The table shows
     the registers, stack, spilled registers and local memory of each kernel. The exit code is 1 if a kernel does not
@@ -147,29 +148,52 @@ def profile(
         profile_growth(operations or (), device or (), memory_mib or _MEMORY_MIB, as_json, plots, overwrite=overwrite)
         return
     reject_unused("without --growth", memory_mib=memory_mib)
+    default_seconds, default_minutes = (_QUICK_SECONDS, _QUICK_MINUTES) if quick else (_SECONDS, _MINUTES)
+    _measure(
+        operations or (),
+        device,
+        pictures,
+        as_json,
+        seconds=seconds or default_seconds,
+        minutes=minutes or default_minutes,
+        quick=quick,
+    )
+
+
+def _measure(
+    operations: Sequence[str],
+    labels: Sequence[str] | None,
+    pictures: _Pictures,
+    as_json: Path | None,
+    *,
+    seconds: float,
+    minutes: float,
+    quick: bool,
+) -> None:
+    """Measure operations against their peers, show and write the run."""
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.profiling import harness
 
-    outputs = Outputs("profile", overwrite=overwrite)
+    outputs = Outputs("profile", overwrite=pictures.overwrite)
     outputs.claim(as_json)
     pictures.claim(outputs)
-    for name in operations or ():
+    for name in operations:
         if name not in harness.OPERATIONS:
             raise ValueError(f"no operation {name!r} to profile; expected some of {', '.join(harness.OPERATIONS)}")
-    devices = [Device.best()] if quick and not device else devices_of(device)
+    devices = [Device.best()] if quick and not labels else devices_of(labels)
     run = harness.profile(
         operations or list(harness.OPERATIONS),
         devices,
-        seconds=seconds or (_QUICK_SECONDS if quick else _SECONDS),
-        total=60.0 * (minutes or (_QUICK_MINUTES if quick else _MINUTES)),
+        seconds=seconds,
+        total=60.0 * minutes,
         quick=quick,
         progress=lambda line: echo(line, err=True),
     )
     if prints_report(as_json):
         typer.echo(run.to_json(), nl=False)
     elif as_json is not None:
-        run.write(as_json, overwrite=overwrite)
+        run.write(as_json, overwrite=pictures.overwrite)
     _show(list(run.rows), to_stderr=prints_report(as_json))
     for line in _speeds(run):
         echo(line, err=True)

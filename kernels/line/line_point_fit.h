@@ -187,9 +187,9 @@ static inline ints in_range(const Gaussian *at) {
 }
 
 // Fit the lanes of `wanted` from the start values `at`, whose sigma is that of the samples and thus contains the variance
-// of a pixel's width. Return the lanes that are fitted. Lanes that converged are not changed any more, so that a reading
-// does not depend on its neighbours. Under NOISE, sigma and amplitude become those of the Gaussian that is integrated over
-// pixels: a smaller sigma, and a larger amplitude with the same product.
+// of a pixel's width. Return the lanes that are fitted. A lane that has converged is not changed any more: its reading
+// does not depend on the other lanes. Under NOISE, sigma and amplitude are converted from the sampled Gaussian to the
+// Gaussian integrated over pixels: sigma is smaller, amplitude larger, and their product is the same.
 static inline ints fit_points(const reals *samples, Gaussian *at, ints wanted, SampleNoise noise) {
     ints moving = wanted & in_range(at);
     ints settled = 0;

@@ -41,8 +41,8 @@ static inline void gather_lanes(const Profiles *profiles, ints peak, int reach, 
 // Copy the window of every lane (see gather_lanes) by whole rows of 16 lanes, where the peaks lie within SHIFTS rows.
 //
 // The rows from the earliest window on are copied, then each lane is moved up by the rows between the earliest window
-// and its own window: by the bits of that number, from the highest bit down. A step selects between two rows in all
-// lanes at once, so that 16 windows take about 2 (2 reach + 1) + SHIFTS instructions for bytes.
+// and its own window. This shift is done in steps of 16, 8, 4, 2 and 1 rows, one for each bit of the number of rows. A step
+// selects between two rows in all lanes at once, so that 16 windows take about 2 (2 reach + 1) + SHIFTS instructions for bytes.
 #define SHIFTS 32
 static inline void gather(const Profiles *profiles, ints peak, int reach, CODE *window) {
     const int first = lowest_lane(peak), last = -lowest_lane(-peak), height = 2 * reach + 1;

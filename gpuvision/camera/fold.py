@@ -118,15 +118,23 @@ def _along_ray(over: Float64, under: Float64, p: Float64, s: Float64, c: float, 
 
 def _sign_changes(terms: Iterable[float]) -> list[float]:
     """Return the positive arguments, ascending, where a polynomial that is 1 at 0 changes its sign."""
-    roots = polynomial.polyroots(np.trim_zeros(np.asarray(terms, dtype=np.float64), "b"))
+    known = np.asarray(terms, dtype=np.float64)
+    roots = polynomial.polyroots(np.trim_zeros(known, "b"))
     # Rounding can make a real root complex, and a double root does not change the sign: compare signs between the
     # roots.
     candidates = roots[
         (roots.real > 0.0) & (np.abs(roots.imag) <= _MAX_IMAGINARY * roots.real) & (roots.real < _FARTHEST**2)
     ]
     places = np.sort(candidates.real)
-    if not len(places):
-        return []
-    between = np.r_[0.0, 0.5 * (places[1:] + places[:-1]), 2.0 * places[-1]]
-    signs = np.sign(polynomial.polyval(between, np.asarray(terms)))
-    return [float(place) for place, change in zip(places, np.diff(signs), strict=True) if change != 0.0]
+    # Between the parts of a multiple root the value is 0 or rounding, at most 2 n eps sum |a_k| x^k for n terms
+    # (Horner's method): its sign means nothing.
+    after = np.r_[0.5 * (places[1:] + places[:-1]), 2.0 * places[-1:]]
+    values = np.asarray(polynomial.polyval(after, known))
+    rounding = 2.0 * len(known) * np.finfo(float).eps * polynomial.polyval(after, np.abs(known))
+    found, sign, first = [], 1.0, 0
+    for k in np.flatnonzero(np.abs(values) > rounding).tolist():
+        if np.sign(values[k]) != sign:
+            found.append(float(places[first]))
+            sign = -sign
+        first = k + 1
+    return found

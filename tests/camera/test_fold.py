@@ -21,11 +21,22 @@ NONE6, NONE2, NONE4 = (0.0,) * 6, (0.0,) * 2, (0.0,) * 4
         ((2.0, 0.5, -1.0), [0.5, 2.0]),
         ((0.5, 1.5, 2.5, 3.0), [0.5, 1.5, 2.5, 3.0]),
         ((1.0 + 1.0j, 1.0 - 1.0j, 2.0), [2.0]),
+        ((1.0, 1.0), []),
+        ((0.3, 0.3, 0.7), [0.7]),
+        ((0.3, 0.7, 0.7), [0.3]),
+        ((0.3, 0.7, 0.7, 2.0), [0.3, 2.0]),
     ],
 )
-def test_sign_changes_are_at_simple_positive_roots(roots: tuple[complex, ...], expected: list[float]) -> None:
+def test_sign_changes_are_at_positive_roots_of_odd_order(roots: tuple[complex, ...], expected: list[float]) -> None:
     terms = polynomial.polyfromroots(roots).real
     assert _sign_changes(terms / terms[0]) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_triple_root_is_one_sign_change() -> None:
+    """Rounding splits a triple root by its third root, 6e-6, times its condition."""
+    assert _sign_changes((1.0, -3.0, 3.0, -1.0)) == pytest.approx([1.0], rel=1e-4)
+    terms = polynomial.polyfromroots((0.3, 0.7, 0.7, 0.7, 2.0))
+    assert _sign_changes(terms / terms[0]) == pytest.approx([0.3, 0.7, 2.0], rel=1e-3)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-2, 1e2])

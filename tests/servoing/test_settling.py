@@ -101,6 +101,15 @@ def test_vibration_of_a_simulated_axis_is_identified() -> None:
     assert found.offset + found.amplitude * decay * np.cos(angle + found.phase) == pytest.approx(errors, abs=3e-7)
 
 
+def test_vibration_is_found_from_half_a_period_of_the_record_on() -> None:
+    """A record of 0.9 periods whose last sample comes late: the scan starts at half a period per record."""
+    times = np.r_[np.linspace(0.0, 0.1, 12), 0.9]
+    found = fit_vibration(times, 3e-6 + 1e-5 * np.cos(2.0 * math.pi * times))
+    assert found.frequency == pytest.approx(1.0, rel=1e-3)
+    assert found.amplitude == pytest.approx(1e-5, rel=1e-2)
+    assert found.residual < 1e-10
+
+
 def test_rule_without_vibration_is_the_normal_distribution() -> None:
     """Four errors of 1 um, mean 2 um: a tolerance of 3 um is two standard deviations of the mean away."""
     rule = VibrationSettling((3e-6, 1.0, 1.0), is_filtered=False)

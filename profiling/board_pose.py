@@ -8,6 +8,7 @@ edge.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -23,7 +24,8 @@ from gpuvision.matching.pose.pose import SolvePose
 from gpuvision.matching.robust import sample_subsets
 from gpuvision.profiling import pose as of_pose
 from gpuvision.profiling import ruler as of_ruler
-from gpuvision.profiling.harness import Case
+from gpuvision.profiling import ruler_peers
+from gpuvision.profiling.harness import Case, Peer
 from gpuvision.profiling.line_fit import EFFICIENCY, STEPS, TRIALS, fit_line
 from gpuvision.profiling.pose import PLACEMENT, fit_pose, numpy_pose, tukey_root
 
@@ -33,7 +35,6 @@ TRUE_POSE = np.array([3e-5, -2e-5, 0.004])
 _PLACE = np.array(PLACEMENT, np.float32)
 _ZERO, _HALF, _ONE, _TWO = (np.float32(each) for each in (0.0, 0.5, 1.0, 2.0))
 _SUMS = {"contract", "reassoc"}
-_rulers = of_ruler._compiled(of_ruler._sample_flat)
 
 
 def scene() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
@@ -68,34 +69,41 @@ def scene() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]
 # ---- Numba ---------------------------------------------------------------------------------------------------------
 
 
-@numba.njit(parallel=True, error_model="numpy", fastmath=_SUMS)
-def _fused(image, plain, rulers, lines, taps, numbers, pairs, starts, edges, status, pose, covariance):
-    """Compute the board pose in one call: edges along all rulers and line fits on all cores, then the pose."""
-    _rulers(image, plain, taps, numbers, edges, status)
-    count = lines.shape[0]
-    rows = np.empty((7, 2 * count), np.float32)
-    for i in numba.prange(count):
-        u, v, w = np.empty(EACH, np.float32), np.empty(EACH, np.float32), np.empty(EACH, np.float32)
-        for k in range(EACH):
-            at = i * EACH + k
-            found, s = status[at] == 0, edges[0, at]
-            per = _ONE / (_ONE + s * rulers[at, 8])
-            a, b = (rulers[at, 4] + s * rulers[at, 6]) * per, (rulers[at, 5] + s * rulers[at, 7]) * per
-            u[k] = a if found else _ZERO
-            v[k] = b if found else _ZERO
-            sigma = edges[3, at] * np.exp(_HALF / (edges[2, at] * edges[2, at] + numbers[1]))
-            across = abs(rulers[at, 7] - b * rulers[at, 8]) * per * sigma
-            w[k] = _ONE / across if found else _ZERO
-        x, y, c, s, of_offset, of_angle = fit_line(u, v, w, pairs)
-        reach = np.sqrt(of_offset / of_angle)
-        for side in range(2):
-            offset = reach if side else -reach
-            on, off, at = x + offset * c, y + offset * s, 2 * i + side
-            rows[0, at], rows[1, at] = lines[i, 0], lines[i, 1]
-            rows[2, at], rows[3, at] = lines[i, 2] + on * lines[i, 1], lines[i, 3] - on * lines[i, 0]
-            rows[4, at], rows[5, at] = off * lines[i, 0], off * lines[i, 1]
-            rows[6, at] = _ONE / np.sqrt(_TWO * of_offset + lines[i, 4] * lines[i, 4])
-    fit_pose(rows, starts, _PLACE, pose, covariance)
+def _fused_form(measure: Any, *, parallel: bool) -> Any:
+    """Return a Numba function that computes the board pose in one call.
+
+    `measure` measures the edges along all rulers; under `parallel` the lines are fitted on all cores.
+    """
+
+    @numba.njit(parallel=parallel, error_model="numpy", fastmath=_SUMS)
+    def fused(frame, plain, rulers, lines, taps, numbers, pairs, starts, edges, status, pose, covariance):
+        measure(frame, plain, taps, numbers, edges, status)
+        count = lines.shape[0]
+        rows = np.empty((7, 2 * count), np.float32)
+        for i in numba.prange(count):
+            u, v, w = np.empty(EACH, np.float32), np.empty(EACH, np.float32), np.empty(EACH, np.float32)
+            for k in range(EACH):
+                at = i * EACH + k
+                found, s = status[at] == 0, edges[0, at]
+                per = _ONE / (_ONE + s * rulers[at, 8])
+                a, b = (rulers[at, 4] + s * rulers[at, 6]) * per, (rulers[at, 5] + s * rulers[at, 7]) * per
+                u[k] = a if found else _ZERO
+                v[k] = b if found else _ZERO
+                sigma = edges[3, at] * np.exp(_HALF / (edges[2, at] * edges[2, at] + numbers[1]))
+                across = abs(rulers[at, 7] - b * rulers[at, 8]) * per * sigma
+                w[k] = _ONE / across if found else _ZERO
+            x, y, c, s, of_offset, of_angle = fit_line(u, v, w, pairs)
+            reach = np.sqrt(of_offset / of_angle)
+            for side in range(2):
+                offset = reach if side else -reach
+                on, off, at = x + offset * c, y + offset * s, 2 * i + side
+                rows[0, at], rows[1, at] = lines[i, 0], lines[i, 1]
+                rows[2, at], rows[3, at] = lines[i, 2] + on * lines[i, 1], lines[i, 3] - on * lines[i, 0]
+                rows[4, at], rows[5, at] = off * lines[i, 0], off * lines[i, 1]
+                rows[6, at] = _ONE / np.sqrt(_TWO * of_offset + lines[i, 4] * lines[i, 4])
+        fit_pose(rows, starts, _PLACE, pose, covariance)
+
+    return fused
 
 
 # ---- NumPy and OpenCV ----------------------------------------------------------------------------------------------
@@ -172,8 +180,8 @@ def _fused_pose(device: Device) -> Case:
     image, rulers, lines = scene()
     edges = RulerEdges(
         threshold=of_ruler.THRESHOLD,
-        length=of_ruler.LENGTH,
-        width=of_ruler.WIDTH,
+        length=ruler_peers.LENGTH,
+        width=ruler_peers.WIDTH,
         smoothing_px=of_ruler.SMOOTHING,
         noise=2.0,
     )
@@ -187,25 +195,28 @@ def _fused_pose(device: Device) -> Case:
     bound.run()
     result = bound.outputs
     noise = edges._packed(image.dtype)[2]
-    by_numpy = _Numpy(image, rulers, lines, float(noise) / of_ruler.WIDTH)
+    by_numpy = _Numpy(image, rulers, lines, float(noise) / ruler_peers.WIDTH)
     flat, plain = rulers.reshape(-1, rulers.shape[-1]), by_numpy.plain
-    numbers = np.array([of_ruler._LEAST * of_ruler.WIDTH, of_ruler._VARIANCE, noise], np.float32)
+    numbers = np.array([of_ruler._LEAST * ruler_peers.WIDTH, of_ruler._VARIANCE, noise], np.float32)
     taps = of_ruler._TAPS.astype(np.float32)
     found, status = np.empty((4, len(flat)), np.float32), np.empty(len(flat), np.uint8)
     pose, covariance = np.empty(3, np.float32), np.empty((3, 3), np.float32)
 
-    def by_numba() -> None:
-        pairs, starts = by_numpy.pairs, by_numpy.starts
-        _fused(image, plain, flat, lines, taps, numbers, pairs, starts, found, status, pose, covariance)
-
-    by_numba()
+    given = (ruler_peers.Frame.of(image), plain, flat, lines, taps, numbers, by_numpy.pairs, by_numpy.starts)
+    forms: dict[str, Callable[[], object]] = {}
+    results = []
+    for name, measure in ruler_peers.expert_forms(len(flat)).items():
+        fused = _fused_form(measure, parallel=not name.endswith("-serial"))
+        forms[name] = functools.partial(fused, *given, found, status, pose, covariance)
+        forms[name]()
+        results.append((f"numba {name}", pose.copy(), covariance.copy()))
     (exact, exact_covariance), (rounded, _) = by_numpy.exact(), by_numpy()
     ours = np.array([*to_numpy(result.placement), to_numpy(result.pose)[2]])
     sigma = np.sqrt(np.diag(exact_covariance))
     of_ours = to_numpy(result.covariance)
     for name, each, of in (
         ("gpuvision", ours, of_ours),
-        ("numba", pose, covariance),
+        *results,
         ("numpy", rounded, exact_covariance),
     ):
         if np.any(np.abs(each - exact) > 0.5 * sigma) or np.any(np.abs(np.sqrt(np.diag(of)) / sigma - 1.0) > 0.1):
@@ -214,7 +225,7 @@ def _fused_pose(device: Device) -> Case:
             )
     metadata = {"p50_us": _median(bound.run) * 1e6, "sigma_m": float(sigma[0]), "numba_error": _worst(pose, exact)}
     metadata["numpy_error"] = _worst(rounded, exact)
-    peers: dict[str, Callable[[], object]] = {"numpy": by_numpy, "numba": by_numba}
+    peers: dict[str, Peer] = {"numpy": by_numpy, "numba": forms}
     return Case("pose", "local-fix", bound.run, peers, _worst(ours, exact), metadata=metadata)
 
 

@@ -11,6 +11,7 @@ with the frame behind a lens (``lens_p50_us``) alternate with the calls without.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -26,7 +27,8 @@ from gpuvision.matching.features.imaging import Imaging
 from gpuvision.matching.pose.pose import SolvePose
 from gpuvision.matching.robust import sample_subsets
 from gpuvision.profiling import ruler as of_ruler
-from gpuvision.profiling.harness import Case
+from gpuvision.profiling import ruler_peers
+from gpuvision.profiling.harness import Case, Peer
 from gpuvision.profiling.line_fit import STEPS, TRIALS
 from gpuvision.profiling.pose import fit_pose, numpy_pose
 
@@ -37,7 +39,6 @@ PREDICTED = np.array([20e-3, 30e-3, 0.0])
 _CALLS = 2000
 _SAMPLING_PX = np.float32(0.02)
 _HALF, _ONE = np.float32(0.5), np.float32(1.0)
-_rulers = of_ruler._compiled(of_ruler._sample_flat)
 
 
 def scene(size: int, lens: Lens | None = None) -> tuple[NDArray[np.uint8], FeatureSet]:
@@ -61,9 +62,9 @@ def scene(size: int, lens: Lens | None = None) -> tuple[NDArray[np.uint8], Featu
         point=point,
         normal=normal,
         spacing=np.zeros(RULERS),
-        length=np.full(RULERS, of_ruler.LENGTH * PIXEL),
+        length=np.full(RULERS, ruler_peers.LENGTH * PIXEL),
         sigma=np.full(RULERS, 0.1 * PIXEL),
-        imaging=Imaging(pixel=PIXEL, smoothing_ratio=of_ruler.SMOOTHING, width_px=of_ruler.WIDTH),
+        imaging=Imaging(pixel=PIXEL, smoothing_ratio=of_ruler.SMOOTHING, width_px=ruler_peers.WIDTH),
         covariance=np.eye(3),
         condition=1.0,
         region=np.stack([placement - size / 2 * PIXEL, placement + size / 2 * PIXEL]),
@@ -92,24 +93,28 @@ def _camera(expected, board, pose):
     pose[2] = expected[2] - board[2]
 
 
-@numba.njit(error_model="numpy")
-def _estimate(frame, image, pose, point, normal, taps, numbers, starts, work):
-    """Compute the pose of the camera in one call."""
-    placed, edges, status, rows, origin, board, covariance, found = work
-    image[:] = frame
-    _place(point, normal, pose, np.float32(_HALF * (image.shape[1] - 1)), placed)
-    _rulers(image, placed, taps, numbers, edges, status)
-    pixel = np.float32(PIXEL)
-    for i in range(placed.shape[0]):
-        sigma = edges[3, i] * np.exp(_HALF / (edges[2, i] * edges[2, i] + numbers[1]))
-        moved = edges[0, i] * pixel if status[i] == 0 else np.float32(0.0)
-        rows[0, i], rows[1, i] = normal[i, 0], normal[i, 1]
-        rows[2, i], rows[3, i] = point[i, 0], point[i, 1]
-        rows[4, i], rows[5, i] = normal[i, 0] * moved, normal[i, 1] * moved
-        certainty = _ONE / (np.sqrt(sigma * sigma + _SAMPLING_PX * _SAMPLING_PX) * pixel)
-        rows[6, i] = certainty if status[i] == 0 else np.float32(0.0)
-    fit_pose(rows, starts, origin, board, covariance)
-    _camera(pose, board, found)
+def _estimator(measure: Any) -> Any:
+    """Return a Numba function that computes the pose of the camera in one call; `measure` measures the rulers."""
+
+    @numba.njit(error_model="numpy")
+    def estimate(frame, views, pose, point, normal, taps, numbers, starts, work):
+        placed, edges, status, rows, origin, board, covariance, found = work
+        views.image[:] = frame
+        _place(point, normal, pose, np.float32(_HALF * (frame.shape[1] - 1)), placed)
+        measure(views, placed, taps, numbers, edges, status)
+        pixel = np.float32(PIXEL)
+        for i in range(placed.shape[0]):
+            sigma = edges[3, i] * np.exp(_HALF / (edges[2, i] * edges[2, i] + numbers[1]))
+            moved = edges[0, i] * pixel if status[i] == 0 else np.float32(0.0)
+            rows[0, i], rows[1, i] = normal[i, 0], normal[i, 1]
+            rows[2, i], rows[3, i] = point[i, 0], point[i, 1]
+            rows[4, i], rows[5, i] = normal[i, 0] * moved, normal[i, 1] * moved
+            certainty = _ONE / (np.sqrt(sigma * sigma + _SAMPLING_PX * _SAMPLING_PX) * pixel)
+            rows[6, i] = certainty if status[i] == 0 else np.float32(0.0)
+        fit_pose(rows, starts, origin, board, covariance)
+        _camera(pose, board, found)
+
+    return estimate
 
 
 class _Numpy:
@@ -153,9 +158,9 @@ def _case(device: Device, size: int) -> Case:
     distorted, _ = scene(size, lens)
     behind_lens = features.bind(device, frame.shape, np.uint8, model=lens, **options)
     noise = bound.operation.ruler._packed(frame.dtype)[2]
-    by_numpy = _Numpy(features, float(noise) / of_ruler.WIDTH, size)
-    image, found = np.empty_like(frame), np.empty(3)
-    numbers = np.array([of_ruler._LEAST * of_ruler.WIDTH, of_ruler._VARIANCE, noise], np.float32)
+    by_numpy = _Numpy(features, float(noise) / ruler_peers.WIDTH, size)
+    views, found = ruler_peers.Frame.of(np.empty_like(frame)), np.empty(3)
+    numbers = np.array([of_ruler._LEAST * ruler_peers.WIDTH, of_ruler._VARIANCE, noise], np.float32)
     point, normal = ((features.point - features.placement).astype(np.float32), features.normal.astype(np.float32))
     single = [np.empty(shape, np.float32) for shape in ((RULERS, 4), (4, RULERS), (7, RULERS), 2, 3, (3, 3))]
     placed, edges, rows, origin, board, covariance = single
@@ -163,8 +168,13 @@ def _case(device: Device, size: int) -> Case:
     work = (placed, edges, np.empty(RULERS, np.uint8), rows, origin, board, covariance, found)
     taps, starts = of_ruler._TAPS.astype(np.float32), by_numpy.starts
 
-    def by_numba() -> None:
-        _estimate(frame, image, PREDICTED, point, normal, taps, numbers, starts, work)
+    forms: dict[str, Callable[[], object]] = {}
+    poses: dict[str, NDArray[Any]] = {}
+    for name, measure in ruler_peers.expert_forms(RULERS).items():
+        estimate = _estimator(measure)
+        forms[name] = functools.partial(estimate, frame, views, PREDICTED, point, normal, taps, numbers, starts, work)
+        forms[name]()
+        poses[f"numba {name}"] = found.copy()
 
     def ours() -> object:
         return bound(frame, PREDICTED)
@@ -172,18 +182,17 @@ def _case(device: Device, size: int) -> Case:
     def ours_behind_lens() -> object:
         return behind_lens(distorted, PREDICTED)
 
-    by_numba()
     result, true = bound(frame, PREDICTED), PREDICTED + MOTION
     sigma = np.sqrt(np.diag(np.asarray(result.covariance)))
     of_ours = np.array(result.pose)
     of_lens = np.array(behind_lens(distorted, PREDICTED).pose)
     of_numpy = by_numpy(frame, PREDICTED)
-    for name, each in (("gpuvision", of_ours), ("lens", of_lens), ("numba", found), ("numpy", of_numpy)):
+    for name, each in (("gpuvision", of_ours), ("lens", of_lens), *poses.items(), ("numpy", of_numpy)):
         if np.any(np.abs(each - true) > 6.0 * sigma):
             raise AssertionError(f"the pose of {name} differs from the truth: {each - true}, sigmas {sigma}")
-    peers: dict[str, Callable[[], object]] = {"numpy": lambda: by_numpy(frame, PREDICTED), "numba": by_numba}
+    peers: dict[str, Peer] = {"numpy": lambda: by_numpy(frame, PREDICTED), "numba": forms}
     metadata: dict[str, float] = {}
-    for names, calls in ((("", "lens_"), (ours, ours_behind_lens)), (("numba_",), (by_numba,))):
+    for names, calls in ((("", "lens_"), (ours, ours_behind_lens)), (("numba_",), (forms["pairs-serial"],))):
         for name, (p50, p99) in zip(names, percentiles(*calls), strict=True):
             metadata |= {f"{name}p50_us": p50, f"{name}p99_us": p99}
     error = float(np.max(np.abs(of_ours[:2] - true[:2])))

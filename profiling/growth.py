@@ -28,6 +28,7 @@ from gpuvision.profiling import (
     psd,
     rays,
     ruler,
+    ruler_peers,
     triangulation,
     undistort_points,
 )
@@ -115,7 +116,11 @@ def _repeated(item: str, operation: Operation[Any], samples: Inputs, axis: int =
 
 def _rulers(items: int) -> Operation[Any]:
     return RulerEdges(
-        threshold=ruler.THRESHOLD, length=ruler.LENGTH, width=ruler.WIDTH, smoothing_px=ruler.SMOOTHING, count=items
+        threshold=ruler.THRESHOLD,
+        length=ruler_peers.LENGTH,
+        width=ruler_peers.WIDTH,
+        smoothing_px=ruler.SMOOTHING,
+        count=items,
     )
 
 

@@ -1,123 +1,45 @@
 """Calipers (rulers) against Numba on all cores, OpenCV's remap of all rulers in one call, and NumPy.
 
-Numba sums the lines of a sample in a register, so that LLVM vectorises over samples. Cases named ``flat`` use a form
-that LLVM compiles to faster code: 32-bit indices into a flat image.
-
 The rulers have 64 samples, 5 lines and a smoothing of 1 px; each crosses the border of a disc once, at any angle, in an
 8-bit frame of 640 x 480. All candidates return position, amplitude, width, predicted standard deviation and status of
 the strongest edge. We correct the position for the bias of linear interpolation; the peers do not. We measure 16 rulers
-in an inline queue, which runs in the thread of the caller.
+in an inline queue, which runs in the thread of the caller. The Numba peers are in `gpuvision.profiling.ruler_peers`.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.ruler import RulerEdges
-from gpuvision.profiling.harness import Case
+from gpuvision.profiling import ruler_peers
+from gpuvision.profiling.harness import Case, Peer
+from gpuvision.profiling.ruler_peers import LENGTH, REACH, WIDTH
 
 ROWS, COLUMNS, RADIUS = 480, 640, 150.0
-LENGTH, WIDTH, SMOOTHING, THRESHOLD = 64, 5, 1.0, 20.0
+SMOOTHING, THRESHOLD = 1.0, 20.0
 _FEW = 16  # largest number of rulers that are measured in an inline queue
-_REACH = 3
 _OPENCV_ROWS = 32767  # largest number of rows of an image from remap
-_TAPS = np.arange(1, _REACH + 1) * np.exp(-0.5 * np.arange(1, _REACH + 1) ** 2)
-_TAPS /= 2.0 * np.sum(_TAPS * np.arange(1, _REACH + 1))
-_VARIANCE = float(np.sum(2.0 * _TAPS * np.arange(1, _REACH + 1) ** 3)) / 3.0
+_TAPS = np.arange(1, REACH + 1) * np.exp(-0.5 * np.arange(1, REACH + 1) ** 2)
+_TAPS /= 2.0 * np.sum(_TAPS * np.arange(1, REACH + 1))
+_VARIANCE = float(np.sum(2.0 * _TAPS * np.arange(1, REACH + 1) ** 3)) / 3.0
 _LEAST = THRESHOLD / math.sqrt(2.0 * math.pi * _VARIANCE)
-
-
-@numba.njit(error_model="numpy", fastmath={"contract"})
-def _sample(image, pixels, pitch, x, y):
-    """Return a bilinear sample. Unsigned indices avoid the test for negative ones."""
-    column, row = np.int32(x), np.int32(y)
-    dx, dy = x - np.float32(column), y - np.float32(row)
-    u, v, one = np.uint64(row), np.uint64(column), np.uint64(1)
-    a, b = np.float32(image[u, v]), np.float32(image[u, v + one])
-    c, d = np.float32(image[u + one, v]), np.float32(image[u + one, v + one])
-    a += dx * (b - a)
-    c += dx * (d - c)
-    return a + dy * (c - a)
-
-
-@numba.njit(error_model="numpy", fastmath={"contract"})
-def _sample_flat(image, pixels, pitch, x, y):
-    """Return a bilinear sample by 32-bit indices into a flat image."""
-    column, row = np.int32(x), np.int32(y)
-    dx, dy = x - np.float32(column), y - np.float32(row)
-    one, at = np.uint32(1), np.uint32(row) * pitch + np.uint32(column)
-    a, b = np.float32(pixels[at]), np.float32(pixels[at + one])
-    c, d = np.float32(pixels[at + pitch]), np.float32(pixels[at + pitch + one])
-    a += dx * (b - a)
-    c += dx * (d - c)
-    return a + dy * (c - a)
-
-
-def _compiled(sample: Any) -> Any:
-    """Return a Numba function ``(image, rulers, taps, numbers, edges, status)`` that fills the edges (4, n)."""
-
-    @numba.njit(parallel=True, error_model="numpy", fastmath={"contract"})
-    def measure(image, rulers, taps, numbers, edges, status):
-        pixels, pitch = image.reshape(-1), np.uint32(image.shape[1])
-        half, one = np.float32(0.5), np.float32(1.0)
-        least, smoothing, noise = numbers[0], numbers[1], numbers[2]
-        first, second, third = taps[0], taps[1], taps[2]
-        for r in numba.prange(rulers.shape[0]):
-            profile, slopes = np.zeros(LENGTH, np.float32), np.zeros(LENGTH, np.float32)
-            cosine, sine = rulers[r, 2], rulers[r, 3]
-            middle = half * np.float32(LENGTH - 1)
-            first_x = rulers[r, 0] - middle * cosine + half * np.float32(WIDTH - 1) * sine
-            first_y = rulers[r, 1] - middle * sine - half * np.float32(WIDTH - 1) * cosine
-            for i in range(LENGTH):
-                along_x, along_y = first_x + np.float32(i) * cosine, first_y + np.float32(i) * sine
-                total = np.float32(0.0)
-                for line in range(WIDTH):
-                    x, y = along_x - np.float32(line) * sine, along_y + np.float32(line) * cosine
-                    total += sample(image, pixels, pitch, x, y)
-                profile[i] = total
-            for i in range(3, LENGTH - 3):
-                slopes[i] = (
-                    first * (profile[i + 1] - profile[i - 1])
-                    + second * (profile[i + 2] - profile[i - 2])
-                    + third * (profile[i + 3] - profile[i - 3])
-                )
-            best, at_best = np.float32(0.0), 4
-            for i in range(4, LENGTH - 4):
-                strength = abs(slopes[i])
-                if strength > best:
-                    best, at_best = strength, i
-            found = best >= least
-            sign = np.float32(np.sign(slopes[at_best]))
-            before = np.log(max(sign * slopes[at_best - 1] / best, np.float32(1e-6)))
-            after = np.log(max(sign * slopes[at_best + 1] / best, np.float32(1e-6)))
-            variance, tilt = -one / (before + after), half * (after - before)
-            shift = tilt * variance
-            nan = np.float32(np.nan)
-            edges[0, r] = np.float32(at_best) + shift - middle if found else nan
-            height = sign * best * np.exp(half * tilt * shift) * np.sqrt(np.float32(2.0 * np.pi) * variance)
-            edges[1, r] = height / np.float32(WIDTH) if found else nan
-            edges[2, r] = np.sqrt(max(variance - smoothing, np.float32(0.0))) if found else nan
-            edges[3, r] = noise * variance / best if found else nan
-            status[r] = np.uint8(not found)
-
-    return measure
 
 
 def _gradient_matrix(dtype: Any) -> NDArray[Any]:
     """Return the matrix that maps samples (LENGTH,) to gradients; BLAS multiplies it."""
-    matrix = np.zeros((LENGTH, LENGTH - 2 * _REACH))
+    matrix = np.zeros((LENGTH, LENGTH - 2 * REACH))
     for k, tap in enumerate(_TAPS, 1):
         for i in range(matrix.shape[1]):
-            matrix[i + _REACH + k, i] += tap
-            matrix[i + _REACH - k, i] -= tap
+            matrix[i + REACH + k, i] += tap
+            matrix[i + REACH - k, i] -= tap
     return matrix.astype(dtype)
 
 
@@ -139,7 +61,7 @@ def _refined(profiles: NDArray[Any], matrix: NDArray[Any]) -> tuple[NDArray[Any]
     after = np.log(np.maximum(slopes[each, at + 1] / peak, 1e-6))
     variance, tilt = -1.0 / (before + after), 0.5 * (after - before)
     shift = tilt * variance
-    position = at + shift + (_REACH - (LENGTH - 1) / 2)
+    position = at + shift + (REACH - (LENGTH - 1) / 2)
     amplitude = peak * np.exp(0.5 * tilt * shift) * np.sqrt(2.0 * np.pi * variance)
     width = np.sqrt(np.maximum(variance - _VARIANCE, 0.0))
     return position, amplitude, width, variance / np.abs(peak), np.abs(peak) < _LEAST
@@ -197,13 +119,24 @@ def scene(count: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
 
 def cases(device: Device) -> Iterator[Case]:
     """Yield 16, 100, 1000 and 10 000 rulers."""
-    plain, flat = _compiled(_sample), _compiled(_sample_flat)
     for count in (16, 100, 1000, 10_000):
-        yield _case(device, count, str(count), plain)
-        yield _case(device, count, f"{count}/flat", flat, alone=True)
+        yield _case(device, count)
 
 
-def _case(device: Device, count: int, name: str, compiled: Any, *, alone: bool = False) -> Case:
+def numba_calls(
+    image: NDArray[np.uint8], rulers: NDArray[np.float32]
+) -> Iterator[tuple[str, str, Callable[[], object], NDArray[Any], NDArray[Any]]]:
+    """Yield the Numba peers: names of peer and form, the call, and the edges (4, n) and status (n,) that it fills."""
+    frame, taps = ruler_peers.Frame.of(image), _TAPS.astype(np.float32)
+    numbers = np.array([_LEAST * WIDTH, _VARIANCE, 1.0], np.float32)
+    forms = [("numba", name, form) for name, form in ruler_peers.expert_forms(len(rulers)).items()]
+    for peer, name, form in [*forms, ("numba-plain", "", ruler_peers.plain_form())]:
+        edges, status = np.empty((4, len(rulers)), np.float32), np.empty(len(rulers), np.uint8)
+        call = functools.partial(form, frame, rulers, taps, numbers, edges, status)
+        yield peer, name, call, edges, status
+
+
+def _case(device: Device, count: int) -> Case:
     image, rulers = scene(count)
     operation = RulerEdges(threshold=THRESHOLD, length=LENGTH, width=WIDTH, smoothing_px=SMOOTHING, count=count)
     # A few rulers are measured faster than a worker thread starts.
@@ -212,20 +145,34 @@ def _case(device: Device, count: int, name: str, compiled: Any, *, alone: bool =
     bound.inputs[0].set(image)
     bound.inputs[1].set(rulers)
     bound.run()
-    taps, matrix = _TAPS.astype(np.float32), _gradient_matrix(np.float32)
-    numbers = np.array([_LEAST * WIDTH, _VARIANCE, 1.0], np.float32)
-    edges, status = np.empty((4, count), np.float32), np.empty(count, np.uint8)
-    plain, _, widths, _, dark = _numpy(image, rulers.astype(np.float64), _gradient_matrix(np.float64))
-    exact = _corrected(rulers.astype(np.float64), plain, widths)
-    if np.any(to_numpy(bound.outputs.status)) or np.any(dark):
+    matrix = _gradient_matrix(np.float32)
+    exact = _numpy(image, rulers.astype(np.float64), _gradient_matrix(np.float64))
+    if np.any(to_numpy(bound.outputs.status)) or np.any(exact[4]):
         raise AssertionError("a ruler across an edge found no edge")
-    compiled(image, rulers, taps, numbers, edges, status)
-    metadata = {"peer_error": float(np.max(np.abs(edges[0] - plain))), "rulers": count}
-    peers: dict[str, Callable[[], object]] = {
-        "numba": lambda: compiled(image, rulers, taps, numbers, edges, status),
-    }
-    if not alone:
-        peers["opencv"] = lambda: _opencv(image, rulers, matrix)
-        peers["numpy"] = lambda: _numpy(image, rulers, matrix)
-    error = float(np.max(np.abs(to_numpy(bound.outputs.position) - exact)))
-    return Case("ruler", name, bound.run, peers, error, metadata=metadata)
+    numba: dict[str, Callable[[], object]] = {}
+    peers: dict[str, Peer] = {"numba": numba}
+    peer_error = 0.0
+    for peer, name, call, edges, status in numba_calls(image, rulers):
+        call()
+        check_peer(f"{peer} {name}", edges, status, exact)
+        peer_error = max(peer_error, float(np.max(np.abs(edges[0] - exact[0]))))
+        if name:
+            numba[name] = call
+        else:
+            peers[peer] = call
+    peers["opencv"] = lambda: _opencv(image, rulers, matrix)
+    peers["numpy"] = lambda: _numpy(image, rulers, matrix)
+    position = _corrected(rulers.astype(np.float64), exact[0], exact[2])
+    error = float(np.max(np.abs(to_numpy(bound.outputs.position) - position)))
+    metadata = {"peer_error": peer_error, "rulers": count}
+    return Case("ruler", str(count), bound.run, peers, error, metadata=metadata)
+
+
+def check_peer(name: str, edges: NDArray[Any], status: NDArray[Any], exact: tuple[NDArray[Any], ...]) -> None:
+    """Raise an AssertionError if edges differ from those in double precision by more than rounding."""
+    bounds = (5e-4, 1e-2, 5e-4, 1e-5)  # px, grey levels, px, px: some 10 times the differences of the forms
+    scales = (1.0, 1.0, 1.0, float(WIDTH))  # the noise of Numba is that of the sum over the lines
+    differences = [np.max(np.abs(k * a - b)) for k, a, b in zip(scales, edges, exact[:4], strict=True)]
+    is_close = [difference <= bound for difference, bound in zip(differences, bounds, strict=True)]
+    if np.any(status) or not all(is_close):
+        raise AssertionError(f"the edges of the peer {name} differ from those in double precision")

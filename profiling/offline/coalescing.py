@@ -29,6 +29,7 @@ from gpuvision.profiling.offline.targets import TARGETS, cache_path, compile_ass
 from gpuvision.profiling.offline.warp import Group, Memory, Requests
 
 _TARGET = TARGETS["sm_90"]
+_Size = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,9 @@ def trace(
     groups : iterable of int, optional
         Numbers of the work-groups to run. Default: all.
     group_size : int, optional
-        Work-items of a group along the first axis. Default: as the operation launches it. The size is not
-        checked: a kernel with a fixed group size gives wrong results with another one.
+        Work-items of a group along the first axis. Default: as the operation launches it. Another size is for kernels
+        without local memory; a smaller one also for kernels whose groups solve a problem each, as in
+        `gpuvision.host.limits.fit_group`.
     offset : int
         Elements between an aligned address and the first element of every input and output, default 0.
 
@@ -83,6 +85,8 @@ def trace(
     ------
     CompilerError
         The kernel does not compile.
+    ValueError
+        The kernel is compiled for another size than `group_size`.
     IndexError, ValueError
         The kernel reads or writes beyond an array of global or local memory, or at an address that is not aligned to
         the access, or not all work-items of a group reach a barrier.
@@ -91,6 +95,7 @@ def trace(
     """
     launch = operation.launch(GpuModel(), inputs[0].shape, inputs[0].dtype)
     kernel = parse_kernel(_assembly(launch), launch.kernel)
+    counts, size = _groups_of(launch, kernel, group_size)
     memory, outputs = Memory(), {}
     values: list[float] = [
         memory.add(f"input {number}", each.copy(), offset * each.itemsize) for number, each in enumerate(inputs)
@@ -104,26 +109,26 @@ def trace(
             values.append(memory.add(f"table {number}", np.ascontiguousarray(argument)))
         else:
             values.append(0 if argument is None else argument.item())
-    _run(kernel, memory, values, launch, groups, group_size)
+    x, y, z = counts
+    for number in range(x * y * z) if groups is None else groups:
+        place = (number % x, number // x % y, number // (x * y))
+        Group(kernel, memory, values, group=place, groups=counts, size=size).run()
     return Trace(memory.requests, outputs)
 
 
-def _run(
-    kernel: PtxKernel,
-    memory: Memory,
-    values: Sequence[float],
-    launch: Launch,
-    groups: Iterable[int] | None,
-    group_size: int | None,
-) -> None:
+def _groups_of(launch: Launch, kernel: PtxKernel, group_size: int | None) -> tuple[_Size, _Size]:
+    """Return the numbers of work-groups and of the work-items of a group along three axes."""
     if launch.local_size is None:
         raise NotImplementedError(f"{launch.kernel} leaves the group size to the runtime")
-    wide, high, deep, *_ = (group_size or launch.local_size[0], *launch.local_size[1:], 1, 1)
+    first, high, deep, *_ = (*launch.local_size, 1, 1)
     columns, rows, layers, *_ = (*launch.global_size, 1, 1)
-    x, y, z = -(-columns // wide), -(-rows // high), -(-layers // deep)
-    for number in range(x * y * z) if groups is None else groups:
-        place = (number % x, number // x % y, number // (x * y))
-        Group(kernel, memory, values, group=place, groups=(x, y, z), size=(wide, high, deep)).run()
+    wide = first if group_size is None else group_size
+    # PTX from OpenCL C does not state a required size, but arrays of local memory are as large as the group needs.
+    is_smaller = launch.problem_per_group and wide < first
+    if wide != first and kernel.shared and not is_smaller:
+        raise ValueError(f"{launch.kernel} is compiled for groups of {first} work-items, group_size is {wide}")
+    x = columns // first if launch.problem_per_group else -(-columns // wide)
+    return (x, -(-rows // high), -(-layers // deep)), (wide, high, deep)
 
 
 def _assembly(launch: Launch) -> str:

@@ -207,7 +207,7 @@ class Case(SimpleNamespace):
 
 
 def test_one_case_of_each_function_of_a_kernel(tmp_path: Path) -> None:
-    """The option ``--one-case`` leaves the best device, the files of kernels and of tests/host, and the first cases."""
+    """The option ``--one-case`` leaves the best device, files of kernels, shared code and tests/host, and first cases."""
     other = SimpleNamespace(label="other")
     best = SimpleNamespace(label="best")
 
@@ -219,8 +219,10 @@ def test_one_case_of_each_function_of_a_kernel(tmp_path: Path) -> None:
     psd, whole = "ranging/test_psd.py", "workflows/test_psd.py"
     places = [(psd, "a", other), (psd, "a", best), (psd, "a", best), (psd, "b", best), (psd, "c", None)]
     places += [(whole, "a", best), ("ranging/test_focus.py", "a", best), ("host/test_ring.py", "a", best)]
+    places += [(name, "a", best) for name in ("test_two_float.py", "test_lanes.py", "test_work_groups.py")]
+    places += [("matching/test_problem_groups.py", "a", best), ("test_two_float.py", "a", best)]
     items = [item_of(*each) for each in places]
     chosen, left, without_inline = one_case_each(Selection(items, [], {items[1], items[2]}), [best])
-    assert [items.index(each) for each in chosen] == [1, 3, 7]
-    assert [items.index(each) for each in left] == [0, 2, 4, 5, 6]
+    assert [items.index(each) for each in chosen] == [1, 3, 7, 8, 9, 10, 11]
+    assert [items.index(each) for each in left] == [0, 2, 4, 5, 6, 12]
     assert without_inline == {items[1]}

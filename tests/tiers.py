@@ -20,6 +20,8 @@ _ROOT = Path(__file__).resolve().parents[1]
 _OF_KERNELS = {f"test_{path.parent.name}" for path in (_ROOT / "kernels").glob("*/*.cl")}
 # Folders whose test files are not about a kernel, also where they have the name of one.
 _COMPOSED = frozenset({"cli", "formats", "profiling", "workflows"})
+# Test files about code that several kernels share: headers of kernels/common, and how launches divide work.
+_OF_SHARED_CODE = frozenset({"test_lanes", "test_problem_groups", "test_two_float", "test_work_groups"})
 # Test functions of a file that the fast tier runs in both kernel variants: the variants differ in few functions of a
 # kernel, and each variant takes another compilation.
 _IN_BOTH_VARIANTS = 2
@@ -105,7 +107,7 @@ def select_fast(items: Sequence[pytest.Item], best: Collection[Device]) -> Selec
 
 
 def one_case_each(selection: Selection, best: Collection[Device]) -> Selection:
-    """Return the first case of each test function of kernels and of ``tests/host`` on the best device.
+    """Return the first case of each test function that `has_one_case` accepts, on the best device.
 
     For a runtime that compiles slowly: most functions have one set of build options in their first case.
     """
@@ -120,8 +122,9 @@ def one_case_each(selection: Selection, best: Collection[Device]) -> Selection:
 
 
 def has_one_case(path: Path) -> bool:
-    """Return whether `one_case_each` chooses tests of a file: a file about one kernel, or in ``tests/host``."""
-    return path.parent.name == "host" or (path.stem in _OF_KERNELS and path.parent.name not in _COMPOSED)
+    """Return whether `one_case_each` chooses tests of a file: about a kernel, about shared code, or in ``tests/host``."""
+    is_of_kernel = path.stem in _OF_KERNELS and path.parent.name not in _COMPOSED
+    return is_of_kernel or path.parent.name == "host" or path.stem in _OF_SHARED_CODE
 
 
 def is_refused(item: pytest.Item) -> bool:

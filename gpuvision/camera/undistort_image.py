@@ -48,7 +48,7 @@ _LARGEST_FRAME = 2**30
 _ROWS_AT_ONCE = 32
 # Work-items of a work-group along columns and rows.
 _GROUP = (32, 4)
-_PIXELS = 4  # of a work-item under QUAD: PIXELS in undistort_image.cl
+_QUAD = 4  # samples of a work-item for bilinear integer images
 
 
 @runtime_checkable
@@ -112,8 +112,8 @@ class UndistortImage(VisionOperation[UndistortedImage]):
     precision : {"single", "double"}, optional
         Precision of computed source positions. Default "single": exact to the rounding of the coordinate.
     variant : {"auto", "vector", "work_item"}
-        Kernel variant: 16-wide vectors for CPU runtimes, a work-item per pixel for GPUs (per four pixels for bilinear
-        integer images of one channel), or by the device (default).
+        Kernel variant: 16-wide vectors for CPU runtimes, a work-item per sample for GPUs (per four samples for bilinear
+        integer images), or by the device (default).
 
     Raises
     ------
@@ -245,7 +245,8 @@ class UndistortImage(VisionOperation[UndistortedImage]):
             work = WorkSize((made_rows, frames), (1, 1), vectors=True)
         else:
             wide, high = _GROUP
-            items = ceil_div(made_columns, _PIXELS if self._quad(dtype) else 1)
+            each = _QUAD if self._quad(dtype) else self.channels if computed else 1  # SAMPLES in undistort_image.cl
+            items = ceil_div(made_columns * self.channels, each)
             work = WorkSize((round_up(items, wide), round_up(made_rows, high), frames), (wide, high, 1))
         return build.launch(
             "undistort_image/undistort_image.cl",
@@ -302,8 +303,8 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         return table
 
     def _quad(self, dtype: np.dtype[Any]) -> dict[str, Define]:
-        """Return the macro QUAD where a work-item of the work-item variant computes four pixels."""
-        if self.interpolation != "bilinear" or self.channels != 1 or dtype.kind != "u":
+        """Return the macro QUAD where a work-item of the work-item variant computes four samples."""
+        if self.interpolation != "bilinear" or dtype.kind != "u":
             return {}
         return {"QUAD": {1: "uint", 2: "ulong"}[dtype.itemsize]}
 

@@ -10,11 +10,11 @@
 //          the lens or camera model; size (7,) int32: sizes, origin of the output and status of missing pixels; fill:
 //          value of pixels without a source.
 // Options: CODE, MAX_CODE (largest value of an integer CODE), CHANNELS (1 or 3, interleaved), BICUBIC (otherwise
-//          bilinear), QUAD (unsigned integer of four samples: work-item variant of bilinear integer images of one
-//          channel), BORDER_MASK, BORDER_CONSTANT, BORDER_REPLICATE or BORDER_REFLECT, FROM_MODEL, LENS or CAMERA,
+//          bilinear), QUAD (unsigned integer of four samples: work-item variant of bilinear integer images),
+//          BORDER_MASK, BORDER_CONSTANT, BORDER_REPLICATE or BORDER_REFLECT, FROM_MODEL, LENS or CAMERA,
 //          PAST_CACHES.
-// Variants: vector: a work-item per row and frame, in runs of 16 pixels; work-item: four neighbouring pixels per item
-//          under QUAD (undistort_image_quad.h), otherwise one pixel per item.
+// Variants: vector: a work-item per row and frame, in runs of 16 pixels; work-item: four neighbouring samples per
+//          item under QUAD (undistort_image_quad.h), one pixel under FROM_MODEL, otherwise one sample.
 #include "common/camera.h"
 #include "common/lanes.h"
 #include "common/lens.h"
@@ -53,46 +53,54 @@ void undistort(global const CODE *image, global CODE *made, global uchar *status
 #else
 #ifdef QUAD
 #include "undistort_image/undistort_image_quad.h"
-#define PIXELS 4
+#define SAMPLES 4
+#elif defined(FROM_MODEL)
+#define SAMPLES CHANNELS
 #else
-#define PIXELS 1
+#define SAMPLES 1
 #endif
 
-// PIXELS neighbouring pixels per work-item.
+// SAMPLES neighbouring samples of a row per work-item. One sample: a warp so reads adjacent samples for each tap, where
+// with a pixel of three channels for each work-item it would read every third one. Source positions from the camera model
+// cost more than requests: a work-item computes a whole pixel.
 kernel void undistort(global const CODE *image, global CODE *made, global uchar *status, global const int4 *heads,
                       global const float8 *curves, global const float2 *points, constant real *model,
                       constant int *size, const float fill) {
-    const int begin = (int)get_global_id(0) * PIXELS, row = get_global_id(1), columns = size[MADE_COLUMNS];
-    const size_t frame = get_global_id(2), pixel = (size_t)row * columns + begin;
-    if (begin >= columns || row >= size[MADE_ROWS]) return;
+    const int begin = (int)get_global_id(0) * SAMPLES, row = get_global_id(1);
+    const int columns = size[MADE_COLUMNS], width = columns * CHANNELS;
+    const size_t frame = get_global_id(2);
+    if (begin >= width || row >= size[MADE_ROWS]) return;
     const size_t samples = (size_t)size[SOURCE_ROWS] * size[SOURCE_COLUMNS] * CHANNELS, first = frame * samples;
-    made += (frame * size[MADE_ROWS] * columns + pixel) * CHANNELS;
+    made += (frame * size[MADE_ROWS] + row) * width;
+    status += (size_t)row * columns;
 #ifdef QUAD
-    if (begin + PIXELS <= columns) {
-        int source_column, source_row;
-        float x[PIXELS], y[PIXELS];
+    if (begin + SAMPLES <= width) {
+        const int column = begin / CHANNELS, channel = begin - column * CHANNELS;
+        QuadPlaces places;
         QUAD quad;
 #ifdef FROM_MODEL
-        const int found = quad_places(begin, row, model, size, &source_column, &source_row, x, y);
+        const int found = quad_places(column, row, model, size, &places);
 #else
-        const int found = quad_places(begin, row, heads, curves, points, size, &source_column, &source_row, x, y);
+        const int found = quad_places(column, row, heads, curves, points, size, &places);
 #endif
-        if (found && interpolated_quad(image, first, get_global_size(2) * samples, source_column, source_row, x, y, size,
-                                       &quad)) {
-            store_quad(quad, made);
-            if (frame == 0) store_good_quad(status + pixel);
+        if (found && interpolated_quad(image, first, get_global_size(2) * samples, channel, &places, size, &quad)) {
+            store_quad(quad, made + begin);
+            if (frame == 0) store_good_quad(status + column, channel);
             return;
         }
     }
 #endif
-    for (int k = 0; k < PIXELS && begin + k < columns; k++) {
+    const int end = min(begin + SAMPLES, width);
+    for (int at = begin, count; at < end; at += count) {
+        const int column = at / CHANNELS, channel = at - column * CHANNELS;
+        count = min(CHANNELS - channel, end - at);
 #ifdef FROM_MODEL
-        const uchar found = computed_pixel(image + first, made + k * CHANNELS, begin + k, row, model, size, fill);
+        const uchar found = computed_pixel(image + first + channel, made + at, count, column, row, model, size, fill);
 #else
-        const uchar found =
-            mapped_pixel(image + first, made + k * CHANNELS, begin + k, row, heads, curves, points, size, fill);
+        const uchar found = mapped_pixel(image + first + channel, made + at, count, column, row, heads, curves, points,
+                                         size, fill);
 #endif
-        if (frame == 0) status[pixel + k] = found;
+        if (frame == 0 && channel == 0) status[column] = found;
     }
 }
 #endif

@@ -66,7 +66,7 @@ static inline void mapped_row(global const CODE *image, global CODE *made, globa
         case RUN_WIDE_BANDED_WINDOW: mapped_window(WIDE, 0, image, to, head, curves[run], size); break;
         case RUN_BLANK:
             for (int lane = 0; lane < lanes; lane++) {
-                blank(head.w, fill, to + lane * CHANNELS);
+                blank(head.w, fill, CHANNELS, to + lane * CHANNELS);
                 if (status) status[start + lane] = head.w;
             }
             break;
@@ -76,14 +76,14 @@ static inline void mapped_row(global const CODE *image, global CODE *made, globa
     }
 }
 #else
-// Compute one pixel; return its status.
-static inline uchar mapped_pixel(global const CODE *image, global CODE *made, int column, int row,
+// Compute `count` channels of one pixel, from those that `image` and `made` point to on; return its status.
+static inline uchar mapped_pixel(global const CODE *image, global CODE *made, int count, int column, int row,
                                  global const int4 *heads, global const float8 *curves, global const float2 *points,
                                  constant int *size, float fill) {
     const int columns = size[MADE_COLUMNS], run = column / RUN, lane = column - RUN_START(run, columns);
     const size_t index = (size_t)row * RUNS(columns) + run;
     const int4 head = heads[index];
-    if (HEAD_KIND(head) == RUN_BLANK) return blank(head.w, fill, made);
+    if (HEAD_KIND(head) == RUN_BLANK) return blank(head.w, fill, count, made);
     float2 place;
     if (HEAD_KIND(head) == RUN_POINTS || HEAD_KIND(head) == RUN_SCATTERED) {
         place = points[(size_t)RUN * head.w + lane];
@@ -92,7 +92,7 @@ static inline uchar mapped_pixel(global const CODE *image, global CODE *made, in
         const float t = lane - RUN_MIDDLE;
         place = (float2)(CUBIC(curve.lo, t), CUBIC(curve.hi, t));
     }
-    return sample(image, head.x, head.y, place.x, place.y, size, fill, made);
+    return sample(image, head.x, head.y, place.x, place.y, size, fill, count, made);
 }
 #endif
 

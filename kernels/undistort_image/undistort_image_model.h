@@ -53,13 +53,13 @@ static inline void computed_run(global const CODE *image, global CODE *made, glo
     else interpolate_window(NARROW, 0, image, pitch, convert_float16(x), convert_float16(y), bands, starts, made);
 }
 #else
-// Compute one pixel; return its status.
-static inline uchar computed_pixel(global const CODE *image, global CODE *made, int column, int row,
+// Compute `count` channels of one pixel, from those that `image` and `made` point to on; return its status.
+static inline uchar computed_pixel(global const CODE *image, global CODE *made, int count, int column, int row,
                                    constant real *model, constant int *size, float fill) {
     real x = column + size[FIRST_COLUMN], y = row + size[FIRST_ROW];
-    if (distort_pixels(&x, &y, model)) return blank(size[MISSING], fill, made);
+    if (distort_pixels(&x, &y, model)) return blank(size[MISSING], fill, count, made);
     const int left = floor_pixel(x), top = floor_pixel(y);
-    return sample(image, left, top, (float)(x - left), (float)(y - top), size, fill, made);
+    return sample(image, left, top, (float)(x - left), (float)(y - top), size, fill, count, made);
 }
 #endif
 

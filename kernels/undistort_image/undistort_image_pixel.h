@@ -106,9 +106,9 @@ static inline float interpolate(global const CODE *image, int column, int row, f
 #endif
 }
 
-// Write the fill value to a pixel without a source; return the given status.
-static inline uchar blank(uchar status, float fill, global CODE *made) {
-    for (int channel = 0; channel < CHANNELS; channel++) made[channel] = to_code(fill);
+// Write the fill value to `count` channels of a pixel without a source; return the given status.
+static inline uchar blank(uchar status, float fill, int count, global CODE *made) {
+    for (int channel = 0; channel < count; channel++) made[channel] = to_code(fill);
     return status;
 }
 
@@ -125,26 +125,27 @@ static inline int floor_pixel(real place) {
     return whole - (clamped < whole);
 }
 
-// Write the pixel at the source position (column + x, row + y) and return its status: NO_DATA for a position more than
-// half a pixel beyond the centres of the outermost pixels, size[MISSING] for a position that is not finite.
+// Write `count` channels, from those that `image` and `made` point to on, of the pixel at the source position (column + x,
+// row + y). Return its status: NO_DATA for a position more than half a pixel beyond the centres of the outermost pixels,
+// size[MISSING] for a position that is not finite.
 static inline uchar sample(global const CODE *image, int column, int row, float x, float y, constant int *size,
-                           float fill, global CODE *made) {
+                           float fill, int count, global CODE *made) {
     if ((as_int(x) & 0x7f800000) == 0x7f800000 || (as_int(y) & 0x7f800000) == 0x7f800000)
-        return blank(size[MISSING], fill, made);
+        return blank(size[MISSING], fill, count, made);
     const int columns = size[SOURCE_COLUMNS], rows = size[SOURCE_ROWS];
     const uchar status = x < -0.5f - column || x > columns - 0.5f - column || y < -0.5f - row || y > rows - 0.5f - row
                              ? STATUS_NO_DATA
                              : STATUS_OK;
 #ifdef BORDER_MASK
-    if (status) return blank(status, fill, made);
+    if (status) return blank(status, fill, count, made);
 #endif
     const int whole_x = floor_pixel(x), whole_y = floor_pixel(y);
     column += whole_x;
     row += whole_y;
 #ifdef BORDER_CONSTANT
-    if (all_taps_outside(column, columns) || all_taps_outside(row, rows)) return blank(status, fill, made);
+    if (all_taps_outside(column, columns) || all_taps_outside(row, rows)) return blank(status, fill, count, made);
 #endif
-    for (int channel = 0; channel < CHANNELS; channel++)
+    for (int channel = 0; channel < count; channel++)
         made[channel] = to_code(interpolate(image + channel, column, row, x - whole_x, y - whole_y, size, fill));
     return status;
 }

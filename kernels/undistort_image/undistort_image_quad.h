@@ -1,120 +1,157 @@
-// Work-item variant for integer images of one channel, bilinear (build option QUAD: an unsigned integer as large as four
-// samples): a work-item computes a quad, four neighbouring pixels of a row.
+// Work-item variant for bilinear integer images (build option QUAD: an unsigned integer as large as four samples): a
+// work-item computes a quad, four neighbouring samples of a row. They are four pixels of one channel, or parts of two
+// pixels of three interleaved channels.
 //
-// A lens is smooth: the taps of a quad lie in a few neighbouring samples of two or three rows. Two aligned loads of four
-// samples hold eight samples of a row, and shifts select the taps. A warp so reads 128 neighbouring pixels with 6
-// requests instead of 64, each of adjacent memory, and stores them with one. Quads whose taps do not fit this window, or
-// lie beyond the border, are computed pixel by pixel.
+// A lens is smooth: the taps of a quad lie in a few neighbouring samples of two rows, or of three rows where the source
+// row changes within the quad. Aligned loads of four samples hold the taps of a row, and shifts select them. A warp so
+// reads 128 neighbouring samples with 4 to 8 requests instead of 64, each of adjacent memory, and stores them with one.
+// The later loads and the third row are read by the work-items that need them. Quads whose taps do not fit the windows, or
+// lie beyond the border, are computed sample by sample.
 #ifndef UNDISTORT_IMAGE_QUAD_H
 #define UNDISTORT_IMAGE_QUAD_H
 
-// Eight neighbouring samples of a row, from an aligned address on.
+#if CHANNELS == 1
+#define QUAD_PIXELS 4
+#define WINDOW_SAMPLES 12  // four pixels at up to 2.3 source columns from pixel to pixel
+#else
+#define QUAD_PIXELS 2
+#define WINDOW_SAMPLES 16  // two pixels that are up to 2 source columns apart, or 3 for the first channel
+#endif
+
+// Neighbouring samples of a row from an aligned address on; `offset`: place of the first tap among them.
 typedef struct {
-    QUAD low, high;
+    QUAD first, second, third;
+#if WINDOW_SAMPLES == 16
+    QUAD fourth;
+#endif
+    int offset;
 } Window;
 
-static inline float window_sample(Window window, int place) {
-    const QUAD part = place < 4 ? window.low : window.high;
-    return (CODE)(part >> (8 * (int)sizeof(CODE) * (place & 3)));
+static inline float window_sample(const Window *window, int place) {
+    const int at = window->offset + place;
+    QUAD part = at < 4 ? window->first : at < 8 ? window->second : window->third;
+#if WINDOW_SAMPLES == 16
+    part = at < 12 ? part : window->fourth;
+#endif
+    return (CODE)(part >> (8 * (int)sizeof(CODE) * (at & 3)));
 }
 
 static inline int is_aligned_to_quad(global const void *to, size_t size) { return ((size_t)to & (size - 1)) == 0; }
 
+// Load the samples at, ..., at + last of the images into a window; `last` is at most WINDOW_SAMPLES - 4, because up to
+// three samples lie before the first one. Two quads are loaded always: conditions cost more than loads.
+static inline Window load_window(global const CODE *images, size_t at, int last) {
+    global const QUAD *quads = (global const QUAD *)images + at / 4;
+    Window window;
+    window.offset = at & 3;
+    const int end = window.offset + last;
+    window.first = quads[0];
+    window.second = quads[1];
+    window.third = end >= 8 ? quads[2] : 0;
+#if WINDOW_SAMPLES == 16
+    window.fourth = end >= 12 ? quads[3] : 0;
+#endif
+    return window;
+}
+
+// Return whether `load_window` reads within the images of this number of samples. If so, it does for smaller `at`.
+static inline int holds_window(size_t at, int last, size_t samples) {
+    return (max((at + last) / 4, at / 4 + 1) + 1) * 4 <= samples;
+}
+
+// Source positions (left + part_x, top + part_y) of the pixels of a quad, parts 0 to 1.
+typedef struct {
+    int left[QUAD_PIXELS], top[QUAD_PIXELS];
+    float part_x[QUAD_PIXELS], part_y[QUAD_PIXELS];
+} QuadPlaces;
+
+static inline void set_place(QuadPlaces *places, int k, int column, int row, float x, float y) {
+    const int whole_x = floor_pixel(x), whole_y = floor_pixel(y);
+    places->left[k] = column + whole_x;
+    places->top[k] = row + whole_y;
+    places->part_x[k] = x - whole_x;
+    places->part_y[k] = y - whole_y;
+}
+
 #ifdef FROM_MODEL
-// Compute the source positions (column + x, row + y) of a quad; return 0 if a pixel has none.
-static inline int quad_places(int made_column, int made_row, constant real *model, constant int *size, int *column,
-                              int *row, float *x, float *y) {
+// Compute the source positions of a quad's pixels, from (column, row) of the output on; return 0 if one has none.
+static inline int quad_places(int column, int row, constant real *model, constant int *size, QuadPlaces *places) {
     masks folded = 0;
-    _Pragma("unroll") for (int k = 0; k < 4; k++) {
-        reals at_x = made_column + k + size[FIRST_COLUMN], at_y = made_row + size[FIRST_ROW];
-        folded |= distort_pixels(&at_x, &at_y, model);
+    int left = 0, top = 0;
+    _Pragma("unroll") for (int k = 0; k < QUAD_PIXELS; k++) {
+        reals x = column + k + size[FIRST_COLUMN], y = row + size[FIRST_ROW];
+        folded |= distort_pixels(&x, &y, model);
         if (k == 0) {
-            *column = floor_pixel(at_x);
-            *row = floor_pixel(at_y);
+            left = floor_pixel(x);
+            top = floor_pixel(y);
         }
-        x[k] = (float)(at_x - *column);
-        y[k] = (float)(at_y - *row);
+        set_place(places, k, left, top, (float)(x - left), (float)(y - top));
     }
     return !folded;
 }
 #else
-// Read the source positions (column + x, row + y) of a quad from the map; return 0 if a pixel has none. The pixels of a
-// quad have one run, because a run has 16 pixels.
-static inline int quad_places(int made_column, int made_row, global const int4 *heads, global const float8 *curves,
-                              global const float2 *points, constant int *size, int *column, int *row, float *x,
-                              float *y) {
-    const int columns = size[MADE_COLUMNS], run = made_column / RUN, lane = made_column - RUN_START(run, columns);
-    const size_t index = (size_t)made_row * RUNS(columns) + run;
-    const int4 head = heads[index];
-    *column = head.x;
-    *row = head.y;
-    if (HEAD_KIND(head) == RUN_BLANK) return 0;
-    if (HEAD_KIND(head) == RUN_POINTS || HEAD_KIND(head) == RUN_SCATTERED) {
-        _Pragma("unroll") for (int k = 0; k < 4; k++) {
-            const float2 place = points[(size_t)RUN * head.w + lane + k];
-            x[k] = place.x;
-            y[k] = place.y;
+// Read the source positions of a quad's pixels from the map, from (column, row) of the output on; return 0 if one has
+// none. Four pixels of one channel have one run, because a run has 16 pixels; two pixels of three channels may have two.
+static inline int quad_places(int column, int row, global const int4 *heads, global const float8 *curves,
+                              global const float2 *points, constant int *size, QuadPlaces *places) {
+    const int columns = size[MADE_COLUMNS];
+    const size_t first = (size_t)row * RUNS(columns);
+    int run = -1, has_all = 1;
+    int4 head;
+    float8 curve;
+    _Pragma("unroll") for (int k = 0; k < QUAD_PIXELS; k++) {
+        const int pixel = column + k;
+        if (k == 0 || (CHANNELS > 1 && pixel / RUN != run)) {
+            run = pixel / RUN;
+            head = heads[first + run];
+            curve = curves[first + run];
         }
-    } else {
-        const float8 curve = curves[index];
-        _Pragma("unroll") for (int k = 0; k < 4; k++) {
-            const float t = lane + k - RUN_MIDDLE;
-            x[k] = CUBIC(curve.lo, t);
-            y[k] = CUBIC(curve.hi, t);
-        }
+        const int lane = pixel - RUN_START(run, columns), kind = HEAD_KIND(head);
+        const float t = lane - RUN_MIDDLE;
+        float2 place = (float2)(CUBIC(curve.lo, t), CUBIC(curve.hi, t));
+        if (kind == RUN_POINTS || kind == RUN_SCATTERED) place = points[(size_t)RUN * head.w + lane];
+        has_all &= kind != RUN_BLANK;
+        set_place(places, k, head.x, head.y, place.x, place.y);
     }
-    return 1;
+    return has_all;
 }
 #endif
 
-// Load the windows of three rows from the sample at (column, row) on; `offset`: its place in the window of each row. The
-// last row repeats the one before it at the lower border. Return 0 if a window ends beyond the images.
-static inline int load_windows(global const CODE *images, size_t first, size_t samples, int column, int row,
-                               constant int *size, Window *window, int *offset) {
-    const int columns = size[SOURCE_COLUMNS];
-    if (!is_aligned_to_quad(images, sizeof(QUAD))) return 0;
-    int fits = 1;
-    _Pragma("unroll") for (int k = 0; k < 3; k++) {
-        const size_t at = first + (size_t)min(row + k, size[SOURCE_ROWS] - 1) * columns + column;
-        offset[k] = at & 3;
-        fits &= at / 4 * 4 + 8 <= samples;
+// Interpolate the quad from `channel` of its first pixel on, in the image that begins at sample `first` of the images.
+// Return 0 if its taps do not fit the windows.
+static inline int interpolated_quad(global const CODE *images, size_t first, size_t samples, int channel,
+                                    const QuadPlaces *places, constant int *size, QUAD *made) {
+    const int columns = size[SOURCE_COLUMNS], rows = size[SOURCE_ROWS], left = places->left[0];
+    int lowest = places->top[0], highest = lowest, farthest = left, inside = 1;
+    _Pragma("unroll") for (int k = 0; k < QUAD_PIXELS; k++) {
+        const int at = places->left[k], top = places->top[k];
+        lowest = min(lowest, top);
+        highest = max(highest, top);
+        farthest = max(farthest, at);
+        inside &= at >= max(left, 0) && at + 1 < columns && top >= 0 && top + 1 < rows;
     }
-    if (!fits) return 0;
-    _Pragma("unroll") for (int k = 0; k < 3; k++) {
-        const size_t at = first + (size_t)min(row + k, size[SOURCE_ROWS] - 1) * columns + column;
-        global const QUAD *quads = (global const QUAD *)images + at / 4;
-        window[k].low = quads[0];
-        window[k].high = quads[1];
-    }
-    return 1;
-}
-
-// Interpolate the quad at the positions (column + x, row + y), of image number `first / (rows * columns)`. Return 0 if its
-// taps do not fit the windows.
-static inline int interpolated_quad(global const CODE *images, size_t first, size_t samples, int column, int row,
-                                    const float *x, const float *y, constant int *size, QUAD *made) {
-    int left[4], top[4], inside = 1, lowest = row + floor_pixel(y[0]);
-    _Pragma("unroll") for (int k = 0; k < 4; k++) {
-        left[k] = column + floor_pixel(x[k]);
-        top[k] = row + floor_pixel(y[k]);
-        lowest = min(lowest, top[k]);
-        inside &= left[k] >= 0 && left[k] + 1 < size[SOURCE_COLUMNS] && top[k] >= 0 && top[k] + 1 < size[SOURCE_ROWS];
-    }
-    // 7: index of the last sample of a window; its first sample is up to 3 samples before the first tap.
-    _Pragma("unroll") for (int k = 0; k < 4; k++) {
-        inside &= left[k] >= left[0] && left[k] + 1 - left[0] <= 7 - 3 && top[k] - lowest <= 1;
-    }
-    Window window[3];
-    int offset[3];
-    if (!inside || !load_windows(images, first, samples, left[0], lowest, size, window, offset)) return 0;
+    // Last tap from the first pixel's first channel on. The first pixel's own last tap is its third channel, 2 + 3.
+    const int last = max((farthest - left + 1) * CHANNELS + (CHANNELS == 1 ? 0 : channel), CHANNELS == 1 ? 1 : 5);
+    if (!inside || highest - lowest > 1 || last > WINDOW_SAMPLES - 4 || !is_aligned_to_quad(images, sizeof(QUAD)))
+        return 0;
+    const size_t pitch = (size_t)columns * CHANNELS, at = first + lowest * pitch + left * CHANNELS;
+    const int has_third = highest > lowest;
+    if (!holds_window(at + (has_third ? 2 : 1) * pitch, last, samples)) return 0;
+    const Window upper = load_window(images, at, last), middle = load_window(images, at + pitch, last);
+    Window lower = middle;
+    if (has_third) lower = load_window(images, at + 2 * pitch, last);
     *made = 0;
     _Pragma("unroll") for (int k = 0; k < 4; k++) {
-        const int later = top[k] > lowest, from = left[k] - left[0];
-        const Window upper = later ? window[1] : window[0], lower = later ? window[2] : window[1];
-        const int above = from + (later ? offset[1] : offset[0]), below = from + (later ? offset[2] : offset[1]);
-        const float part_x = x[k] - (left[k] - column), part_y = y[k] - (top[k] - row);
-        const float a = window_sample(upper, above), b = window_sample(upper, above + 1);
-        const float c = window_sample(lower, below), d = window_sample(lower, below + 1);
+        // Of three channels, the first pixel has the samples before CHANNELS, the second pixel the others.
+        const int next = CHANNELS > 1 && channel + k >= CHANNELS, pixel = CHANNELS == 1 ? k : 0;
+        const int column = next ? places->left[1] : places->left[pixel];
+        const int later = (next ? places->top[1] : places->top[pixel]) > lowest;
+        const float part_x = next ? places->part_x[1] : places->part_x[pixel];
+        const float part_y = next ? places->part_y[1] : places->part_y[pixel];
+        const int from = (column - left) * CHANNELS + (CHANNELS == 1 ? 0 : channel + k - (next ? CHANNELS : 0));
+        const Window above = later ? middle : upper, below = later ? lower : middle;
+        const float a = window_sample(&above, from), b = window_sample(&above, from + CHANNELS);
+        const float c = window_sample(&below, from), d = window_sample(&below, from + CHANNELS);
         const float first_row = a + part_x * (b - a);
         const float value = first_row + part_y * (c + part_x * (d - c) - first_row);
         *made |= (QUAD)to_code(value) << (8 * (int)sizeof(CODE) * k);
@@ -131,12 +168,16 @@ static inline void store_quad(QUAD value, global CODE *to) {
     }
 }
 
-static inline void store_good_quad(global uchar *status) {
+// Store the status of the pixels whose first channel is in a quad of which all pixels have a source.
+static inline void store_good_quad(global uchar *status, int channel) {
+#if CHANNELS == 1
     if (is_aligned_to_quad(status, sizeof(uint))) {
         *(global uint *)status = STATUS_OK * 0x01010101u;
-    } else {
-        for (int k = 0; k < 4; k++) status[k] = STATUS_OK;
+        return;
     }
+#endif
+    for (int k = 0; k < QUAD_PIXELS; k++)
+        if (CHANNELS == 1 || k > 0 || channel == 0) status[k] = STATUS_OK;
 }
 
 #endif

@@ -14,7 +14,8 @@ static inline void each_pixel(global const CODE *image, global CODE *made, globa
     vstore16(x, 0, along);
     vstore16(y, 0, across);
     for (int lane = 0; lane < lanes; lane++) {
-        const uchar found = sample(image, column, row, along[lane], across[lane], size, fill, made + lane * CHANNELS);
+        const uchar found =
+            sample(image, column, row, along[lane], across[lane], size, fill, CHANNELS, made + lane * CHANNELS);
         if (status) status[lane] = found;
     }
 }

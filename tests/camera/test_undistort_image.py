@@ -171,6 +171,21 @@ def test_every_width_of_a_window(device: Device, channels: int, interpolation: A
     assert_right(op(image, device=device), image, positions, channels=channels, interpolation=interpolation)
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_every_gap_of_a_quad(device: Device, dtype: Any, channels: int, rng: np.random.Generator) -> None:
+    """Work-items of four samples: source columns 0 to 4 apart, also to the left, and source rows that change within."""
+    scale = np.concatenate([np.linspace(0.0, 4.0, 41), np.linspace(-1.0, -0.1, 4)])
+    source = (61, 203)
+    image = pixels(rng, (2, *source, 3)[: 3 + channels // 3], dtype)
+    column = np.arange(45)
+    positions = np.empty((len(scale), len(column), 2))
+    positions[..., 0] = np.where(scale[:, None] < 0.0, 190.4, 0.3) + scale[:, None] * column
+    positions[..., 1] = np.linspace(0.2, 58.9, len(scale))[:, None] + np.linspace(-0.2, 0.3, 9)[np.arange(45) % 9]
+    op = UndistortImage(model=positions, channels=channels, variant="work_item")
+    assert_right(op(image, device=device), image, positions, channels=channels)
+
+
 _PRODUCT = [
     {"dtype": dtype, "variant": variant, "channels": channels, "border": border, "interpolation": interpolation}
     for dtype in DTYPES

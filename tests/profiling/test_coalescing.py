@@ -226,16 +226,35 @@ STREAMS: list[tuple[str, Any, list[NDArray[Any]], float, float, int, int]] = [
     ("centroid, columns", gv.LineReadout(method="centroid", threshold=20), [_frames(np.uint8)], 1.0, 1.0, 142, 550),
     ("line, rows", gv.LineReadout(threshold=20, along="rows"), [_ROW], 1.75, 1.0, 161, 952),
     ("centroid, rows", gv.LineReadout(method="centroid", threshold=20, along="rows"), [_ROW], 1.06, 1.0, 135, 553),
-    ("image", gv.UndistortImage(model=_CAMERA), [_image(np.uint8)], 1.31, 1.0, 704, 3520),
-    ("image, colour", gv.UndistortImage(model=_CAMERA, channels=3), [_image(np.uint8, 3)], 3.21, 2.5, 4865, 14900),
+    ("image", gv.UndistortImage(model=_CAMERA), [_image(np.uint8)], 1.36, 1.0, 578, 2946),
+    ("image, float", gv.UndistortImage(model=_CAMERA), [_image(np.float32)], 1.23, 1.0, 2304, 7270),
+    ("image, colour", gv.UndistortImage(model=_CAMERA, channels=3), [_image(np.uint8, 3)], 1.42, 1.33, 2309, 8441),
+    (
+        "image, colour, bicubic",
+        gv.UndistortImage(model=_CAMERA, channels=3, interpolation="bicubic"),
+        [_image(np.uint8, 3)],
+        1.67,
+        1.0,
+        16080,
+        26037,
+    ),
+    (
+        "image, colour, float",
+        gv.UndistortImage(model=_CAMERA, channels=3),
+        [_image(np.float32, 3)],
+        1.15,
+        1.0,
+        6912,
+        20681,
+    ),
     (
         "image, computed",
         gv.UndistortImage(model=_CAMERA, coordinates="computed"),
         [_image(np.uint8)],
         1.12,
         1.0,
-        512,
-        2231,
+        388,
+        1662,
     ),
 ]
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "kernel_variants.md"
@@ -287,6 +306,31 @@ def test_group_sizes_odd_counts_and_unaligned_arrays(name: str, group_size: int,
 
 
 @needs_compilers
+@pytest.mark.parametrize("group_size", [32, 128])
+@pytest.mark.parametrize("name", ["line, columns", "centroid, rows"])
+def test_kernels_compiled_for_a_group_size_refuse_another_one(name: str, group_size: int) -> None:
+    operation, inputs = next((each[1], each[2]) for each in STREAMS if each[0] == name)
+    with pytest.raises(ValueError, match=rf"compiled for groups of 256 work-items, group_size is {group_size}"):
+        trace(operation, inputs, group_size=group_size)
+    assert trace(operation, inputs, groups=[0], group_size=256).total.count > 0
+
+
+@needs_compilers
+@pytest.mark.parametrize("group_size", [1, 16, 32])
+def test_a_smaller_group_solves_a_problem(group_size: int) -> None:
+    """`FitLines` launches a group of 64 per line: smaller groups are as many, and give the same results."""
+    operation = gv.FitLines(variant="work_item")
+    along = np.linspace(0.0, 9.0, 40, dtype=np.float32)
+    lines = np.stack([np.stack([along, k * along + RNG.normal(0.0, 0.1, 40)], -1) for k in range(5)]).astype(np.float32)
+    expected = trace(operation, [lines]).outputs
+    outputs = trace(operation, [lines], group_size=group_size).outputs
+    for field, value in outputs.items():
+        np.testing.assert_array_equal(value, expected[field], err_msg=field)
+    with pytest.raises(ValueError, match="compiled for groups of 64 work-items, group_size is 128"):
+        trace(operation, [lines], group_size=128)
+
+
+@needs_compilers
 @pytest.mark.parametrize(
     ("name", "columns", "offset"),
     [
@@ -298,11 +342,14 @@ def test_group_sizes_odd_counts_and_unaligned_arrays(name: str, group_size: int,
         ("image", 101, 0),
         ("image", 102, 1),
         ("image, computed", 3, 2),
+        ("image, colour", 99, 0),
+        ("image, colour", 102, 4),
+        ("image, colour, float", 33, 1),
     ],
 )
 def test_rows_that_are_not_aligned(name: str, columns: int, offset: int) -> None:
     operation, whole = next((each[1], each[2]) for each in STREAMS if each[0] == name)
-    inputs = [np.ascontiguousarray(whole[0][..., :9, :columns])]
+    inputs = [np.ascontiguousarray(whole[0][:9, :columns])]
     if name.startswith("line") or "columns" in name:
         inputs = [np.ascontiguousarray(whole[0][..., : 11 if "rows" in name else 200, :columns])]
     outputs = trace(operation, inputs, offset=offset).outputs

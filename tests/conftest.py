@@ -8,7 +8,8 @@ products of three or more parameters. ``nightly`` runs all tests on every device
 ``GPUVISION_DEVICE`` selects the best device, see `Device.best`.
 
 The option ``--one-case`` reduces the fast and the full tier to the best device, and to one case of each test function
-of kernels, of code that kernels share, and of ``tests/host``. Expected failures do not run then: their kernels take minutes to compile.
+of kernels, of code that kernels share, and of ``tests/host``. Expected failures do not run then: their kernels take
+minutes to compile.
 
 No tier runs the cases that a device refuses: double precision without doubles, vectors on a runtime without them. The
 last lines of a run state their number. A case that PoCL or Intel's CPU runtime refuses is an error.

@@ -207,7 +207,7 @@ class Case(SimpleNamespace):
 
 
 def test_one_case_of_each_function_of_a_kernel(tmp_path: Path) -> None:
-    """The option ``--one-case`` leaves the best device, files of kernels, shared code and tests/host, and first cases."""
+    """The option ``--one-case`` leaves first cases on the best device: of kernels, of shared code and of tests/host."""
     other = SimpleNamespace(label="other")
     best = SimpleNamespace(label="best")
 

@@ -122,7 +122,7 @@ def one_case_each(selection: Selection, best: Collection[Device]) -> Selection:
 
 
 def has_one_case(path: Path) -> bool:
-    """Return whether `one_case_each` chooses tests of a file: about a kernel, about shared code, or in ``tests/host``."""
+    """Return whether `one_case_each` chooses tests of a file: about a kernel or shared code, or in ``tests/host``."""
     is_of_kernel = path.stem in _OF_KERNELS and path.parent.name not in _COMPOSED
     return is_of_kernel or path.parent.name == "host" or path.stem in _OF_SHARED_CODE
 

@@ -344,7 +344,6 @@ def test_a_smaller_group_solves_a_problem(group_size: int) -> None:
         ("image, computed", 3, 2),
         ("image, colour", 99, 0),
         ("image, colour", 102, 4),
-        ("image, colour, float", 33, 1),
     ],
 )
 def test_rows_that_are_not_aligned(name: str, columns: int, offset: int) -> None:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 from gpuvision.host.arrays import HostArray
@@ -19,6 +20,7 @@ from gpuvision.host.device import Device, requested_device
 from gpuvision.host.errors import DeviceLostError, DeviceMemoryError, GpuVisionError
 from gpuvision.host.kept_numbers import driver_key, kept_number
 from gpuvision.host.operation import Operation
+from gpuvision.host.program import sources_digest
 
 # Calls that bind the operation and fill the caches, and timed calls, of which the median counts. Chosen: pauses of a
 # shared machine hit a few calls.
@@ -129,6 +131,9 @@ class StepDevices:
     device : Device or None
         Device of all steps. ``None``: of the best GPU and the best CPU device the faster one for each step, where both
         exist and ``GPUVISION_DEVICE`` is not set; otherwise `Device.best`.
+    kernel_folders : sequence of pathlib.Path, optional
+        Folders of the kernels that the steps run, such as ``gpuvision.operation.KERNEL_FOLDER``. Times that were kept
+        with other kernels do not count.
 
     Attributes
     ----------
@@ -141,8 +146,9 @@ class StepDevices:
         There is no healthy device.
     """
 
-    def __init__(self, device: Device | None) -> None:
+    def __init__(self, device: Device | None, *, kernel_folders: Sequence[Path] = ()) -> None:
         self._candidates = candidate_devices() if device is None else (device,)
+        self._kernel_folders = tuple(kernel_folders)
         self.choices: dict[str, DeviceChoice] = {}
 
     @property
@@ -167,15 +173,17 @@ class StepDevices:
         Notes
         -----
         Times are kept in the file ``step_seconds.json`` of the cache folder, for the version of gpuvision and of the
-        driver, and for 30 days at most; delete the file to measure again. A measurement runs the step at least twice
-        on each device, and up to 6 times where the runs take less than 0.2 s together; then the job runs the step. A
-        device that fails while another one runs the step is left out until the process ends, for this size of the step.
-        A full memory and a lost device are tried again in the next call.
+        driver, for the text of the kernels in ``kernel_folders``, and for 30 days at most; delete the file to measure
+        again. A measurement runs the step at least twice on each device, and up to 6 times where the runs take less
+        than 0.2 s together; then the job runs the step. A device that fails while another one runs the step is left out
+        until the process ends, for this size of the step. A full memory and a lost device are tried again in the next
+        call.
         """
         if len(self._candidates) == 1:
             self.choices[step] = DeviceChoice(operation=step, device=self.first, seconds={})
         else:
-            self.choices[step] = _choose_for_step(step, run, size, self._candidates)
+            kernels = tuple(sources_digest(each) for each in self._kernel_folders)
+            self.choices[step] = _choose_for_step(step, run, (*kernels, *size), self._candidates)
         return self.choices[step].device
 
     def report(self) -> dict[str, Any]:

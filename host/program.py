@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import os
 import re
 import warnings
@@ -76,6 +77,19 @@ def build(
     return _build(device.context, handle, folder, source, tuple(options(defines)), tuple(include_folders))
 
 
+@functools.cache
+def sources_digest(folder: Path) -> str:
+    """Return a digest of the kernel files and headers of a folder, without their comments.
+
+    A process reads the files once: programs that it has built do not follow later changes either.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(each for each in folder.rglob("*") if each.suffix in (".cl", ".h")):
+        text = _COMMENT.sub("", path.read_text(encoding="utf-8"))
+        digest.update(repr((path.relative_to(folder).as_posix(), text)).encode())
+    return digest.hexdigest()[:16]
+
+
 @functools.lru_cache(maxsize=256)
 def _build(
     context: Any, handle: Any, folder: Path, source: str, words: tuple[str, ...], include_folders: tuple[Path, ...]
@@ -107,3 +121,4 @@ def _build(
 
 
 clear_with(_build.cache_clear)
+clear_with(sources_digest.cache_clear)

@@ -122,7 +122,8 @@ def locate_robot(
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size
     from gpuvision.formats.field_file import read_field
-    from gpuvision.host import Device
+    from gpuvision.host import Device, StepDevices
+    from gpuvision.operation import KERNEL_FOLDER
     from gpuvision.plots.field import draw_located_robot
     from gpuvision.workflows.locating_robot import POINT_FILES, read_floor, read_points
     from gpuvision.workflows.locating_robot import locate_robot as locate
@@ -139,6 +140,7 @@ def locate_robot(
         return
     reject_unused("without --rate", odometry=odometry)
     outputs = claim_outputs("locate-robot", (source, field, camera), out, as_json, overwrite)
+    devices = StepDevices(chosen, kernel_folders=(KERNEL_FOLDER,))
     picture = None
     measured: npt.NDArray[np.float32] | FloorScan
     if source.suffix.lower() in POINT_FILES:
@@ -156,9 +158,9 @@ def locate_robot(
         if camera is not None:
             check_calibrated_size(source, (picture.shape[1], picture.shape[0]), read_calibrated_size(camera))
         measured = _scan(
-            picture, described, camera, pixel, line_width, blind_radius, threshold=threshold, device=chosen
+            picture, described, camera, pixel, line_width, blind_radius, threshold=threshold, device=devices
         )
-    located = locate(measured, described, initial_pose=pose, scale=pixel, device=chosen)
+    located = locate(measured, described, initial_pose=pose, scale=pixel, device=devices)
     report_pose(located, lambda path: draw_located_robot(path, located, picture), out, as_json, outputs)
 
 

@@ -35,6 +35,7 @@ from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.imaging import Imaging
 from gpuvision.matching.features.ruler import best_smoothing
 from gpuvision.matching.pose.registration import Registration, prepare_board_registration
+from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.status import Status
 
 COPPER = ("auto", "bright", "dark")
@@ -161,7 +162,8 @@ def locate_board(
     if copper not in COPPER:
         raise ValueError(f"copper is {copper!r}, expected one of {', '.join(COPPER)}")
     levels = _levels(grey, noise, threshold)
-    job = _Job(grey, artwork, *levels, blur_px, etch_bias_sigma, StepDevices(device), limits)
+    devices = StepDevices(device, kernel_folders=(KERNEL_FOLDER,))
+    job = _Job(grey, artwork, *levels, blur_px, etch_bias_sigma, devices, limits)
     view = _initial_view(initial_pose, artwork, scale, grey.shape, model)
     expected = job.register(view, _search_range(search_range, initial_pose is not None, scale, features, limits))
     return job.locate(expected, job.select_features(expected, budget) if features is None else features, copper)

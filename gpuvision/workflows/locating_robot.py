@@ -35,6 +35,7 @@ from gpuvision.matching.field.evidence import Evidence, evidence
 from gpuvision.matching.field.field_pose import PoseCandidate, find_pose_candidates
 from gpuvision.matching.field.line_detection import FloorScan, default_threshold, scan_tilted_view, scan_top_view
 from gpuvision.matching.field.located_robot import LocatedRobot
+from gpuvision.operation import KERNEL_FOLDER
 
 Float32 = npt.NDArray[np.float32]
 
@@ -92,7 +93,7 @@ def locate_robot(
     scale: float | None = None,
     max_candidates: int = 6,
     margin: float | None = None,
-    device: Device | None = None,
+    device: Device | StepDevices | None = None,
     limits: RobotLimits = RobotLimits(),
 ) -> LocatedRobot:
     """Locate a robot on a field by points on its lines.
@@ -113,7 +114,8 @@ def locate_robot(
     margin
         Width of the border around the field in which the robot may be [m]; None: a twentieth of the field's length.
     device
-        Where to run; None: `Device.best`, and beside a GPU the faster device for the search (`StepDevices`).
+        Where to run; None: `Device.best`, and beside a GPU the faster device for the search. A `StepDevices` that
+        `scan_floor` has used: its choices are in the result, too.
     limits
         Thresholds of the decisions.
 
@@ -135,14 +137,16 @@ def locate_robot(
     both. Clutter that replaces points on lines also does both, but it thins out all lines alike: such a pose is
     accepted where no whole line is missing (`RobotLimits.min_least_seen`).
     """
-    devices = StepDevices(device)
+    devices = _step_devices(device)
     start = time.perf_counter()
     scan = points if isinstance(points, FloorScan) else None
     used = _usable(points.points if isinstance(points, FloorScan) else points)
     kept: dict[str, Any] = {"points": used, "field": field, "scale": scale, "device": devices.first}
     if len(used) < limits.min_points:
         reason = f"{len(used)} points on lines, expected {limits.min_points} or more"
-        return LocatedRobot(candidates=(), doubtful=(), evidence=None, reason=reason, seconds={}, **kept)
+        return LocatedRobot(
+            candidates=(), doubtful=(), evidence=None, reason=reason, seconds={}, steps=devices.report(), **kept
+        )
     field_map = _search_map(field, used, margin, devices.first)
     mapped = time.perf_counter()
     most = max(max_candidates, limits.min_refined)
@@ -272,7 +276,7 @@ def scan_floor(
     threshold: float | None = None,
     model: Lens | Camera | MountedCamera | None = None,
     max_range: float = _MAX_RANGE,
-    device: Device | None = None,
+    device: Device | StepDevices | None = None,
 ) -> FloorScan:
     """Find the centres of white stripes on the floor, along rays from the robot's place.
 
@@ -298,7 +302,8 @@ def scan_floor(
     max_range
         Of a mounted camera: largest distance from it [m].
     device
-        Where to run; None: `Device.best`.
+        Where to run; None: `Device.best`, and beside a GPU the faster device. A `StepDevices` keeps the choice, for
+        the report of `locate_robot`.
 
     Raises
     ------
@@ -311,20 +316,28 @@ def scan_floor(
     if isinstance(model, MountedCamera):
         if scale is not None:
             raise ValueError("scale is given for a mounted camera, whose height and focal length determine it; omit it")
-        return scan_tilted_view(
-            white, model, line_width=line_width, lines=rays, max_range=max_range, threshold=least, device=device
-        )
-    if scale is None:
-        raise ValueError("scale is missing: the size of a pixel on the floor [m]")
-    return scan_top_view(
-        white,
-        BoardView(scale=scale, shape=white.shape, pose=(0.0, 0.0, 0.0), model=model),
-        line_width=line_width,
-        rays=rays,
-        blind=blind,
-        threshold=least,
-        device=device,
-    )
+        mounted: MountedCamera = model
+
+        def scan(device: Device) -> FloorScan:
+            return scan_tilted_view(
+                white, mounted, line_width=line_width, lines=rays, max_range=max_range, threshold=least, device=device
+            )
+    else:
+        if scale is None:
+            raise ValueError("scale is missing: the size of a pixel on the floor [m]")
+        view = BoardView(scale=scale, shape=white.shape, pose=(0.0, 0.0, 0.0), model=model)
+
+        def scan(device: Device) -> FloorScan:
+            return scan_top_view(
+                white, view, line_width=line_width, rays=rays, blind=blind, threshold=least, device=device
+            )
+
+    size = (white.shape, white.dtype.str, type(model).__name__, rays, 0.0 if scale is None else scale / line_width)
+    return scan(_step_devices(device).choose("scan", scan, *size))
+
+
+def _step_devices(device: Device | StepDevices | None) -> StepDevices:
+    return device if isinstance(device, StepDevices) else StepDevices(device, kernel_folders=(KERNEL_FOLDER,))
 
 
 def floor_points(image: npt.NDArray[Any], **how: Any) -> Float32:

@@ -27,6 +27,7 @@ from gpuvision.host import (
     planning,
 )
 from gpuvision.host.planning import Cost
+from gpuvision.host.program import sources_digest
 from gpuvision.ranging.psd import PsdReadout
 from streams import READOUT, currents_of
 
@@ -219,6 +220,29 @@ def test_each_step_runs_where_it_is_fastest(gpu: Device, device: Device, kept: P
     assert len(json.loads(kept.read_text())) == 4
     StepDevices(None).choose("rulers", slow_on("gpu", "rulers"), (48, 64), "u1")
     assert len(runs) > counted
+
+
+def test_times_of_steps_are_measured_again_with_other_kernels(
+    gpu: Device, device: Device, kept: Path, clock: Clock, tmp_path: Path
+) -> None:
+    """A changed comment makes the same programs; a changed header, and a kernel in a subfolder, make other programs."""
+    folder = tmp_path / "kernels"
+    (folder / "edges").mkdir(parents=True)
+    texts = ["int a; // once", "int a;  // twice", "int b;", "int b;", "int b;"]
+    files = ["sum.h", "sum.h", "sum.h", "edges/edges.cl", "notes.md"]
+    runs = []
+    for name, text in zip(files, texts, strict=True):
+        (folder / name).write_text(text)
+        sources_digest.cache_clear()  # each turn is another process
+        ran: list[Device] = []
+
+        def run(on: Device, ran: list[Device] = ran) -> None:
+            ran.append(on)
+            clock.run(1e-2 if on is gpu else 1e-3)
+
+        assert StepDevices(None, kernel_folders=(folder,)).choose("rulers", run) is device
+        runs.append(bool(ran))
+    assert runs == [True, False, True, True, False]
 
 
 def test_steps_on_a_given_device_are_not_measured(gpu: Device, device: Device, kept: Path) -> None:

@@ -14,14 +14,16 @@ import pytest
 
 from fakes import list_gpu
 from floors import GREEN, WHITE, floor_image
+from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.camera.lens import Lens
 from gpuvision.cli import main as cli
 from gpuvision.formats.field_file import read_field
-from gpuvision.host import Device
+from gpuvision.host import Device, StepDevices
 from gpuvision.matching.field.distance_map import Arc, Field
 from gpuvision.matching.field.evidence import detected_fraction, distances_to_lines, expected_crossings, robot_to_field
 from gpuvision.matching.field.line_detection import FloorScan
 from gpuvision.status import Status
+from gpuvision.workflows import locating_robot
 from gpuvision.workflows.locating_robot import default_line_width, floor_points, locate_robot, scan_floor
 
 SCALE, SHAPE, WIDE = 0.03, (400, 440), 0.125
@@ -167,6 +169,38 @@ def test_the_search_runs_on_its_fastest_device(
     seconds = {"gpu": 1e-3, device.label: 2e-3}
     assert located.report()["steps"] == {"search": {"device": "gpu", "seconds": seconds, "unusable": {}}}
     assert set(located.seconds) == {"map", "choose device", "search"}
+
+
+@pytest.mark.parametrize("mounted", [False, True])
+def test_the_floor_scan_runs_on_its_fastest_device(
+    mounted: bool, device: Device, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The choices of the scan and of the search are in one report."""
+    field = read_field("robocup_msl")
+    image = seen_from(field, (-6.0, 2.0, 0.7), rng)
+    seconds = {"gpu": 3e-3, device.label: 2e-3}
+    times = {("scan", "gpu"): 3e-3, ("scan", device.label): 2e-3}
+    gpu = list_gpu(device, times | {("search", "gpu"): 1e-3, ("search", device.label): 2e-3}, monkeypatch)
+    ran: list[Device | None] = []
+    name = "scan_tilted_view" if mounted else "scan_top_view"
+    found = scan_floor(image, scale=SCALE, line_width=WIDE, device=device)
+    monkeypatch.setattr(locating_robot, name, lambda *_, device, **__: ran.append(device) or found)
+    how: dict[str, Any] = (
+        {"model": MountedCamera(height=0.8, tilt=0.4, focal_px=500.0, centre_px=(319.5, 239.5))}
+        if mounted
+        else {"scale": SCALE}
+    )
+    devices = StepDevices(None)
+    scan = scan_floor(image, line_width=WIDE, device=devices, **how)
+    assert ran[-1] is device
+    assert devices.first is gpu
+    steps = locate_robot(scan, field, device=devices).report()["steps"]
+    assert steps["scan"] == {"device": device.label, "seconds": seconds, "unusable": {}}
+    assert steps["search"]["device"] == "gpu"
+    scan_floor(image, line_width=WIDE, **how)
+    assert ran[-1] is device
+    scan_floor(image, line_width=WIDE, device=gpu, **how)
+    assert ran[-1] is gpu
 
 
 def replaced(scan: FloorScan, share: float, rng: np.random.Generator) -> FloorScan:

@@ -11,7 +11,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from example_inputs import assert_has_numbers, random_values
+from example_inputs import assert_has_numbers, inputs_with_numbers
 from gpuvision.host import Device, Launch, bound
 from gpuvision.host.constant_memory import constant_sizes, fitting_defines
 from gpuvision.host.debug import flatten_includes
@@ -83,11 +83,13 @@ def little_memory(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 
 
 def results_of(example: Example, device: Device) -> Any:
-    """Return the results of an example on random numbers."""
+    """Return the results of an example."""
     rng = np.random.default_rng(3)
     bound: Any = example.operation.bind(device, (min(301, example.shape[0]), *example.shape[1:]), example.dtype)
-    for array in bound.inputs:
-        array.set(random_values(array.shape, array.dtype, rng))
+    for array, values in zip(
+        bound.inputs, inputs_with_numbers(example.operation, bound.inputs, device, rng), strict=True
+    ):
+        array.set(values)
     bound().wait()
     return type(bound.outputs)(*(None if each is None else each.get() for each in bound.outputs))
 

@@ -3,9 +3,9 @@
 // At 1e-6 of a segment's length from the segment a difference of two single-precision positions has no digit left.
 // Differences are taken in `place`, the rest is computed in `real`.
 //
-// Options: DOUBLE_POSITIONS: doubles; TWO_FLOAT_POSITIONS: two floats (two_float.h); neither: floats. Line irradiance and
-// ray queries take doubles on devices with fast doubles and two floats on other devices. Occluded irradiance takes
-// doubles on every device that has them and floats on other devices.
+// Options: DOUBLE_POSITIONS: doubles; TWO_FLOAT_POSITIONS: two floats (two_float.h); neither: floats. Kernels take doubles
+// on devices with fast doubles and two floats on other devices. The vector variants of occluded irradiance and of ray
+// queries take doubles where the device has them, else floats.
 #ifndef PLACES_H
 #define PLACES_H
 #include "common/lanes.h"
@@ -29,6 +29,24 @@ INLINE reals real_of_sum(places a, place b) {
 // x row[0] + y row[1] + z row[2] + row[3]
 INLINE places place_dot(places x, places y, places z, global const place *row) {
     return two_dot_plus(x, two_floats_of(row[0]), y, two_floats_of(row[1]), z, two_floats_of(row[2]), two_floats_of(row[3]));
+}
+
+INLINE places load_place(place value) { return two_floats_of(value); }
+#ifndef VECTOR_VARIANT
+INLINE place as_place(places value) { return (place)(value.high, value.low); }
+#endif
+INLINE places places_plus(places a, places b) { return two_plus(a, b); }
+INLINE places places_minus(places a, places b) { return two_plus(a, (places){-b.high, -b.low}); }
+INLINE places places_times(places a, places b) { return two_times(a, b); }
+INLINE places places_dot(places x, places a, places y, places b, places z, places c) {
+    return two_dot_plus(x, a, y, b, z, c, convert_places((reals)0));
+}
+// 1 / sqrt(v), relative error 2^-43: one Newton step from single precision.
+INLINE places place_per_root(places v) {
+    const reals y = (reals)1 / sqrt(v.high);
+    const two_floats product = two_times(v, two_product(y, y));
+    const reals rest = two_plus_real((places){-product.high, -product.low}, (reals)1).high;
+    return quick_two_sum(y, (reals)0.5 * y * rest);
 }
 
 #else
@@ -64,6 +82,16 @@ INLINE reals real_of_sum(places a, place b) { return convert_to_reals(a + b); }
 INLINE places place_dot(places x, places y, places z, global const place *row) {
     return x * row[0] + (y * row[1] + (z * row[2] + row[3]));
 }
+
+INLINE places load_place(place value) { return (places)value; }
+#ifndef VECTOR_VARIANT
+INLINE place as_place(places value) { return value; }
+#endif
+INLINE places places_plus(places a, places b) { return a + b; }
+INLINE places places_minus(places a, places b) { return a - b; }
+INLINE places places_times(places a, places b) { return a * b; }
+INLINE places places_dot(places x, places a, places y, places b, places z, places c) { return x * a + y * b + z * c; }
+INLINE places place_per_root(places v) { return (places)1 / sqrt(v); }
 
 // The mask of a comparison of places, with the number of bits per lane of a real.
 #ifdef VECTOR_VARIANT

@@ -1,6 +1,6 @@
 // Lit segments in structure-of-arrays form, grouped by the line on which they lie.
 //
-// Segments on one line, such as the segments of a sheet of light on a board between its parts, share one visibility
+// For the vector variant. Segments on one line, such as the segments of a sheet of light on a board between its parts, share one visibility
 // traversal.
 #ifndef LIT_LINES_H
 #define LIT_LINES_H
@@ -12,11 +12,7 @@
 #define LINE_SLACK ((real)8 * (real)REAL_EPSILON)
 
 // Number of segments that are processed together.
-#ifdef VECTOR_VARIANT
 #define SEGMENTS 32
-#else
-#define SEGMENTS 1
-#endif
 
 // Starts and frames of segments: `along` the segment, `off` normal to its surface, `across` both.
 typedef struct {

@@ -109,7 +109,8 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
         subtracted before they are rounded.
     variant : {"auto", "vector", "work_item"}
         "vector" (a work-item for several strips, 16 boxes at once, for CPU runtimes), "work_item" (a work-group per
-        strip, a work-item per receiver, for GPUs), or "auto".
+        strip, which lists the pairs of receivers and segments that face each other; a work-item per pair, for GPUs), or
+        "auto".
 
     Raises
     ------
@@ -121,6 +122,11 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
     The visible parts are summed by the closed form, with the errors of `LineIrradiance`. The edge of a shadow moves
     along a segment by e D / d, if the occluding edge at distance d from the receiver is off by e and the segment is D
     away; e is a few roundings of positions, 1e-7 or 2e-16 of the scene's size.
+
+    The work-item variant takes two floats (kernels/common/two_float.h) for positions and sums in single precision on a
+    device without doubles, or with doubles at 1/32 of the float rate or less. This adds 2^-41 (1 + D / h) of E0 to the
+    error, with D and h as in `LineIrradiance`. On Mesa's rusticl without doubles, positions are floats. Sums have a
+    fixed order: results are bit-equal from run to run.
     """
 
     Result: ClassVar[type[Any]] = StripIrradiance
@@ -156,6 +162,9 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
             work = WorkSize((min(strips, _SHARES_PER_CORE * device.compute_units),), (1,), vectors=True)
         else:
             work = group_per_element(strips, _GROUP)
+        # The vector variant computes in vectors of doubles or floats. Mesa's compiler takes minutes or more for frames
+        # in two floats (rusticl on llvmpipe, 2026-11).
+        two_floats = not (build.doubles_positions or work.vectors or device.kind == "rusticl")
         inputs: list[Spec] = [((strips, each, 2), dtype), ((self.segments, 10), dtype)]
         if self.selected is not None:
             integers = np.dtype(np.int32)
@@ -174,7 +183,8 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
                 "BVH_DEPTH": tree.stack_size,
                 **({} if work.vectors else {"GROUP": _GROUP}),
                 **flags(
-                    DOUBLE_POSITIONS=device.has_double,
+                    DOUBLE_POSITIONS=not two_floats and device.has_double,
+                    TWO_FLOAT_POSITIONS=two_floats,
                     INTERVALS=self.visibility == "intervals",
                     RAYS=self.visibility == "rays",
                     SELECTED=self.selected is not None,
@@ -182,7 +192,7 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
             },
             arguments=[
                 *tree.tables(build.real),
-                tree.middle.astype(build.widest),
+                build.positions(tree.middle) if two_floats else tree.middle.astype(build.widest),
                 _clearance(self.clearance, self.scene, build.real, dtype),
                 np.uint32(self.samples),
                 np.uint32(each),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 from typing import Any
 
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from canary import Guarded
 from gpuvision.host import Device
+from gpuvision.reference import line_irradiance as closed_form
 from gpuvision.reference import occluded_irradiance as reference
 from gpuvision.reference.occluded_irradiance import comb, single, soup
 from gpuvision.simulation.scene.scene import Scene
@@ -300,6 +302,86 @@ def test_grazing(device: Device, variant: Any, dtype: Any, angle: float) -> None
     seen = light_of(corners, receivers, segments, device, variant=variant, clearance=1e-7).irradiance[0, 0]
     free = light_of(NO_TRIANGLES, receivers, half, device, visibility="none").irradiance[0, 0]
     assert seen == pytest.approx(free, rel=1e-5 if dtype == np.float32 else 1e-12)
+
+
+# ---- pairs of receivers and segments -------------------------------------------------------------------------------
+
+
+def without_fast_doubles(device: Device) -> Device:
+    """Return the device as one whose doubles are slow: the work-item variant takes two floats."""
+    slow = copy.copy(device)
+    slow.has_fast_double = False
+    return slow
+
+
+@pytest.mark.parametrize("each", [1, 16, 33])
+def test_more_segments_than_a_tile(device: Device, each: int, rng: np.random.Generator) -> None:
+    """Pairs of several tiles: as the vector variant, as the sum of three parts, and equal in each run."""
+    corners, segments = soup(rng, 150, 0.3), segments_of(rng, 150)
+    receivers = receivers_of(rng, 3, each).astype(np.float32)
+    results = [light_of(corners, receivers, segments, device, variant="work_item") for _ in range(3)]
+    for result in results[1:]:
+        for one, other in zip(results[0], result, strict=True):
+            np.testing.assert_array_equal(one, other)
+    together = results[0].irradiance
+    parts = [light_of(corners, receivers, segments[k : k + 50], device, variant="work_item") for k in (0, 50, 100)]
+    np.testing.assert_allclose(together, sum(part.irradiance for part in parts), rtol=1e-6)
+    free = light_of(NO_TRIANGLES, receivers, segments, device, variant="work_item").irradiance
+    assert np.mean(together < 0.9 * free) > 0.5
+    if device.takes_vectors:
+        vectors = light_of(corners, receivers, segments, device, variant="vector").irradiance
+        assert np.all(np.abs(together - vectors) <= 2e-5 * free)
+    away = segments.copy()
+    away[:, 9] = 0.0
+    dark = light_of(corners, receivers, away, device, variant="work_item")
+    assert not any(array.any() for array in dark)
+
+
+@pytest.mark.parametrize("count", [3, 60])
+def test_light_with_slow_doubles(device: Device, count: int) -> None:
+    corners, segments, receivers, value, largest = lit_soup(count)
+    slow, single = without_fast_doubles(device), receivers.astype(np.float32)
+    result = light_of(corners, single, segments, slow, variant="work_item", clearance=1e-5)
+    assert not result.status.any()
+    error = np.abs(result.irradiance.ravel() - value) / np.where(largest > 0.0, largest, 1.0)
+    assert np.quantile(error, 0.95) <= 5e-6
+    assert error.max() <= 2e-3
+    sums = result.irradiance.astype(float).sum(axis=1)
+    for current in (result.left, result.right):
+        np.testing.assert_allclose(current, sums, rtol=4 * np.finfo(np.float32).eps)
+
+
+@pytest.mark.parametrize("exponent", [0, 60, -60])
+def test_positions_with_slow_doubles(device: Device, exponent: int, rng: np.random.Generator) -> None:
+    """Two floats keep the digits of positions a millionth of the length from a segment; normals of any length."""
+    if device.kind == "rusticl":
+        pytest.skip("positions are floats on rusticl")
+    start, along = rng.uniform(0.5, 1.5, 3).astype(np.float32), rng.normal(size=3).astype(np.float32)
+    normal = np.cross(along, rng.normal(size=3)).astype(np.float32)
+    rows = np.array([[*start, *(start + along), *(normal * np.float32(2.0**exponent)), 1.0]], np.float32).astype(float)
+    begin, step, normal = rows[0, :3], rows[0, 3:6] - rows[0, :3], rows[0, 6:9] * 2.0**-exponent
+    normal -= step * (step @ normal) / (step @ step)
+    normal /= np.linalg.norm(normal)
+    # Rounding to float32 moves the receivers: as many as lie above the segment stay.
+    heights = np.repeat([3e-7, 1e-6, 1e-5, 1e-3], 16)
+    places = single(begin + rng.uniform(0.1, 0.9, (64, 1)) * step + heights[:, None] * normal)
+    facing = -normal + 0.3 * rng.normal(size=(64, 3))
+    receivers = np.hstack([places, single(facing)])
+    receivers = receivers[(places - begin) @ normal > 1e-7]
+    assert len(receivers) > 40
+    value, most = closed_form.irradiance(receivers, rows[:, :6].reshape(1, 2, 3), normal[None], rows[:, 9])
+    result = light_of(
+        NO_TRIANGLES,
+        receivers[None].astype(np.float32),
+        rows,
+        without_fast_doubles(device),
+        variant="work_item",
+        visibility="none",
+    )
+    far = np.linalg.norm(receivers[:, None, :3] - rows[:, :6].reshape(1, 2, 3), axis=-1).max(axis=1)
+    reach = far / ((receivers[:, :3] - begin) @ normal)
+    error = np.abs(result.irradiance[0] - value)
+    assert np.all(error <= (2e-6 + 2.0**-41 * (1.0 + reach)) * most), f"{np.max(error / most)} of the whole light"
 
 
 # ---- segments on one line --------------------------------------------------------------------------------------

@@ -1,0 +1,263 @@
+// Vector variant of occluded_irradiance.cl: blocks of 16 receivers in the lanes of a vector.
+//
+// Order of work: (1) facing tests of 16 receivers with a line reject most pairs; (2) the visible parts of the remaining
+// pairs are found pair by pair; (3) the visible parts of any receivers and segments are collected until 16 of them fill
+// the vectors of the closed form.
+#ifndef RECEIVER_BLOCKS_H
+#define RECEIVER_BLOCKS_H
+#include "line_irradiance/line_irradiance.h"
+#include "occluded_irradiance/lit_lines.h"
+#include "common/status.h"
+#include "occluded_irradiance/segment_view.h"
+
+// Receivers in the frame of a segment, as line_irradiance.h takes them.
+typedef struct {
+    real along[LANES], height[LANES], aside[LANES], past[LANES], by_u[LANES], by_n[LANES], by_w[LANES];
+    real toward[LANES], toward_end[LANES]; // height of the segment's ends above the receiver's plane
+} facing;
+
+// Receivers in front of a line, in the line's frame and in the frames of its segments, and the lanes that face each
+// segment.
+typedef struct {
+    facing whole, own[SEGMENTS];
+    uint lanes[SEGMENTS];
+} before;
+
+// Visible parts of segments that wait for the closed form, each with the lane of its receiver.
+typedef struct {
+    real along[LANES], height[LANES], aside[LANES], past[LANES], length[LANES], by_u[LANES], by_n[LANES], by_w[LANES];
+    real exitance[LANES];
+    int lane[LANES];
+    int count;
+} pieces;
+
+// Evaluate the closed form of the waiting parts; unused lanes have height 0, which gives 0.
+static __attribute__((noinline)) void finish(pieces *waiting, place *sums) {
+    for (int n = waiting->count; n < LANES; n++) waiting->height[n] = 0;
+    const reals factor = LANED(line_factor)(load_private(waiting->along), load_private(waiting->height),
+                                            load_private(waiting->aside), load_private(waiting->past),
+                                            load_private(waiting->length), load_private(waiting->by_u),
+                                            load_private(waiting->by_n), load_private(waiting->by_w));
+    real light[LANES];
+    store_private(load_private(waiting->exitance) * factor, light);
+    for (int n = 0; n < waiting->count; n++) sums[waiting->lane[n]] += light[n];
+    waiting->count = 0;
+}
+
+// Append the part of segment k from fraction `start` to `stop`, which is visible from the receiver of a lane.
+static __attribute__((noinline)) void add_piece(const chunk *lit, int k, const facing *all, int lane, real start, real stop,
+                                         pieces *waiting, place *sums) {
+    if (!(start < stop)) return;
+    const int n = waiting->count++;
+    const real length = (real)lit->each.length[k];
+    waiting->along[n] = all->along[lane] - start * length;
+    waiting->height[n] = all->height[lane];
+    waiting->aside[n] = all->aside[lane];
+    waiting->past[n] = all->past[lane] - ((real)1 - stop) * length;
+    waiting->length[n] = (stop - start) * length;
+    waiting->by_u[n] = all->by_u[lane], waiting->by_n[n] = all->by_n[lane], waiting->by_w[n] = all->by_w[lane];
+    waiting->exitance[n] = lit->exitance[k];
+    waiting->lane[n] = lane;
+    if (waiting->count == LANES) finish(waiting, sums);
+}
+
+// Receiver of a lane before a line, with its place for the visible parts.
+typedef struct {
+    const chunk *lit;
+    int line, lane;
+    const before *all;
+    pieces *waiting;
+    place *sums;
+#ifdef RAYS
+    int segment; // whose parts are seen
+#endif
+} receiving;
+
+#ifdef INTERVALS
+// Append the visible parts of segment k: the part of the line from `from` to `to` without the sorted hidden intervals.
+static void add_segment(const hidden *dark, real from, real to, int k, receiving *seen) {
+    const chunk *lit = seen->lit;
+    const facing *own = seen->all->own + k;
+    const real begin = lit->begin[k], end = lit->end[k], per = (real)1 / (end - begin), stop = fmin(to, end);
+    real start = fmax(from, begin);
+    for (int n = 0; n <= dark->count && start < stop; n++) {
+        const real low = n < dark->count ? fmin(dark->low[HIDDEN_AT(n)], stop) : stop;
+        const real share = low == end ? (real)1 : (low - begin) * per;
+        add_piece(lit, k, own, seen->lane, (start - begin) * per, share, seen->waiting, seen->sums);
+        if (n < dark->count) start = fmax(start, dark->high[HIDDEN_AT(n)]);
+    }
+}
+
+// Append the visible parts of all segments of the line that the receiver faces.
+static void add_seen(const hidden *dark, real from, real to, receiving *seen) {
+    for (uint left = seen->lit->members[seen->line]; left; left &= left - 1) {
+        const int k = lowest_bit(left);
+        if (seen->all->lanes[k] >> seen->lane & 1) add_segment(dark, from, to, k, seen);
+    }
+}
+#endif
+
+#ifdef RAYS
+static void add_part(real start, real stop, receiving *seen) {
+    const int k = seen->segment;
+    add_piece(seen->lit, k, seen->all->own + k, seen->lane, start, stop, seen->waiting, seen->sums);
+}
+#endif
+#include "occluded_irradiance/visible_part.h"
+
+// LANES receivers of a strip in structure-of-arrays form: positions from the scene's middle and normals, in place
+// (`wide`; normals scaled to about 1) and in real (`at`; unit normals).
+typedef struct {
+    place wide[6][LANES];
+    real at[6][LANES];
+    place sums[LANES];
+    uchar flags[LANES], is_none[LANES];
+    uint count;
+} block;
+
+// Load a block; repeat the last receiver to fill the lanes.
+static void load_block(global const INPUT *receivers, constant place *middle, uint count, block *here) {
+    here->count = count;
+    for (int lane = 0; lane < LANES; lane++) {
+        global const INPUT *row = receivers + 6 * min((uint)lane, count - 1);
+        for (int k = 0; k < 3; k++) here->wide[k][lane] = (place)row[k] - middle[k];
+        for (int k = 3; k < 6; k++) here->wide[k][lane] = (place)row[k];
+        here->is_none[lane] = row[3] == 0 && row[4] == 0 && row[5] == 0;
+        here->sums[lane] = 0, here->flags[lane] = STATUS_OK;
+    }
+    places nx = load_places(here->wide[3]), ny = load_places(here->wide[4]), nz = load_places(here->wide[5]);
+    const places longest = fmax(fmax(fabs(nx), fabs(ny)), fabs(nz));
+    nx /= longest, ny /= longest, nz /= longest;
+    const places per = (place)1 / sqrt(nx * nx + ny * ny + nz * nz);
+    *(places_at *)here->wide[3] = nx, *(places_at *)here->wide[4] = ny, *(places_at *)here->wide[5] = nz;
+    for (int k = 0; k < 3; k++) store_private(convert_to_reals(load_places(here->wide[k])), here->at[k]);
+    store_private(convert_to_reals(nx * per), here->at[3]);
+    store_private(convert_to_reals(ny * per), here->at[4]);
+    store_private(convert_to_reals(nz * per), here->at[5]);
+}
+
+// Lanes whose receiver and a segment face each other; if any, the receivers' coordinates in the segment's frame.
+static uint face(const block *here, const frames *of, int n, facing *all) {
+    const places dx = load_places(here->wide[0]) - of->x[n], dy = load_places(here->wide[1]) - of->y[n];
+    const places dz = load_places(here->wide[2]) - of->z[n];
+    const reals zero = (reals)0, height = convert_to_reals(dx * of->off_x[n] + dy * of->off_y[n] + dz * of->off_z[n]);
+    const masks above = mask_of(height > zero);
+    if (!any_lane(above)) return 0;
+    const places along = dx * of->along_x[n] + dy * of->along_y[n] + dz * of->along_z[n];
+    const reals aside = convert_to_reals(dx * of->across_x[n] + dy * of->across_y[n] + dz * of->across_z[n]);
+    const real ux = (real)of->along_x[n], uy = (real)of->along_y[n], uz = (real)of->along_z[n];
+    const real ex = (real)of->off_x[n], ey = (real)of->off_y[n], ez = (real)of->off_z[n];
+    const real wx = (real)of->across_x[n], wy = (real)of->across_y[n], wz = (real)of->across_z[n];
+    const reals nx = load_private(here->at[3]), ny = load_private(here->at[4]), nz = load_private(here->at[5]);
+    const reals by_u = nx * ux + ny * uy + nz * uz, by_n = nx * ex + ny * ey + nz * ez;
+    const reals by_w = nx * wx + ny * wy + nz * wz;
+    const reals past = convert_to_reals(of->length[n] - along), foot = -(by_n * height + by_w * aside);
+    const reals toward = foot - by_u * convert_to_reals(along), toward_end = foot + by_u * past;
+    const uint found = lane_bits(above & (mask_of(toward > zero) | mask_of(toward_end > zero)));
+    if (!found) return 0;
+    store_private(convert_to_reals(along), all->along), store_private(height, all->height), store_private(aside, all->aside);
+    store_private(past, all->past), store_private(by_u, all->by_u), store_private(by_n, all->by_n);
+    store_private(by_w, all->by_w), store_private(toward, all->toward), store_private(toward_end, all->toward_end);
+    return found & (uint)((1ul << here->count) - 1);
+}
+
+static inline segment_axes axes_of(const frames *of, int n) {
+    return (segment_axes){(real)of->x[n],        (real)of->y[n],        (real)of->z[n],        (real)of->along_x[n],
+                          (real)of->along_y[n],  (real)of->along_z[n],  (real)of->off_x[n],    (real)of->off_y[n],
+                          (real)of->off_z[n],    (real)of->across_x[n], (real)of->across_y[n], (real)of->across_z[n],
+                          (real)of->length[n]};
+}
+
+static inline placement placement_of(const facing *all, int lane) {
+    return (placement){all->along[lane], all->height[lane], all->aside[lane],  all->past[lane],      all->by_u[lane],
+                       all->by_n[lane],  all->by_w[lane],   all->toward[lane], all->toward_end[lane]};
+}
+
+static inline observer observer_of(const block *here, int lane) {
+    return (observer){here->at[0][lane], here->at[1][lane], here->at[2][lane],
+                      here->at[3][lane], here->at[4][lane], here->at[5][lane]};
+}
+
+// Append the visible parts of a line that the receiver of a lane faces.
+static void add_light(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, real clearance,
+                      uint samples, int *hint, block *here, pieces *waiting) {
+    const uint members = lit->members[line];
+#if defined(INTERVALS)
+    if (!(members & lit->unseen)) {
+        receiving seen = {lit, line, lane, all, waiting, here->sums};
+        const segment_axes of = axes_of(&lit->lines, line);
+        const placement from = placement_of(&all->whole, lane);
+        const observer at = observer_of(here, lane);
+        view v = view_from(&of, &from, &at, clearance);
+        hidden dark;
+        if (!add_visible(tree, &from, &v, hint, &dark, &seen)) here->flags[lane] = STATUS_AMBIGUOUS;
+        return;
+    }
+#endif
+    for (uint left = members; left; left &= left - 1) {
+        const int k = lowest_bit(left);
+        const facing *own = all->own + k;
+        if (!(all->lanes[k] >> lane & 1)) continue;
+#if defined(RAYS)
+        if (!(members & lit->unseen)) {
+            receiving seen = {lit, line, lane, all, waiting, here->sums, k};
+            const segment_axes of = axes_of(&lit->each, k);
+            const placement from = placement_of(own, lane);
+            const observer at = observer_of(here, lane);
+            add_sampled(tree, &of, &from, &at, clearance, samples, &seen);
+            continue;
+        }
+#endif
+        add_piece(lit, k, own, lane, 0, 1, waiting, here->sums);
+    }
+}
+
+// Append the visible parts of a line for all receivers of a block.
+static void light_block(const bvh_tree *tree, const chunk *lit, int line, real clearance, uint samples, int *hint, block *here,
+                 pieces *waiting) {
+    before all;
+    uint lanes = face(here, &lit->lines, line, &all.whole);
+    if (!lanes) return;
+    const uint members = lit->members[line];
+    for (uint left = members; left; left &= left - 1) {
+        const int k = lowest_bit(left);
+        if (members == (1u << k)) all.own[k] = all.whole, all.lanes[k] = lanes;
+        else all.lanes[k] = face(here, &lit->each, k, all.own + k);
+    }
+    for (; lanes; lanes &= lanes - 1)
+        add_light(tree, lit, line, &all, lowest_bit(lanes), clearance, samples, hint, here, waiting);
+}
+
+static inline int has_no_number(place value) { return not_finite((real)value); }
+
+// Store the result of a receiver; return its contribution to the currents per unit of weight.
+static place result_of(const block *here, int lane, uchar flag, global real *irradiance, global uchar *status) {
+    int is_bad = 0;
+    for (int k = 0; k < 6; k++) is_bad |= not_finite(here->at[k][lane]) && !(k >= 3 && here->is_none[lane]);
+    const uchar wrong = flag | (is_bad || has_no_number(here->sums[lane]) ? STATUS_NOT_FINITE : 0);
+    const int is_none = here->is_none[lane];
+    const place light = wrong ? (place)REAL_NAN : here->sums[lane];
+    *irradiance = is_none ? REAL_NAN : (real)light;
+    *status = is_none ? STATUS_NO_DATA : wrong | here->flags[lane];
+    return is_none ? 0 : light;
+}
+
+// Store the results of a block and add them to the currents.
+static void store_block(const block *here, uchar flag, global real *irradiance, global uchar *status,
+                 global const INPUT *weights, place *to_left, place *to_right) {
+    for (uint lane = 0; lane < here->count; lane++) {
+        const place light = result_of(here, lane, flag, irradiance + lane, status + lane);
+        if (here->is_none[lane]) continue;
+        *to_left += light * (place)weights[2 * lane], *to_right += light * (place)weights[2 * lane + 1];
+    }
+}
+
+// Add the light of a chunk of segments to a block of receivers.
+static void light_chunk(const bvh_tree *tree, const chunk *lit, real clearance, uint samples, int *hint, block *here,
+                        pieces *waiting, uchar *flag) {
+    if (!lit->is_good) *flag |= STATUS_NOT_FINITE;
+    for (int line = 0; line < lit->line_count; line++)
+        light_block(tree, lit, line, clearance, samples, hint, here, waiting);
+}
+
+#endif

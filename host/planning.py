@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gpuvision.host.arrays import HostArray
 from gpuvision.host.device import Device
 from gpuvision.host.device_choice import candidate_devices
 from gpuvision.host.errors import GpuVisionError, StreamError
@@ -209,9 +210,10 @@ def plan_stream(
     zero_copy: bool | None = None,
     batches: Sequence[int] = BATCHES,
     measure: Measure | None = None,
+    sample: HostArray | None = None,
     limits: PlanLimits = PlanLimits(),
 ) -> Plan:
-    """Choose batch size, ring and threads by measurements on blank frames, before the stream reads from the source.
+    """Choose batch size, ring and threads by measurements, before the stream reads from the source.
 
     Parameters
     ----------
@@ -241,6 +243,9 @@ def plan_stream(
     measure : callable, optional
         Function that takes a batch size and whether kernels run inline, and returns a `Cost`; it replaces the
         measurement on the device, and the choice between devices.
+    sample : (frames, ...) array, optional
+        Frames to measure on; default: a blank frame. Give some where the time depends on the content: an iterative fit
+        has nothing to do on a blank frame.
     limits : PlanLimits
         Limits of the measurements and of the memory.
 
@@ -251,8 +256,8 @@ def plan_stream(
     Raises
     ------
     ValueError
-        Neither the source nor the caller gives a rate, the stall is negative or not finite, or the device has no inline
-        queues.
+        Neither the source nor the caller gives a rate, the stall is negative or not finite, the device has no inline
+        queues, or the sample is empty or not of the source's shape and dtype.
     StreamError
         No batch keeps up with the rate within the latency (the message gives the figures of the fastest batch), or the
         ring takes more memory than the limit.
@@ -266,6 +271,12 @@ def plan_stream(
         raise ValueError(f"rate is {rate}, expected the sensor's frames per second, > 0")
     if not 0.0 <= stall < math.inf:
         raise ValueError(f"stall is {stall}, expected seconds >= 0")
+    sample = np.zeros((1, *source.shape), source.dtype) if sample is None else sample
+    if not len(sample) or (sample.shape[1:], sample.dtype) != (source.shape, source.dtype):
+        raise ValueError(
+            f"the sample has shape {sample.shape} and dtype {sample.dtype}, expected (frames, *{source.shape}) of "
+            f"{source.dtype} with a frame at least"
+        )
     plan = functools.partial(
         _plan_on,
         source,
@@ -278,6 +289,7 @@ def plan_stream(
         zero_copy=zero_copy,
         batches=batches,
         measure=measure,
+        sample=sample,
         limits=limits,
     )
     if device is not None or measure is not None:
@@ -325,13 +337,14 @@ def _plan_on(
     zero_copy: bool | None,
     batches: Sequence[int],
     measure: Measure | None,
+    sample: HostArray,
     limits: PlanLimits,
 ) -> Plan:
     """Return the plan for one device; parameters as in `plan_stream`."""
     zero_copy = device.shares_memory if zero_copy is None else zero_copy
     modes = _modes(inline, device)
     steps = steps_of(operation)
-    measure = _Measurement(source, steps, device, zero_copy, limits) if measure is None else measure
+    measure = _Measurement(sample, steps, device, zero_copy, limits) if measure is None else measure
     max_bytes = free_bytes(device) // 2 if limits.max_bytes is None else limits.max_bytes
     trials: list[Trial] = []
     for batch in (1,) if takes_single_frames(steps) else batches:
@@ -409,15 +422,15 @@ def _ring_for(stall: float, rate: float, batch: int, source: Source, limits: Pla
 
 
 class _Measurement:
-    """Measurement of batch sizes on streams of blank frames."""
+    """Measurement of batch sizes on streams of the sampled frames, repeated."""
 
     def __init__(
-        self, source: Source, steps: Sequence[Step], device: Device, zero_copy: bool, limits: PlanLimits
+        self, sample: HostArray, steps: Sequence[Step], device: Device, zero_copy: bool, limits: PlanLimits
     ) -> None:
         self._steps = steps
         self._limits = limits
         self._setup: dict[str, Any] = {"device": device, "zero_copy": zero_copy}
-        self._blank = np.zeros((1, *source.shape), source.dtype)
+        self._sample = sample
 
     def __call__(self, batch: int, inline: bool) -> Cost:
         seconds = self._one_by_one(batch, inline)
@@ -428,7 +441,7 @@ class _Measurement:
 
     def _round(self, batch: int, batches: int, inline: bool) -> tuple[float, float]:
         """Return the throughput [frames/s] and the processor time per frame [s]."""
-        source = ArraySource(self._blank, batch * batches)
+        source = ArraySource(self._sample, batch * batches)
         ring = self._limits.min_ring
         stream: Pipeline[Any] = Pipeline(source, self._steps, batch=batch, ring=ring, inline=inline, **self._setup)
         with stream:
@@ -440,7 +453,7 @@ class _Measurement:
 
     def _one_by_one(self, batch: int, inline: bool) -> float:
         """Return the median time of a batch through an empty stream [s]."""
-        source = _Stepped(self._blank, batch * self._limits.latency_batches)
+        source = _Stepped(self._sample, batch * self._limits.latency_batches)
         stream: Pipeline[Any] = Pipeline(
             source, self._steps, batch=batch, ring=2, warm_up=2, inline=inline, **self._setup
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,13 @@ def _recording(folder: Path) -> dict[str, Any]:
     rows = 40.0 + 3.0 * np.sin(np.arange(480) / 60.0)
     np.save(folder / "recording.npy", line_frames(np.tile(rows, (32, 1))))
     return {}
+
+
+def _recording_with_noise(folder: Path) -> dict[str, Any]:
+    """Also write a sensor file that gives the noise."""
+    text = resources.files("gpuvision").joinpath("presets", "sensors", "camera_line.toml").read_text(encoding="utf-8")
+    (folder / "sensor.toml").write_text(text.replace("[line]", "[line]\nread_noise = 0.5\ngain = 0.1"))
+    return _recording(folder)
 
 
 def _one_image(folder: Path) -> dict[str, Any]:
@@ -92,6 +100,7 @@ def _paste(folder: Path) -> dict[str, Any]:
 
 
 INPUTS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    "docs/guides/plan_scan.md": _recording_with_noise,
     "docs/guides/scan_recording.md": _recording,
     "docs/guides/calibrate_lens.md": _one_image,
     "docs/guides/calibrate_tilted_camera.md": _images,

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -21,6 +21,7 @@ from gpuvision.cli.arguments import (
     reject_unused,
     write_report,
 )
+from gpuvision.cli.scan_plan import make_plan, write_plan
 
 if TYPE_CHECKING:
     from gpuvision.host.outputs import Outputs
@@ -119,6 +120,23 @@ Preview = Annotated[
     ),
 ]
 
+Tolerance = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LENGTH",
+        help="Largest error of the heights, such as 20um: replace method and window of the sensor's line readout by "
+        "the fastest that is predicted to meet it on a sample of the recording. The sensor file must give the noise.",
+    ),
+]
+OnlyPlan = Annotated[
+    bool,
+    typer.Option(
+        "--plan",
+        help="With --tolerance: only print the readouts that were tried with their predicted errors and times, and "
+        "write plan.png. With --rate also batch and ring of the stream. No scan.",
+    ),
+]
+
 
 def scan(
     recording: Recording,
@@ -134,6 +152,8 @@ def scan(
     ply: PlyFile = PlyPoints.organised,
     encoder: EncoderFile = None,
     preview: Preview = False,
+    tolerance: Tolerance = None,
+    only_plan: OnlyPlan = False,
     as_json: ReportFile = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -159,21 +179,40 @@ def scan(
             format=formats,
             ply=None if ply is PlyPoints.organised else ply,
             json=as_json,
+            tolerance=tolerance,
+            plan=only_plan,
         )
         _write_preview(recording, described, out, inputs, device, overwrite)
+        return
+    if only_plan:
+        reject_unused(
+            "with --plan",
+            precision=precision,
+            policy=policy,
+            format=formats,
+            ply=None if ply is PlyPoints.organised else ply,
+        )
+        write_plan(recording, described, tolerance, rate, device, out, as_json, inputs, overwrite=overwrite)
         return
     chosen_formats = [each.value for each in formats or ()]
     outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
     _claim(outputs, out, chosen_formats, as_json)
     chosen = None if device is None else Device.named(device)
+    plan = None
+    asked: Literal["single", "double"] | None = None if precision is None else precision.value
+    if tolerance is not None:
+        reject_unused("with --tolerance, which chooses it", precision=precision)
+        plan = make_plan(recording, described, tolerance, rate, chosen)
+        described, asked = plan.sensor, plan.chosen.readout.precision
     with progress_bar(f"scanning {recording.name}") as progress:
         done = run(
             recording,
             described,
             device=chosen,
-            precision=None if precision is None else precision.value,
+            precision=asked,
             rate=rate,
             policy=None if policy is None else policy.value,
+            stream_plan=None if plan is None else plan.stream,
             progress=progress,
         )
     # The size of the height map is known only now: write the other files before the error.
@@ -181,6 +220,8 @@ def scan(
     possible = [each for each in chosen_formats if each not in problems]
     done.write(out, formats=possible, ply_points=ply.value, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
+    if plan is not None:
+        echo(f"plan: {plan}", err=prints_report(as_json))
     _show(done, out, to_stderr=prints_report(as_json))
     if problems:
         raise ValueError(f"{'; '.join(problems.values())}; all other files are written")

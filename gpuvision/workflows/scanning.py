@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from gpuvision.host import Device, Operation, Precision, to_numpy
 from gpuvision.host.pipeline import Pipeline, Policy
-from gpuvision.host.planning import plan_stream
+from gpuvision.host.planning import Plan, plan_stream
 from gpuvision.host.sources import PacedSource, Source
 from gpuvision.ranging.focus_stack import FocusStack
 from gpuvision.ranging.line import LineReadout
@@ -45,6 +45,7 @@ def scan(
     precision: Precision = None,
     rate: float | None = None,
     policy: Policy | None = None,
+    stream_plan: Plan | None = None,
     progress: Progress = lambda done, of: None,
     limits: ScanLimits = ScanLimits(),
 ) -> Scan:
@@ -66,6 +67,9 @@ def scan(
         read as fast as the device processes.
     policy : {"block", "drop_oldest", "raise"}, optional
         Handling of a frame when the queue is full; default "block" without a rate and "drop_oldest" with one.
+    stream_plan : Plan, optional
+        Plan of the stream at this rate, such as ``ScanPlan.stream``. Default: a plan by measurements on blank frames,
+        on which ``"ml"`` is faster than on a line.
     progress : callable, optional
         Called with the number of processed frames and the number of all frames (None if unknown).
     limits : ScanLimits, optional
@@ -91,9 +95,9 @@ def scan(
     opened = open_for_scan(recording, sensor)
     source, name, sensor = opened.source, opened.name, opened.sensor
     try:
-        readout = _with_range_outputs(sensor, precision)
+        readout = range_readout(sensor, precision)
         device = Device.best() if device is None else device
-        paced, stream = _pipeline(source, readout, device, rate, policy)
+        paced, stream = _pipeline(source, readout, device, rate, policy, stream_plan)
     except BaseException:
         source.close()
         raise
@@ -102,7 +106,7 @@ def scan(
         damaged = np.isin(frame_numbers, sorted(paced.damaged_frames()))
         fields["status"][damaged] |= np.uint8(Status.NO_DATA)
     start = time.perf_counter()
-    points, errors = _points(sensor, fields, frame_numbers, stream.device)
+    points, errors = measure_points(sensor, fields, frame_numbers, stream.device)
     intensity = fields["peak" if sensor.kind == "camera" else "total"]
     middle = time.perf_counter()
     heights, grid, errors = _height_map(sensor, points, intensity, errors, stream.device, limits.max_cells)
@@ -197,8 +201,20 @@ def _encoder(sensor: Sensor) -> dict[str, Any] | None:
     return {"file": str(sensor.encoder.file), "scale": sensor.encoder.scale, **known}
 
 
-def _with_range_outputs(sensor: Sensor, precision: Precision) -> LineReadout | PsdReadout:
-    """Return the sensor's readout with only the outputs that a range image and its errors need."""
+def range_readout(sensor: Sensor, precision: Precision) -> LineReadout | PsdReadout:
+    """Return the sensor's readout with only the outputs that a range image and its errors need.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Camera or PSD.
+    precision : {"single", "double", None}
+        Precision of the readout.
+
+    Returns
+    -------
+    LineReadout or PsdReadout
+    """
     assert not isinstance(sensor.readout, FocusStack)  # it has no stream of profiles
     positions = ("position",) if isinstance(sensor.transport, RotatingSheet) else ("g", "h")
     light = "peak" if sensor.kind == "camera" else "total"
@@ -210,14 +226,19 @@ def _with_range_outputs(sensor: Sensor, precision: Precision) -> LineReadout | P
 
 
 def _pipeline(
-    source: Source, operation: Operation[Any], device: Device, rate: float | None, policy: Policy | None
+    source: Source,
+    operation: Operation[Any],
+    device: Device,
+    rate: float | None,
+    policy: Policy | None,
+    planned: Plan | None,
 ) -> tuple[Source, Pipeline[Any]]:
     """Return the source, paced if a rate [frames/s] is given, and the pipeline over its frames."""
     if rate is None:
         stream = Pipeline(source, operation, device=device, profile=True, policy=policy or "block")
         return source, stream
     paced = PacedSource(source, rate)
-    planned = plan_stream(paced, operation, device=device)
+    planned = plan_stream(paced, operation, device=device) if planned is None else planned
     setup: dict[str, Any] = {"profile": True, "policy": policy or "drop_oldest"}
     return paced, Pipeline(paced, operation, **setup, **planned.settings)
 
@@ -240,12 +261,28 @@ def _read_frames(
     )
 
 
-def _points(
+def measure_points(
     sensor: Sensor, fields: dict[str, Array], frame_numbers: Array, device: Device
 ) -> tuple[RangePoints, ScanErrors | None]:
-    """Return the organised range image of the readout's outputs, with the transport of each frame number.
+    """Assemble the points of a readout's outputs, and predict their errors.
 
-    With a noise model also return the predicted errors.
+    Parameters
+    ----------
+    sensor : Sensor
+        Gives the transport of each frame.
+    fields : dict of str to numpy.ndarray
+        Outputs of `range_readout` by name, (frames, samples). Flags of the encoder are added to ``status``.
+    frame_numbers : (frames,) int64
+        Numbers of the frames in the recording, ascending.
+    device : Device
+        Device of the computation.
+
+    Returns
+    -------
+    RangePoints
+        Organised range image, (frames, samples).
+    ScanErrors or None
+        None without a noise model.
     """
     positions = [fields[name] for name in (("g", "h") if "g" in fields else ("position",))]
     transports, status = sensor.transports(int(frame_numbers[-1]) + 1), fields["status"]

@@ -21,6 +21,7 @@ from gpuvision.plots.calibration import draw_calibration
 from gpuvision.plots.field import draw_located_robot, draw_robot_track, field_lines
 from gpuvision.plots.inspection import draw_regions
 from gpuvision.plots.line_frames import LineFrame, draw_line_frames
+from gpuvision.plots.plan import PlannedSetting, draw_plan
 from gpuvision.plots.sensor_calibration import SensorPicture, draw_sensor_calibration
 from gpuvision.ranging.regrid import Grid
 from gpuvision.status import Status
@@ -393,3 +394,23 @@ def test_a_refused_pose_is_drawn_in_the_view_only(drawn: list[Figure], tmp_path:
     (view, field), (empty, _) = (each.axes for each in drawn)
     assert (len(view.collections), len(empty.collections), len(field.patches), len(field.lines)) == (1, 0, 0, 0)
     assert ranges(empty) == [-1.0, 1.0, -1.0, 1.0]
+
+
+# ---- plans ---------------------------------------------------------------------------------------------------
+
+
+def test_picture_of_a_plan(drawn: list[Figure], tmp_path: Path) -> None:
+    settings = (
+        PlannedSetting("windowed 6", 9e-6, 7e-6, chosen=True),
+        PlannedSetting("ml 6", 40e-6, 6e-6, chosen=False),
+    )
+    draw_plan(tmp_path / "plan.png", settings, 8e-6, title="camera")
+    (axes,) = drawn[0].axes
+    assert labels(axes) == ("time per frame [us]", "predicted error of the heights [um]", "camera")
+    limit, chosen, other = axes.lines
+    np.testing.assert_allclose(limit.get_ydata(), 8.0)
+    np.testing.assert_allclose(data(chosen), [[9.0, 7.0]])
+    np.testing.assert_allclose(data(other), [[40.0, 6.0]])
+    assert chosen.get_color() != other.get_color()
+    assert [each.get_text() for each in axes.texts] == ["windowed 6", "ml 6"]
+    assert [each.get_text() for each in axes.get_legend().get_texts()] == ["tolerance", "chosen"]

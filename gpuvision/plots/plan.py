@@ -1,0 +1,66 @@
+"""Picture of a plan: predicted errors over measured times of the settings that were tried, and the tolerance."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from gpuvision.plots.figure import new_figure, write_png
+
+_WIDTH, _HEIGHT = 6.5, 4.5  # of the page [in]
+_CHOSEN, _OTHER, _TOLERANCE = "#009e73", "#0072b2", "#d55e00"
+
+
+class PlannedSetting(NamedTuple):
+    """Setting that a plan tried.
+
+    Attributes
+    ----------
+    name : str
+        Text beside the point.
+    seconds : float
+        Time for a frame [s].
+    error : float
+        Predicted error [m].
+    chosen : bool
+        Whether the plan chose it.
+    """
+
+    name: str
+    seconds: float
+    error: float
+    chosen: bool
+
+
+def draw_plan(
+    path: str | os.PathLike[str], settings: Sequence[PlannedSetting], tolerance: float, *, title: str = ""
+) -> None:
+    """Draw the error of each setting over its time, with the tolerance as a line, as PNG.
+
+    Parameters
+    ----------
+    path : path-like
+        File to write; it must not exist.
+    settings : sequence of PlannedSetting
+        Settings with an error.
+    tolerance : float
+        Largest error [m].
+    title : str
+        Title of the picture.
+    """
+    figure = new_figure(_WIDTH, _HEIGHT)
+    axes = figure.subplots()
+    axes.axhline(1e6 * tolerance, color=_TOLERANCE, linewidth=1.0, label="tolerance")
+    for each in settings:
+        colour = _CHOSEN if each.chosen else _OTHER
+        place = (1e6 * each.seconds, 1e6 * each.error)
+        axes.plot(
+            *place, "o", color=colour, markersize=8 if each.chosen else 5, label="chosen" if each.chosen else None
+        )
+        axes.annotate(each.name, place, xytext=(6, 4), textcoords="offset points", fontsize=8, color=colour)
+    axes.set(xlabel="time per frame [us]", ylabel="predicted error of the heights [um]", xscale="log", yscale="log")
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.grid(which="both", alpha=0.2)
+    axes.legend(fontsize=8, frameon=False)
+    write_png(figure, path)

@@ -1,0 +1,370 @@
+"""Planning of a scan: try line readouts on a sample of the recording, and choose the fastest that is accurate enough.
+
+The error of the heights comes from the error model of `gpuvision.workflows.scan_errors`, the time from the device.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import ArraySource, Device, Plan, StreamError, plan_stream, to_numpy
+from gpuvision.normal_distribution import MAD_TO_SIGMA
+from gpuvision.ranging.background import sample_frames
+from gpuvision.ranging.line import LineReadout
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.status import Status
+from gpuvision.validation import finite
+from gpuvision.workflows.opened_recording import open_for_scan
+from gpuvision.workflows.scan_plan import PlanError, ReadoutTrial, ScanPlan, ScanPlanLimits, micrometres, usable_trials
+from gpuvision.workflows.scanning import measure_points, range_readout
+
+Array = npt.NDArray[Any]
+Progress = Callable[[int, int | None], object]
+
+# Windows to try: few, because each is a build of the kernel; a factor of 1.5 or less apart.
+_WINDOWS = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 180)
+_HALF_WIDTHS = (1.2, 2.0)  # of the windows, over half the width of the line: noise moves the peak within the line
+_UNKNOWN_LENGTH = 1 << 40  # frames of a recording that does not tell: its stream has no end
+_EDGE = 8.0  # robust standard deviations of the second differences of heights. Chosen: noise stays below
+_ROUNDS = 7  # of the timing, of which the median counts. Chosen: pauses of a shared machine hit a few
+
+
+class _Sample(NamedTuple):
+    """Frames of a recording less their background.
+
+    Attributes
+    ----------
+    frames : numpy.ndarray
+        (frames, rows, columns).
+    numbers : numpy.ndarray
+        Their numbers in the recording, (frames,).
+    length : int
+        Number of frames of the recording.
+    """
+
+    frames: Array
+    numbers: npt.NDArray[np.int64]
+    length: int
+
+
+def plan_scan(
+    recording: str | Path | Array,
+    sensor: Sensor,
+    *,
+    tolerance: float,
+    rate: float | None = None,
+    latency: float | None = None,
+    device: Device | None = None,
+    limits: ScanPlanLimits = ScanPlanLimits(),
+    progress: Progress = lambda done, of: None,
+) -> ScanPlan:
+    """Choose the fastest line readout whose predicted error of the heights meets a tolerance.
+
+    Methods ``"windowed"``, ``"gauss3"``, ``"fir"`` and ``"ml"`` are tried with windows that suit the width of the line,
+    and the readout of the sensor. All other settings are the sensor's. ``"centroid"`` is tried only if the sensor has
+    it: no error model covers light beside the line.
+
+    Parameters
+    ----------
+    recording : str, Path or numpy.ndarray
+        Camera recording (`open_recording`), or frames (frames, rows, columns). It is read to its end for a sample.
+    sensor : Sensor
+        Sensor of the recording, with the noise of its camera.
+    tolerance : float
+        Largest error of the heights z [m], root mean square over the samples of the recording: random errors, the phase
+        of the line in its pixel, and the calibration where its covariance is known.
+    rate : float, optional
+        Frame rate that the scan must keep up with [frames/s].
+    latency : float, optional
+        Longest acceptable time from the arrival of a frame to its result [s]; needs a rate.
+    device : Device, optional
+        Default `Device.best`.
+    limits : ScanPlanLimits
+        Margins of the choice.
+    progress : callable, optional
+        Called with the number of tried readouts and the number of all.
+
+    Returns
+    -------
+    ScanPlan
+
+    Raises
+    ------
+    PlanError
+        No readout meets the tolerance, or none of them keeps up with the rate.
+    RecordingError
+        The recording cannot be read.
+    ValueError
+        The sensor is no camera, its file gives no noise, the tolerance is not above 0, a latency has no rate, or the
+        recording has no line.
+
+    Notes
+    -----
+    Errors are predicted to first order for Gaussian lines, see `LineReadout` and
+    `gpuvision.ranging.line_phase.phase_error`. Where the heights of one readout scatter more along their profiles than
+    its noise explains, and than those of the other readouts do, the difference is added. Not covered: errors of the
+    threshold, light of reflections, the texture of the surface (unless ``[line] speckle`` is given), and interpolation
+    to the height map. The precision is double where rounding would exceed the tolerance.
+
+    References
+    ----------
+    R. B. Fisher and D. K. Naidu, A comparison of algorithms for subpixel peak detection, in Image Technology, Springer
+    1996.
+    """
+    _check(sensor, tolerance, rate, latency)
+    device = Device.best() if device is None else device
+    sensor, sample = _sampled(recording, sensor)
+    trials = _try_readouts(sensor, sample, device, progress)
+    chosen = _chosen(trials, tolerance, limits)
+    chosen, rounding = _with_precision(chosen, sensor, sample, device, tolerance / limits.margin)
+    stream = None
+    if rate is not None:
+        stream = _plan_stream(chosen, trials, sensor, sample, device, rate, latency, limits)
+    return ScanPlan(
+        sensor=dataclasses.replace(sensor, readout=chosen.readout, auto_threshold=False),
+        chosen=chosen,
+        trials=trials,
+        tolerance=tolerance,
+        rounding=rounding,
+        stream=stream,
+        limits=limits,
+    )
+
+
+def _check(sensor: Sensor, tolerance: float, rate: float | None, latency: float | None) -> None:
+    finite(tolerance, "tolerance", above=0.0)
+    if rate is not None:
+        finite(rate, "rate", above=0.0)
+    elif latency is not None:
+        raise ValueError("a latency needs a rate; give the frames per second as well")
+    if sensor.kind != "camera":
+        raise ValueError(
+            f"{sensor.name or 'the sensor'} is a {sensor.kind} sensor; only the readout of a camera is planned"
+        )
+    if not sensor.noise_known:
+        raise ValueError("the sensor file gives no noise to predict errors from; give [line] read_noise and gain")
+
+
+def _sampled(recording: str | Path | Array, sensor: Sensor) -> tuple[Sensor, _Sample]:
+    """Return the sensor with its threshold, and the sample."""
+    opened = open_for_scan(recording, sensor)
+    try:
+        sample = sample_frames(opened.source)
+        length = opened.source.length
+    finally:
+        opened.source.close()
+    return opened.sensor, _Sample(sample.frames[:, 0], sample.numbers, _UNKNOWN_LENGTH if length is None else length)
+
+
+def _try_readouts(sensor: Sensor, sample: _Sample, device: Device, progress: Progress) -> tuple[ReadoutTrial, ...]:
+    """Return the readouts with their errors and times on the sample, fastest first."""
+    readouts = _readouts(sensor, sample, device)
+    on_device = device.empty(sample.frames.shape, sample.frames.dtype)
+    on_device.set(sample.frames)
+    trials, calls = [], []
+    for number, readout in enumerate(readouts):
+        other = dataclasses.replace(sensor, readout=readout)
+        trials.append(_errors(other, sample, device))
+        operation = range_readout(other, readout.precision)
+        calls.append(operation.bind(device, on_device.shape, on_device.dtype, inputs=(on_device,)).run)
+        progress(number + 1, len(readouts))
+    seconds = [each / len(sample.frames) for each in _median_times(calls)]
+    timed = [each._replace(seconds=one) for each, one in zip(_with_unexplained(trials), seconds, strict=True)]
+    return tuple(sorted(timed, key=lambda each: each.seconds))
+
+
+def _readouts(sensor: Sensor, sample: _Sample, device: Device) -> list[LineReadout]:
+    """Return the readouts to try: the sensor's first.
+
+    Raises
+    ------
+    ValueError
+        The sample has no line.
+    """
+    given = sensor.readout
+    assert isinstance(given, LineReadout)  # `_check` refuses other sensors
+    reading: Any = range_readout(sensor, None)(sample.frames, device=device)
+    good = to_numpy(reading.status) == Status.OK
+    if not good.any():
+        raise ValueError(f"no line in {len(sample.frames)} frames of the recording; look at `gpuvision scan --preview`")
+    half = 0.5 * float(np.median(to_numpy(reading.width)[good]))
+    windows = _windows(half)
+    changes: list[dict[str, Any]] = [
+        {},
+        *({"method": "windowed", "window": window} for window in windows),
+        {"method": "gauss3"},
+        *({"method": "fir", "fir_length": length} for length in (4, 8)),
+        *({"method": "ml", "window": window} for window in windows),
+    ]
+    return list(dict.fromkeys(dataclasses.replace(given, **change) for change in changes))
+
+
+def _windows(half: float) -> list[int]:
+    """Return windows that hold a line of this half width [px], ascending."""
+    wanted = (factor * half + 1.0 for factor in _HALF_WIDTHS)
+    return sorted({next((window for window in _WINDOWS if window >= each), _WINDOWS[-1]) for each in wanted})
+
+
+def _errors(sensor: Sensor, sample: _Sample, device: Device) -> ReadoutTrial:
+    """Return the predicted errors of a readout on the sample, without its time."""
+    points, errors = _points(sensor, sample, device)
+    assert errors is not None  # `_check` asks for the noise
+    z = to_numpy(points.z)
+    random, phase, systematic = (
+        _rms(None if each is None else each.z) for each in (errors.random, errors.phase, errors.systematic)
+    )
+    readout: Any = sensor.readout
+    lost = float(np.mean(~np.isfinite(z)))
+    error = math.hypot(random, phase, systematic) if lost < 1.0 else math.nan
+    unexplained = math.sqrt(max(_scatter(z) ** 2 - _rms(errors.readout.z) ** 2, 0.0))
+    return ReadoutTrial(readout, math.nan, error, random, phase, systematic, unexplained, lost)
+
+
+def _scatter(z: Array) -> float:
+    """Return the scatter of heights along their profiles [m], about the line through the neighbours; 0 if unknown.
+
+    The second difference of three independent values has 6 times the variance of one of them. Differences beyond 8
+    standard deviations are edges of the part.
+    """
+    second = np.diff(z.astype(np.float64), 2, axis=1)
+    known = np.abs(second[np.isfinite(second)])
+    if not known.size:
+        return 0.0
+    return _rms(known[known <= _EDGE * MAD_TO_SIGMA * np.median(known)]) / math.sqrt(6.0)
+
+
+def _with_unexplained(trials: Sequence[ReadoutTrial]) -> list[ReadoutTrial]:
+    """Add the scatter that the noise model of a readout does not explain to its error.
+
+    The least unexplained scatter of all readouts is taken as the texture of the surface, which is no error.
+    """
+    texture = min((each.unexplained for each in trials if each.lost < 1.0), default=0.0)
+    own = [math.sqrt(max(each.unexplained**2 - texture**2, 0.0)) for each in trials]
+    return [
+        each._replace(unexplained=one, error=math.hypot(each.error, one)) for each, one in zip(trials, own, strict=True)
+    ]
+
+
+def _points(sensor: Sensor, sample: _Sample, device: Device) -> Any:
+    """Return the points of the sample, and their errors."""
+    readout: Any = sensor.readout
+    operation = range_readout(sensor, readout.precision)
+    reading = operation(sample.frames, device=device)
+    fields = {name: to_numpy(getattr(reading, name)) for name in operation.outputs or ()}
+    return measure_points(sensor, fields, sample.numbers, device)
+
+
+def _rms(sigma: Array | None) -> float:
+    """Return the root mean square of the known values; 0 without one."""
+    known = np.empty(0) if sigma is None else sigma[np.isfinite(sigma)].astype(np.float64)
+    return math.sqrt(float(np.mean(known**2))) if known.size else 0.0
+
+
+def _median_times(calls: Sequence[Callable[[], object]]) -> list[float]:
+    """Return the median time of each call [s]; the calls take turns."""
+    times: list[list[float]] = [[] for _ in calls]
+    for _ in range(_ROUNDS):
+        for taken, call in zip(times, calls, strict=True):
+            start = time.perf_counter()
+            call()
+            taken.append(time.perf_counter() - start)
+    return [statistics.median(each) for each in times]
+
+
+def _chosen(trials: Sequence[ReadoutTrial], tolerance: float, limits: ScanPlanLimits) -> ReadoutTrial:
+    """Return the fastest usable readout that meets the tolerance.
+
+    Raises
+    ------
+    PlanError
+        None does.
+    """
+    usable = usable_trials(trials, limits)
+    if not usable:
+        raise PlanError("no readout gives a point with a predicted error; look at `gpuvision scan --preview`", trials)
+    met = [each for each in usable if limits.margin * each.error <= tolerance]
+    if met:
+        return min(met, key=lambda each: each.seconds)
+    best = min(usable, key=lambda each: each.error)
+    raise PlanError(
+        f"no readout meets an error of {micrometres(tolerance)}; the most accurate, {best.name}, is predicted "
+        f"{micrometres(best.error)} (random {micrometres(best.random)}, phase {micrometres(best.phase)}, calibration "
+        f"{micrometres(best.systematic)}, unexplained {micrometres(best.unexplained)}): ask for "
+        f"{micrometres(limits.margin * best.error)} or more",
+        trials,
+    )
+
+
+def _with_precision(
+    chosen: ReadoutTrial, sensor: Sensor, sample: _Sample, device: Device, largest: float
+) -> tuple[ReadoutTrial, float | None]:
+    """Return the readout, in double precision if rounding would exceed the largest error [m], and its rounding [m]."""
+    if not device.has_double:
+        return chosen, None
+    double = chosen._replace(readout=dataclasses.replace(chosen.readout, precision="double"))
+    heights = [
+        to_numpy(_points(dataclasses.replace(sensor, readout=each.readout), sample, device)[0].z).astype(np.float64)
+        for each in (chosen, double)
+    ]
+    rounding = _rms(heights[0] - heights[1])
+    return (double if math.hypot(chosen.error, rounding) > largest else chosen), rounding
+
+
+def _plan_stream(
+    chosen: ReadoutTrial,
+    trials: Sequence[ReadoutTrial],
+    sensor: Sensor,
+    sample: _Sample,
+    device: Device,
+    rate: float,
+    latency: float | None,
+    limits: ScanPlanLimits,
+) -> Plan:
+    """Return the plan of the stream of the chosen readout.
+
+    Raises
+    ------
+    PlanError
+        It does not keep up with the rate.
+    """
+
+    def planned(trial: ReadoutTrial) -> Plan:
+        operation = range_readout(dataclasses.replace(sensor, readout=trial.readout), trial.readout.precision)
+        source = ArraySource(sample.frames)
+        return plan_stream(
+            source,
+            operation,
+            rate=rate,
+            latency=latency,
+            margin=limits.rate_margin,
+            device=device,
+            sample=sample.frames,
+        )
+
+    try:
+        return planned(chosen)
+    except StreamError as error:
+        slow = error
+    quicker = [each for each in usable_trials(trials, limits) if each.seconds < chosen.seconds]
+    for each in sorted(quicker, key=lambda each: each.error):
+        try:
+            planned(each)
+        except StreamError:
+            continue
+        raise PlanError(
+            f"{chosen.name} meets the tolerance and is too slow: {slow}; at this rate {each.name} keeps up with a "
+            f"predicted error of {micrometres(each.error)}: ask for {micrometres(limits.margin * each.error)} or more",
+            trials,
+        ) from slow
+    raise PlanError(
+        f"{chosen.name} meets the tolerance and is too slow, as all {len(quicker)} faster ones: {slow}", trials
+    ) from slow

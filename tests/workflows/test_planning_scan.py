@@ -1,0 +1,295 @@
+"""Plan of a scan: the fastest readout whose error is within the tolerance; refusals name the nearest feasible one."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpuvision.host import Device, to_numpy
+from gpuvision.host.planning import plan_stream
+from gpuvision.host.sources import ArraySource
+from gpuvision.ranging.line import LineReadout
+from gpuvision.reference.line import pixel_gaussian
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.workflows import planning_scan
+from gpuvision.workflows.planning_scan import plan_scan
+from gpuvision.workflows.scan_plan import PlanError, ReadoutTrial, ScanPlan, ScanPlanLimits, usable_trials
+from gpuvision.workflows.scanning import scan
+
+READ_NOISE, GAIN = 1.5, 0.1
+# The fast tier tries these: each readout is a build of the kernel.
+FEW: tuple[dict[str, Any], ...] = (
+    {"method": "windowed", "window": 6},
+    {"method": "gauss3"},
+    {"method": "ml", "window": 6},
+)
+ROWS = 30.2 + 0.01 * np.arange(480)
+
+
+@pytest.fixture
+def few_readouts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        planning_scan,
+        "_readouts",
+        lambda sensor, *_: [dataclasses.replace(sensor.readout, **change) for change in FEW],
+    )
+    # A busy machine must not change their order.
+    monkeypatch.setattr(planning_scan, "_median_times", lambda calls: [1e-4, 2e-4, 9e-4])
+
+
+def noisy_camera(**changes: Any) -> Sensor:
+    sensor = Sensor.load("camera_line")
+    given: Any = sensor.readout
+    readout = dataclasses.replace(
+        given, threshold=20, minimum_peak=None, ambiguity=None, read_noise=READ_NOISE, gain=GAIN, **changes
+    )
+    return dataclasses.replace(sensor, readout=readout, noise_known=True)
+
+
+def recording(rng: np.random.Generator, frames: int = 24) -> Any:
+    """Return frames of one tilted line, sigma 2 px, with shot noise and read noise."""
+    light = pixel_gaussian(np.arange(64)[:, None], ROWS[None], 2.0, 150.0, 4.0)  # type: ignore[arg-type]
+    light = np.broadcast_to(light, (frames, 64, 480))
+    noisy = rng.poisson(light / GAIN) * GAIN + rng.normal(0.0, READ_NOISE, light.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def scatter(frames: Any, plan: ScanPlan, device: Device) -> float:
+    """Return the scatter of the heights: each column sees the same place in all frames."""
+    z = to_numpy(scan(frames, plan.sensor, device=device).points.z).astype(np.float64)
+    return math.sqrt(float(np.mean(np.var(z, axis=0, ddof=1))))
+
+
+def trial(name: str, seconds: float, error: float, lost: float = 0.0) -> ReadoutTrial:
+    method: Any = name
+    return ReadoutTrial(LineReadout(method=method), seconds, error, error, 0.0, 0.0, 0.0, lost)
+
+
+TRIALS = (trial("fir", 1.0, 9.0), trial("windowed", 2.0, 5.0), trial("gauss3", 3.0, 7.0), trial("ml", 8.0, 4.0))
+
+
+def plan_of(chosen: ReadoutTrial, trials: tuple[ReadoutTrial, ...] = TRIALS) -> ScanPlan:
+    return ScanPlan(
+        sensor=Sensor.load("camera_line"),
+        chosen=chosen,
+        trials=trials,
+        tolerance=6.0,
+        rounding=None,
+        stream=None,
+        limits=ScanPlanLimits(),
+    )
+
+
+@pytest.mark.parametrize(("tolerance", "name"), [(10.0, "fir"), (9.89, "windowed"), (5.5, "windowed"), (5.49, "ml")])
+def test_the_fastest_readout_within_the_margin_is_chosen(tolerance: float, name: str) -> None:
+    """The margin is 1.1: an error of 5 needs a tolerance of 5.5."""
+    shuffled = TRIALS[::-1]
+    assert planning_scan._chosen(shuffled, tolerance * (1 + 1e-12), ScanPlanLimits()).readout.method == name
+
+
+def test_a_refusal_names_a_tolerance_that_is_met() -> None:
+    with pytest.raises(PlanError, match="the most accurate, ml 8, is predicted 4000000 um") as refusal:
+        planning_scan._chosen(TRIALS, 4.0, ScanPlanLimits())
+    wanted = re.search(r"ask for (\d+) um or more", str(refusal.value))
+    assert wanted is not None
+    assert float(wanted[1]) * 1e-6 == pytest.approx(4.4)
+
+
+def test_readouts_that_lose_samples_or_have_no_error_are_not_chosen() -> None:
+    lossy, blind = trial("gauss3", 0.5, 1.0, lost=0.111), trial("fir", 0.1, math.nan, lost=1.0)
+    kept, edge = trial("windowed", 2.0, 5.0, lost=0.1), trial("ml", 1.5, 5.0, lost=0.1099)
+    assert usable_trials([lossy, blind, kept, edge], ScanPlanLimits()) == [kept, edge]
+    assert usable_trials([lossy, kept], ScanPlanLimits(max_lost=0.02)) == [lossy, kept]
+    with pytest.raises(PlanError, match="no readout gives a point"):
+        planning_scan._chosen([blind], 1.0, ScanPlanLimits())
+
+
+def test_the_plan_says_what_a_little_more_buys() -> None:
+    plan = plan_of(TRIALS[1])
+    assert plan.faster == TRIALS[0]
+    assert plan.finer == TRIALS[3]
+    assert str(plan) == (
+        "windowed 8: predicted error 5000000 um of 6000000 um, 2000000 us per frame; the tolerance binds; 9000000 um "
+        "would allow fir 4 at 0.5 times the time; 4000000 um takes ml 8 at 4 times the time"
+    )
+    near = (trial("fir", 1.92, 5.1), trial("windowed", 2.0, 5.0), trial("ml", 8.0, 4.8))
+    plan = plan_of(near[1], near)
+    assert plan.faster is None  # less than 5 % faster, less than 5 % more accurate
+    assert plan.finer is None
+    assert "no usable readout is faster" in str(plan)
+    report = plan_of(TRIALS[1]).to_dict()
+    assert report["chosen"]["readout"] == "windowed 8"
+    assert [each["error"] for each in report["trials"]] == [9.0, 5.0, 7.0, 4.0]
+    assert report["faster"]["readout"], report["finer"]["readout"] == ("fir 4", "ml 8")
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"margin": 0.99}, r"ScanPlanLimits\.margin is 0\.99, expected"),
+        ({"max_lost": 1.01}, r"ScanPlanLimits\.max_lost is 1\.01, expected"),
+        ({"rate_margin": 0.0}, r"ScanPlanLimits\.rate_margin is 0\.0, expected"),
+    ],
+)
+def test_limits_are_checked(limits: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ScanPlanLimits(**limits)
+
+
+@pytest.mark.parametrize(("half", "windows"), [(0.8, [3]), (4.2, [8, 12]), (8.0, [12, 24]), (300.0, [180])])
+def test_windows_hold_the_line(half: float, windows: list[int]) -> None:
+    assert planning_scan._windows(half) == windows
+
+
+def test_scatter_beyond_the_texture_of_the_surface_is_an_error() -> None:
+    trials = [trial("fir", 1.0, 9.0), trial("windowed", 2.0, 4.0), trial("ml", 3.0, 5.0)]
+    texture, noisy = 3.0, 5.0  # all scatter by 3 more than their noise explains, one by 5
+    seen = [each._replace(unexplained=one) for each, one in zip(trials, (texture, noisy, texture), strict=True)]
+    assert [each.error for each in planning_scan._with_unexplained(seen)] == [9.0, math.hypot(4.0, 4.0), 5.0]
+
+
+def test_the_scatter_is_the_noise_of_a_curved_surface(rng: np.random.Generator) -> None:
+    z = 1e-3 * np.sin(np.arange(500) / 80.0) + rng.normal(0.0, 5e-6, (40, 500))
+    z[3, 100:200], z[5] = np.nan, 1.0
+    z[7, ::50] += 1.0
+    assert planning_scan._scatter(z) == pytest.approx(5e-6, rel=0.04)
+    assert planning_scan._scatter(np.full((3, 2), np.nan)) == 0.0
+
+
+@pytest.mark.slow
+def test_predicted_errors_of_all_readouts_are_the_scatter(device: Device, rng: np.random.Generator) -> None:
+    frames, sensor = recording(rng), noisy_camera()
+    plan = plan_scan(frames, sensor, tolerance=1.0, device=device)
+    assert plan.chosen == min(usable_trials(plan.trials, plan.limits), key=lambda each: each.seconds)
+    assert {each.readout.method for each in plan.trials} == {"windowed", "gauss3", "fir", "ml"}
+    assert [each.seconds for each in plan.trials] == sorted(each.seconds for each in plan.trials)
+    for each in plan.trials:
+        tried = dataclasses.replace(plan, sensor=dataclasses.replace(sensor, readout=each.readout))
+        # 24 frames x 480 columns determine the scatter to 0.7 %, the unexplained part to 15 % of the noise.
+        assert scatter(frames, tried, device) == pytest.approx(each.random, rel=0.06), each.name
+        assert each.unexplained < 0.25 * each.random
+        assert each.error == pytest.approx(math.hypot(each.random, each.phase, each.unexplained))
+        assert each.lost == 0.0
+
+
+@pytest.mark.slow
+def test_a_window_that_noise_moves_off_the_line_is_seen(device: Device, rng: np.random.Generator) -> None:
+    """Its predicted noise is far below its scatter: a plan by the noise alone would choose it."""
+    frames = recording(rng)
+    sensor = noisy_camera(window=3)
+    sample = planning_scan._Sample(frames, np.arange(len(frames)), len(frames))
+    narrow = planning_scan._errors(sensor, sample, device)
+    found = scatter(frames, dataclasses.replace(plan_of(TRIALS[0]), sensor=sensor), device)
+    assert found > 2.0 * narrow.random
+    assert math.hypot(narrow.random, narrow.unexplained) == pytest.approx(found, rel=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_readouts")
+def test_a_tight_tolerance_takes_the_likelihood_fit_and_a_tighter_one_is_refused(
+    device: Device, rng: np.random.Generator
+) -> None:
+    frames, sensor = recording(rng), noisy_camera()
+    free = plan_scan(frames, sensor, tolerance=1.0, device=device)
+    errors = {each.name: each.error for each in free.trials}
+    best = min(errors, key=lambda name: errors[name])
+    assert best.startswith("ml")
+    # Every other method has at least 1.05 times the error.
+    assert min(error for name, error in errors.items() if not name.startswith("ml")) > 1.05 * errors[best]
+    plan = plan_scan(frames, sensor, tolerance=1.15 * errors[best], device=device)
+    assert plan.chosen.readout.method == "ml"
+    assert plan.sensor.readout == plan.chosen.readout
+    assert plan.rounding is None or plan.rounding < 0.01 * plan.chosen.error
+    with pytest.raises(PlanError, match="no readout meets an error of"):
+        plan_scan(frames, sensor, tolerance=1.05 * errors[best], device=device)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_readouts")
+def test_rounding_beyond_the_tolerance_takes_double_precision(device: Device, rng: np.random.Generator) -> None:
+    if not device.has_double:
+        pytest.skip("the device has no double precision")
+    frames, sensor = recording(rng, 3), noisy_camera()
+    plan = plan_scan(frames, sensor, tolerance=1.0, device=device)
+    sample = planning_scan._Sample(frames, np.arange(3), 3)
+    assert plan.rounding is not None
+    assert plan.rounding > 0.0
+    tight = math.hypot(plan.chosen.error, 0.5 * plan.rounding)
+    chosen, rounding = planning_scan._with_precision(plan.chosen, sensor, sample, device, tight)
+    assert rounding == plan.rounding
+    assert chosen.readout.precision == "double"
+    assert chosen.name.endswith(" double")
+    chosen, _ = planning_scan._with_precision(plan.chosen, sensor, sample, device, plan.chosen.error + rounding)
+    assert chosen.readout.precision is None
+
+
+@pytest.mark.usefixtures("few_readouts")
+def test_a_rate_gives_the_plan_of_its_stream(device: Device, rng: np.random.Generator) -> None:
+    frames, sensor = recording(rng), noisy_camera()
+    plan = plan_scan(frames, sensor, tolerance=1.0, rate=10.0, device=device)
+    assert plan.stream is not None
+    assert plan.stream.rate == 10.0
+    assert plan.stream.batch == 1
+    done = scan(frames, plan.sensor, device=device, rate=1000.0, stream_plan=plan.stream, policy="block")
+    assert len(done.frame_numbers) == len(frames)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_readouts")
+def test_a_rate_that_only_a_coarser_readout_keeps_up_with(
+    device: Device, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The refusal names the most accurate readout that keeps up."""
+    frames, sensor = recording(rng), noisy_camera()
+    free = plan_scan(frames, sensor, tolerance=1.0, device=device)
+    ml = min((each for each in free.trials if each.readout.method == "ml"), key=lambda each: each.error)
+
+    def only_windowed(source: Any, operation: LineReadout, **options: Any) -> Any:
+        assert options["sample"].shape == (24, 64, 480)
+        if operation.method != "windowed":
+            raise planning_scan.StreamError("too slow")
+        return plan_stream(source, operation, **options)
+
+    monkeypatch.setattr(planning_scan, "plan_stream", only_windowed)
+    with pytest.raises(PlanError, match=r"^ml \d+ meets the tolerance and .* too slow; at this rate windowed"):
+        plan_scan(frames, sensor, tolerance=1.12 * ml.error, rate=10.0, device=device)
+
+    def none(source: Any, operation: LineReadout, **options: Any) -> Any:
+        raise planning_scan.StreamError("too slow")
+
+    monkeypatch.setattr(planning_scan, "plan_stream", none)
+    with pytest.raises(PlanError, match=r"^ml \d+ meets the tolerance and is too slow, as all 2 faster ones: too slow"):
+        plan_scan(frames, sensor, tolerance=1.12 * ml.error, rate=10.0, device=device)
+
+
+def test_a_dark_recording_is_refused(device: Device) -> None:
+    with pytest.raises(ValueError, match="no line in 5 frames"):
+        plan_scan(np.zeros((5, 64, 480), np.uint8), noisy_camera(), tolerance=1.0, device=device)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "options", "message"),
+    [
+        (noisy_camera(), {"tolerance": 0.0}, "tolerance is 0.0, expected"),
+        (noisy_camera(), {"tolerance": math.nan}, "tolerance must be finite, got nan"),
+        (noisy_camera(), {"tolerance": 1.0, "rate": 0.0}, "rate is 0.0, expected"),
+        (noisy_camera(), {"tolerance": 1.0, "latency": 0.1}, "a latency needs a rate"),
+        (Sensor.load("psd_line"), {"tolerance": 1.0}, "is a psd sensor; only the readout of a camera is planned"),
+        (Sensor.load("camera_line"), {"tolerance": 1.0}, "gives no noise to predict errors from"),
+    ],
+)
+def test_wrong_arguments_are_refused(sensor: Sensor, options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        plan_scan(np.zeros((5, 64, 480), np.uint8), sensor, **options)  # type: ignore[arg-type]
+
+
+def test_a_sample_must_be_frames_of_the_source() -> None:
+    frames = np.zeros((4, 8, 64), np.uint8)
+    for sample in (frames[:0], frames.astype(np.uint16), frames[:, :7]):
+        with pytest.raises(ValueError, match=r"the sample has shape .* expected \(frames, \*\(8, 64\)\) of uint8"):
+            plan_stream(ArraySource(frames), LineReadout(), rate=10.0, sample=sample)

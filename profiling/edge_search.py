@@ -2,11 +2,13 @@
 
 81 x 81 shifts by 2 px and 21 headings (+-2 mm and +-5 degrees at 25 um in a frame of 640 x 480) with 512 edges; every
 candidate returns the smallest cost of 64 adjacent shifts. Numba and NumPy use our algorithm: an edge is a shift of the
-map, and rows of the map are added (in 16 bits by Numba).
+map, and rows of the map are added, in 16 bits by Numba (`gpuvision.profiling.shift_peers`). The first loop of Numba
+adds them in 64 bits.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -17,50 +19,28 @@ from numpy.typing import NDArray
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.pose.edge_search import EdgeSearch, cell_offsets
-from gpuvision.profiling.harness import Case
+from gpuvision.profiling import shift_peers
+from gpuvision.profiling.harness import Case, Peer
 
 _ROWS, _HEADINGS, _POINTS, _CELL = 81, 21, 512, 2
-_WIDE = 96  # columns of the Numba peer, a compile-time constant: 1.7 times as fast as the necessary 81
 
 
-@numba.njit(error_model="numpy", inline="always")
-def least_in_blocks(total, columns, scale, least, where):
-    """Write the smallest sum of each block of 64 columns, scaled, and its column; the last block ends with the row."""
-    for block in range(least.shape[0]):
-        at = min(block * 64, columns - 64)
-        low = total[at]
-        for x in range(at, at + 64):
-            low = min(low, total[x])
-        while total[at] != low:
-            at += 1
-        least[block] = np.float32(low) * scale
-        where[block] = at
-
-
-@numba.njit(parallel=True, error_model="numpy")
-def _numba_search(level, shifts, columns, least, where):
-    """Add rows of the map in 16 bits; a task is a row of positions for one heading, padded for vectorisation."""
-    turns, rows, _ = least.shape
-    stride = level.shape[2]
-    flat = level.reshape(-1)
+@numba.njit(parallel=True)
+def _plain(level, shifts, least, where):
+    """Add shifted rows in 64 bits; a task is a row of positions for one heading."""
+    turns, rows, blocks = least.shape
+    stride, flat = level.shape[2], level.reshape(-1)
     for task in numba.prange(turns * rows):
         turn, row = task // rows, task % rows
-        total, part = np.zeros(_WIDE, np.uint32), np.empty(_WIDE, np.uint16)
-        used = 0
-        for first in range(0, shifts.shape[1], 64):
-            for x in range(_WIDE):
-                part[x] = 0
-            for i in range(first, min(first + 64, shifts.shape[1])):
-                shift = shifts[turn, i]
-                if shift >= 0:
-                    used += 1
-                    source = flat[shift + row * stride : shift + row * stride + _WIDE]
-                    for x in range(_WIDE):
-                        part[x] += source[x]
-            for x in range(_WIDE):
-                total[x] += part[x]
-        scale = np.float32(1.0 / (1023.0 * used))
-        least_in_blocks(total, columns, scale, least[turn, row], where[turn, row])
+        sums, used = np.zeros(_ROWS, np.int64), 0
+        for shift in shifts[turn]:
+            used += shift >= 0
+            for x in range(_ROWS):
+                sums[x] += flat[shift + row * stride + x] if shift >= 0 else 0
+        for block in range(blocks):
+            first = min(64 * block, _ROWS - 64)
+            at = first + np.argmin(sums[first : first + 64])
+            least[turn, row, block], where[turn, row, block] = sums[at] / (1023.0 * used), at
 
 
 def _numpy_search(level: NDArray[Any], shifts: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -97,19 +77,28 @@ def cases(device: Device) -> Iterator[Case]:
     bound.inputs[1].set(shifts)
     ours = bound.run()
     least, where = np.empty((_HEADINGS, _ROWS, 2), np.float32), np.empty((_HEADINGS, _ROWS, 2), np.int64)
-
-    def by_numba() -> None:
-        _numba_search(level, shifts, _ROWS, least, where)
+    flat, wide = shift_peers.padded(level, _ROWS)
+    # Zero rows of scores: the kernel returns the least scores only.
+    given = (flat, cells[2], shifts.astype(np.int64), np.empty((_HEADINGS, 0, _ROWS), np.float32), least, where)
+    forms: dict[str, Callable[[], object]] = {
+        f"{rays} edges": functools.partial(shift_peers.search_form(rays, wide, is_long=True), *given)
+        for rays in (4, 8, 16)
+    }
 
     def by_numpy() -> tuple[NDArray[Any], NDArray[Any]]:
         return _numpy_search(level, shifts)
 
-    by_numba()
+    plain = functools.partial(_plain, level, shifts, least, where)
     exact, places = by_numpy()
     error = float(np.max(np.abs(to_numpy(ours.least) - exact)))
-    same = np.array_equal(where, places) and np.array_equal(to_numpy(ours.column), places)
-    if not (same and np.allclose(least, exact, rtol=1e-6) and error < 1e-6):
-        raise AssertionError("the poses of a peer differ from ours")
-    peers: dict[str, Callable[[], object]] = {"numba": by_numba, "numpy": by_numpy}
+    if not (np.array_equal(to_numpy(ours.column), places) and error < 1e-6):
+        raise AssertionError("the poses of NumPy differ from ours")
+    calls: dict[str, Callable[[], object]] = forms | {"first loop": plain}
+    for name, call in calls.items():
+        least[...], where[...] = np.nan, -1
+        call()
+        if not (np.array_equal(where, places) and np.allclose(least, exact, rtol=1e-6)):
+            raise AssertionError(f"the poses of Numba ({name}) differ from ours")
+    peers: dict[str, Peer] = {"numba": forms, "numba-plain": plain, "numpy": by_numpy}
     metadata = {"poses": _HEADINGS * _ROWS**2, "points": _POINTS}
     yield Case("registration", "search", bound.run, peers, error, metadata=metadata)

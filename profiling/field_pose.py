@@ -3,11 +3,11 @@
 Cases:
 
 - ``global``: search over 44 226 positions (243 x 182 at 1 cm) with 64 rays; the heading is known from a compass. Every
-  candidate returns the scores of all poses and the smallest score of each block of 64 poses. The Numba peer uses our
-  algorithm: for one heading a ray is a shift of the map, and rows of the map are added in 16 bits, which vectorises.
-  The NumPy peer looks up every ray of every pose in the map.
-- ``global-shifts``: the same search; NumPy adds shifted maps, and Numba looks up every ray of every pose, the direct
-  form for any set of poses.
+  candidate returns the scores of all poses and the smallest score of each block of 64 poses. The tuned forms of Numba
+  use our algorithm: for one heading a ray is a shift of the map, and rows of the map are added in 16 bits, which
+  vectorises (`gpuvision.profiling.shift_peers`). The first loop of Numba and the NumPy peer look up every ray of every
+  pose.
+- ``global-shifts``: the same search; NumPy adds shifted maps.
 - ``turns``: a field of 22 m with 72 headings; Numba as in ``global``.
 - ``local``: refinement of one pose; SciPy uses exact distances and their gradients as we do, in double.
 - ``map``: the distance map of a field (`gpuvision.profiling.distance_map`).
@@ -15,6 +15,7 @@ Cases:
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -27,9 +28,8 @@ from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.field.distance_map import COST_LEVELS, DistanceMap
 from gpuvision.matching.field.field_pose import FieldPoseRefinement, FieldPoseSearch
-from gpuvision.profiling import distance_map
-from gpuvision.profiling.edge_search import least_in_blocks
-from gpuvision.profiling.harness import Case
+from gpuvision.profiling import distance_map, shift_peers
+from gpuvision.profiling.harness import Case, Peer
 
 _BLOCK, _RAYS = 64, 64
 
@@ -76,23 +76,17 @@ def _shifts(points, headings, per_cell, border):
     return columns, rows
 
 
-@numba.njit(parallel=True, error_model="numpy")
-def _numba_shifts(level, columns, rows, scores, sums, least, where):
-    """Add rows of the map in 16 bits; a task is a row of positions for one heading."""
-    turns, height, width = scores.shape
-    scale = np.float32(1.0 / (1023.0 * columns.shape[1]))
-    for task in numba.prange(turns * height):
-        turn, row = task // height, task % height
-        total, out = sums[task], scores[turn, row]
-        total[:] = 0
-        for i in range(columns.shape[1]):
-            first = columns[turn, i]
-            source = level[row + rows[turn, i], first : first + width]
-            for x in range(width):
-                total[x] += source[x]
-        for x in range(width):
-            out[x] = np.float32(total[x]) * scale
-        least_in_blocks(total, width, scale, least[turn, row], where[turn, row])
+@functools.cache
+def _search_form(rays: int, wide: int) -> Any:
+    """Return a Numba function that adds shifted rows of the map, `rays` of them in a pass."""
+    search = shift_peers.search_form(rays, wide, is_long=False)
+
+    @numba.njit(error_model="numpy")
+    def search_field(points, headings, per_cell, border, flat, stride, scores, least, where):
+        columns, rows = _shifts(points, headings, per_cell, border)
+        search(flat, stride, rows * stride + columns, scores, least, where)
+
+    return search_field
 
 
 @numba.njit(parallel=True, error_model="numpy")
@@ -134,7 +128,6 @@ class _Search:
         assert self.ours.scores is not None  # because of with_scores
         self.our_scores = self.ours.scores
         self.scores = np.empty(self.our_scores.shape, np.float32)
-        self.sums = np.empty((len(headings) * self.scores.shape[1], self.scores.shape[2]), np.uint16)
         self.least = np.empty(self.ours.least.shape, np.float32)
         self.where = np.empty(self.ours.column.shape, np.int64)
         self.float_level = field_map.cells.level.astype(np.float32)
@@ -151,9 +144,13 @@ class _Search:
         )
         return result
 
-    def numba_shifts(self) -> None:
-        """Add shifted rows of the map, the algorithm of our kernel."""
-        _numba_shifts(self.map.cells.level, *self.shifts(), self.scores, self.sums, self.least, self.where)
+    def numba_forms(self) -> dict[str, Callable[[], None]]:
+        """Return functions that add shifted rows of the map, the algorithm of our kernel, by name."""
+        level, per_cell = to_numpy(self.map.cells.level), np.float32(1.0 / self.map.cell)
+        flat, wide = shift_peers.padded(level, self.scores.shape[2])
+        given = (self.points, self.headings, per_cell, self.map.border, flat, level.shape[1])
+        results = (self.scores, self.least, self.where)
+        return {f"{rays} rays": functools.partial(_search_form(rays, wide), *given, *results) for rays in (4, 8, 16)}
 
     def numba_poses(self) -> None:
         """Look up every ray of every pose, compiled."""
@@ -181,6 +178,7 @@ class _Search:
         ours: tuple[NDArray[Any], ...]
         ours = to_numpy(self.our_scores), to_numpy(self.ours.least), to_numpy(self.ours.column)
         for peer in peers:
+            self.scores[...], self.least[...], self.where[...] = np.nan, np.nan, -1
             peer()
             theirs: tuple[NDArray[Any], ...] = (self.scores, self.least, self.where)
             if not all(np.allclose(each, other, atol=1e-6) for each, other in zip(theirs, ours, strict=True)):
@@ -206,19 +204,21 @@ def _global(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> 
     search = _Search(device, field_map, _points(field_map, pose, 0.003), (pose[2],))
     height, width = field_map.positions
     metadata = {"poses": height * width, "rays": _RAYS}
-    search.check(search.numba_shifts, search.numpy_poses, search.numba_poses, search.numpy_shifts)
-    peers: dict[str, Callable[[], object]] = {"numba": search.numba_shifts, "numpy": search.numpy_poses}
+    forms = search.numba_forms()
+    search.check(*forms.values(), search.numpy_poses, search.numba_poses, search.numpy_shifts)
+    peers: dict[str, Peer] = {"numba": forms, "numba-plain": search.numba_poses, "numpy": search.numpy_poses}
     yield Case("field", "global", search.bound.run, peers, search.error, search.traffic, metadata=metadata)
-    peers = {"numba": search.numba_poses, "numpy": search.numpy_shifts}
+    peers = {"numpy": search.numpy_shifts}
     yield Case("field", "global-shifts", search.bound.run, peers, search.error, search.traffic, metadata=metadata)
 
 
 def _turns(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> Case:
     headings = tuple(np.arange(72) * (np.pi / 36.0))
     search = _Search(device, field_map, _points(field_map, pose, 0.02), headings)
-    search.check(search.numba_shifts)
+    forms = search.numba_forms()
+    search.check(*forms.values())
     metadata = {"poses": search.scores.size, "rays": _RAYS}
-    peers = {"numba": search.numba_shifts}
+    peers: dict[str, Peer] = {"numba": forms}
     return Case("field", "turns", search.bound.run, peers, search.error, search.traffic, metadata=metadata)
 
 

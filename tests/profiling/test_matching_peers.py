@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("numba", reason="the extra 'profile' is not installed")
 
-from gpuvision.profiling import ruler
+from gpuvision.profiling import ruler, shift_peers
 
 
 @pytest.fixture(scope="module")
@@ -39,3 +39,26 @@ def test_a_wrong_edge_of_a_peer_is_noticed(exact_rulers):
         edges[row, 7] += change
         with pytest.raises(AssertionError, match="changed"):
             ruler.check_peer("changed", edges, status, exact)
+
+
+@pytest.mark.parametrize("is_long", [False, True])
+@pytest.mark.parametrize("rays", [8, pytest.param(4, marks=pytest.mark.slow), pytest.param(16, marks=pytest.mark.slow)])
+def test_numba_adds_the_shifted_rows(rays, is_long):
+    """61 or 131 rays fill neither the passes nor the sums of 16 bits; some are not used."""
+    rng = np.random.default_rng(8)
+    count, rows, columns, stride = 131 if is_long else 61, 3, 70, 90
+    level = rng.integers(0, 1024, (9, stride)).astype(np.uint16)
+    shifts = rng.integers(0, 5 * stride + 20, (2, count))
+    shifts[0, ::7], shifts[1, -3:] = -1, -1
+    flat, wide = shift_peers.padded(level, columns)
+    scores, least = np.full((2, rows, columns), np.nan, np.float32), np.full((2, rows, 2), np.nan, np.float32)
+    where = np.full((2, rows, 2), -1)
+    shift_peers.search_form(rays, wide, is_long=is_long)(flat, stride, shifts, scores, least, where)
+    for turn in range(2):
+        used = shifts[turn][shifts[turn] >= 0]
+        for row in range(rows):
+            exact = sum(level.ravel()[at + row * stride :][:columns].astype(int) for at in used) / (1023.0 * len(used))
+            assert scores[turn, row] == pytest.approx(exact, rel=1e-6)
+            places = [int(np.argmin(exact[:64])), 6 + int(np.argmin(exact[6:70]))]
+            assert where[turn, row].tolist() == places
+            assert least[turn, row] == pytest.approx(exact[places], rel=1e-6)

@@ -105,6 +105,7 @@ class ClusteredIrradiance:
         if not self._is_worthwhile(tolerance, segments, receivers, weights):
             cut = LightCut.full(segments, receivers.shape, reading, tolerance)
             return BoundedIrradiance(self.compute_all(segments, receivers), cut)
+        receivers = np.ascontiguousarray(receivers, self._real)
         cut = self._clustering(segments, receivers, weights, reading, tolerance=tolerance, device=self.device)
         if not cut.has_pairs:
             return BoundedIrradiance(np.zeros(receivers.shape[:2]), cut)

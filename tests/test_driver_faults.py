@@ -22,6 +22,8 @@ AFFECTED = {
     "blob kernel": ("tests/matching/features/test_blob.py::test_any[rusticl-uint8]", False),
     "accuracy of blobs": ("tests/matching/features/test_blob_accuracy.py::test_any[rusticl]", False),
     "pose of features": ("tests/a/test_feature_pose.py::test_one_kind_of_features_is_enough[rusticl-rulers]", True),
+    "poses of a stream": ("tests/a/test_streamed_pose.py::test_poses_of_a_stream_are_those_of[rusticl-True]", True),
+    "form factors": ("tests/a/test_radiosity.py::test_what_a_body_stands_on_is_not_lit[rusticl]", True),
     "affine pose": ("tests/a/test_registration_pairs.py::test_a_scale_is_not_hidden_in_a_rigid_pose[rusticl]", True),
     "board in an image": ("tests/a/test_registration.py::test_real_boards_are_found[rusticl-upverter]", True),
 }

@@ -48,6 +48,11 @@ def frames(artwork: Artwork) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(images), np.stack([pose for _, pose in seen])
 
 
+def near(device: Device) -> np.ndarray:
+    """Return the expected pose as the operation takes it: in single precision on a device without doubles."""
+    return NEAR.astype(np.float64 if device.has_double else np.float32)
+
+
 def rulers() -> np.ndarray:
     x, y = np.meshgrid(np.linspace(60, 340, 6), np.linspace(60, 240, 4))
     return np.column_stack([x.ravel(), y.ravel(), np.ones(24), np.zeros(24)]).astype(np.float32)
@@ -61,7 +66,7 @@ def test_poses_of_a_stream_are_those_of_single_calls(
     bound = features.bind(device, SHAPE, np.uint8, copper="bright", threshold=12.0, noise=NOISE)
     source = ArraySource(images)
     source.exposure_delay = 1.5e-3
-    step = Step(bound.operation, fixed=(NEAR, CORNER))
+    step = Step(bound.operation, fixed=(near(device), CORNER))
     measured = []
     with Pipeline(source, step, device=device, zero_copy=zero_copy and device.shares_memory) as stream:
         for number, batch in enumerate(stream):
@@ -91,7 +96,7 @@ def test_loop_with_a_wall_clock_takes_the_poses_of_a_stream(
     images, clock, observer = frames[0][:-1], WallClock(), PoseObserver(MotionModel(lag=(0.0,) * 3), gate=1e300)
     observer.reset(clock.now(), NEAR, np.eye(3))
     found: list[PoseMeasurement] = []
-    with Pipeline(images, Step(bound.operation, fixed=(NEAR, CORNER)), device=device) as stream:
+    with Pipeline(images, Step(bound.operation, fixed=(near(device), CORNER)), device=device) as stream:
         batches = iter(stream)
 
         def sensor(time: float, _predicted: PosePrediction) -> list[PoseMeasurement]:

@@ -48,6 +48,11 @@ def check_sum(found: ErrorAttribution) -> None:
     np.testing.assert_allclose(total, found.error, rtol=1e-9, atol=1e-15)
 
 
+def zero_height(device: Device) -> float:
+    """Return the rounding of a height that is 0 [m]: in single precision 3 mm of strip have steps of 2e-10 m."""
+    return 1e-9 if device.has_double else 1e-8
+
+
 @pytest.mark.parametrize("method", ["moments", "shapley"])
 def test_secondary_light(method: str, device: Device) -> None:
     """One secondary spot of ratio q at distance D: error q D / (1 + q), all of it secondary."""
@@ -58,7 +63,7 @@ def test_secondary_light(method: str, device: Device) -> None:
     moved = q * distance / (1.0 + q)
     slope = height_secant(view.triangulation, u, u + moved, view.v_centres)
     np.testing.assert_allclose(found.error, slope * moved, rtol=1e-9 if device.has_double else 1e-3)
-    np.testing.assert_allclose(found.causes["secondary"], found.error, rtol=1e-6)
+    np.testing.assert_allclose(found.causes["secondary"], found.error, rtol=1e-6 if device.has_double else 1e-5)
     assert (found.dominant_cause() == list(found.causes).index("secondary")).all()
     check_sum(found)
 
@@ -141,8 +146,8 @@ def test_reflectivity_step(method: str, device: Device) -> None:
     slope = height_secant(view.triangulation, u, u + shift, view.v_centres)
     rounding = 1e-8 if device.has_double else 1e-3
     np.testing.assert_allclose(found.causes["reflectivity"], slope * shift, rtol=rounding)
-    np.testing.assert_allclose(found.causes["occlusion"], 0.0, atol=1e-9)
-    np.testing.assert_allclose(found.causes["shape"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.causes["occlusion"], 0.0, atol=zero_height(device))
+    np.testing.assert_allclose(found.causes["shape"], 0.0, atol=zero_height(device))
     check_sum(found)
     assert (found.dominant_cause(1e-7) == list(found.causes).index("reflectivity")).all()
 
@@ -175,7 +180,7 @@ def test_spots_clipped_by_the_end_of_the_strip(method: str, end: float, device: 
     rounding = 1e-6 if device.has_double else 1e-2
     np.testing.assert_allclose(found.error, slope * shift, rtol=rounding)
     np.testing.assert_allclose(found.causes["clipped"], slope * shift, rtol=rounding)
-    np.testing.assert_allclose(found.causes["shape"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.causes["shape"], 0.0, atol=zero_height(device))
     assert (found.category == ReadingCategory.VALID).all()
     assert (found.dominant_cause(1e-6) == list(found.causes).index("clipped")).all()
     assert found.summary(1e-6)["surface"] == 5

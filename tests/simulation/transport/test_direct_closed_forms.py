@@ -18,6 +18,7 @@ from gpuvision.simulation.transport.sheet_cut import SheetIndex
 from gpuvision.simulation.transport.slabs import Slabs
 from light_of_a_sheet import GREY, TRANSPORT, light_of, plate, quad, sensor_view, two_plates, u_of
 
+# Edges of screens 0.1 mm wide, seen from FAR [m], need the digits of doubles.
 FAR, SIGMA = 1e4, 1e-4
 
 
@@ -60,6 +61,7 @@ def test_step_of_reflectivity(k: float, largest: float) -> None:
 
 
 @pytest.mark.parametrize("x", [-2.0, -1.0, 0.0, 0.5, 2.0])
+@pytest.mark.double
 def test_half_of_the_beam_hidden(device: Device, x: float) -> None:
     """A screen before the lens hides the beam beyond x sigmas: the shift equals the shift of a step to 0."""
     seen_by = far_view()
@@ -90,6 +92,7 @@ SHIPPED_SIGMA, ALLOWED = 60e-6, 0.5e-6
 
 
 @pytest.mark.parametrize("x", [-2.2, -1.03, -0.4, 0.11, 0.5, 1.37, 2.9, 3.3])
+@pytest.mark.double
 def test_shipped_slabs_at_an_edge_along_the_sheet(device: Device, x: float) -> None:
     """With nine slabs, a half plane that cuts the beam gives the mean of a truncated Gaussian."""
     seen_by = far_view()
@@ -109,6 +112,7 @@ def test_shipped_slabs_at_an_edge_along_the_sheet(device: Device, x: float) -> N
 
 
 @pytest.mark.parametrize("angle", [0.2, 1.0, 5.0, 20.0, 60.0])
+@pytest.mark.double
 def test_shipped_slabs_at_an_edge_across_the_sheet(device: Device, angle: float) -> None:
     """The edge leaves each sample another part of the beam: integrals of the Gaussian along the sample."""
     seen_by = sensor_view(scale=FAR, bins=3, samples=24)

@@ -64,6 +64,7 @@ def test_a_sphere_shows_points_where_alhazen_says(
     assert place.dtype == dtype
 
 
+@pytest.mark.double
 def test_images_converge_to_the_third_order_and_density_to_the_first_or_better(
     device: Device, rng: np.random.Generator
 ) -> None:

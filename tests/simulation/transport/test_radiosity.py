@@ -146,6 +146,7 @@ def _owners(corners: np.ndarray, places: np.ndarray) -> np.ndarray:
     return np.asarray(np.argmin(np.maximum(outside, 0.0) + off, axis=1))
 
 
+@pytest.mark.double  # the faces of the wall are 1 um apart
 def test_light_beside_a_screen(device: Device) -> None:
     """A wall across the room keeps the light on one side, except for rays along its seams."""
     scene = room(1.0, 0.8, 0.6)

@@ -102,6 +102,17 @@ def test_cpu_runtimes_with_doubles_have_fast_doubles(device: Device) -> None:
     assert device.has_fast_double == device.has_double
 
 
+@pytest.mark.parametrize(("ratio", "is_fast"), [(1.0, True), (2.0, True), (16.0, True), (32.0, False), (64.0, False)])
+def test_fast_doubles_run_at_more_than_a_32nd_of_the_float_rate(
+    device: Device, ratio: float, is_fast: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """GPUs have doubles at 1/2, 1/16, 1/32 or 1/64 of the float rate."""
+    monkeypatch.setattr("gpuvision.host.device.double_ratio", lambda handle: ratio)
+    gpu = copy.copy(device)
+    gpu.__dict__.pop("has_fast_double", None)
+    assert gpu.has_fast_double is is_fast
+
+
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_positions_of_single_precision_follow_the_rate(device: Device, precision: Any) -> None:
     slow = copy.copy(device)

@@ -10,7 +10,7 @@ import pyopencl as cl
 import pyopencl.array
 import pytest
 
-from gpuvision.host import Device
+from gpuvision.host import Device, clear_cache
 from gpuvision.host import program as programs
 
 FILES = {
@@ -45,6 +45,15 @@ def test_a_changed_header_of_a_header_is_another_program(device: Device, tmp_pat
     """The same folder, file and options: the programs that drivers and pyopencl keep on disk do not fit."""
     factors = (2.0, 3.0, 2.0)
     assert tuple(scaled_one(device, write_kernels(tmp_path, each)) for each in factors) == factors
+
+
+def test_clear_cache_frees_programs(device: Device, tmp_path: Path) -> None:
+    """The same folder, file and options give the same program, and another one after the cache is cleared."""
+    folder = write_kernels(tmp_path, 2.0)
+    one, same = (programs.build(device, folder, "scale/scale.cl", {}) for _ in range(2))
+    assert same is one
+    clear_cache()
+    assert programs.build(device, folder, "scale/scale.cl", {}) is not one
 
 
 def test_copies_of_the_kernels_share_their_programs(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gpuvision.camera.photon_transfer import FrameStatistics, frame_statistics
-from gpuvision.camera.sensor_fit import Estimate, SensorFit, fit_sensor
+from gpuvision.camera.sensor_fit import Estimate, SensorFit, _reduced_chi_square, fit_sensor
 
 PLANTED = {"gain": 0.25, "quantum_efficiency": 0.6, "dark_noise": 12.0, "prnu": 0.02, "dsnu": 15.0, "dark_current": 4e4}
 LEVEL, FULL_WELL = 30.0, 14e3
@@ -122,6 +122,13 @@ def test_uneven_steps_enlarge_the_sigma(rng: np.random.Generator) -> None:
     assert curved.reduced_chi_square > 30.0
     assert curved.gain.sigma > 3.0 * straight.gain.sigma
     assert curved.quantum_efficiency.sigma > 3.0 * straight.quantum_efficiency.sigma
+
+
+def test_reduced_chi_square_is_the_mean_over_the_freedoms() -> None:
+    """Squares 1, 4 and 9 with weights 1, 1/2 and 1/3 are 6 in all; as many parameters as residuals leave no test."""
+    left, weights = np.array([1.0, 2.0, 3.0]), np.diag([1.0, 1.0 / 2.0, 1.0 / 3.0])
+    assert _reduced_chi_square(left, weights, 1) == pytest.approx(3.0)
+    assert _reduced_chi_square(left, weights, 3) == 1.0
 
 
 def recording(folder: Path) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:

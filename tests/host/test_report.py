@@ -95,6 +95,19 @@ def test_quantiles_are_right_to_a_hundredth(values: list[int], split: int) -> No
         assert value == pytest.approx(exact, rel=0.0101, abs=1.01e-9)
 
 
+def test_bins_are_narrower_than_a_hundredth() -> None:
+    """Medians of durations that differ by 1/100 differ, too, wherever the bins begin."""
+
+    def median(nanoseconds: float) -> float:
+        durations = DurationHistogram()
+        # The maximum, which bounds the quantiles, is far above.
+        durations.add_all(np.array([int(nanoseconds), int(nanoseconds), 10**12]))
+        return durations.statistics().p50
+
+    for duration in np.geomspace(1e6, 4e6, 300):
+        assert median(duration) < median(1.01 * duration)
+
+
 def test_quantiles_of_a_long_tail() -> None:
     """The quantiles are far apart: 10 000 durations of which one in a hundred and one in a thousand are long."""
     durations = DurationHistogram()

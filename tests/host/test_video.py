@@ -119,6 +119,17 @@ def test_bidirectional_pictures_in_an_avi_file(tmp_path: Path, codec: str) -> No
     assert set(np.flatnonzero(wrong)) <= damaged <= set(range(9, 24))
 
 
+@pytest.mark.parametrize(("suffix", "codec"), [("mkv", "libx264"), ("ts", "mpeg2video")])
+def test_length_of_a_file_without_a_number_of_pictures(tmp_path: Path, suffix: str, codec: str) -> None:
+    """The length follows from the duration: of the whole file in Matroska, of the stream in a transport stream."""
+    path = written(tmp_path / f"video.{suffix}", codec)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert stream.frames == 0
+        assert (stream.duration is None) == (suffix == "mkv")
+    assert open_recording(path).length == COUNT
+
+
 def test_packets_without_a_time_of_display(tmp_path: Path) -> None:
     """Some Matroska files give the time of decoding only."""
     path = written(tmp_path / "video.mp4", bf="3")

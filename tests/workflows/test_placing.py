@@ -99,6 +99,9 @@ def test_parts_land_where_and_when_the_prediction_says(artwork: Artwork, machine
     assert np.all(result.reach < 0.5)
     report = result.report()
     assert [each["settled_frames"] for each in report["placements"]] == counted
+    # The report also counts the frame of the release.
+    least = [placement.predicted_frames + 1 for placement in result.placements]
+    assert [each["predicted_frames"] for each in report["placements"]] == least
     assert (report["observer"], report["controller"], report["settling"]) == ("latest", "p", "response")
     assert report["tolerated_plant_gain"] == pytest.approx(
         margins(machine.gains, machine.delay.latency, machine.period).gain

@@ -105,7 +105,8 @@ def _neighbour_ends(runs: Runs, place: Float64, is_outermost: Flags, width: floa
     x = np.where((other >= 0)[:, None] & straight, runs.x[other], runs.x)
     t = np.where(other >= 0, place[runs.level[other]], 0.0)
 
-    continues = (other < 0) & (back >= 0) & is_outermost[runs.level]
+    # The runs of an outermost level have no neighbour beyond it.
+    continues = (back >= 0) & is_outermost[runs.level]
     reach = _OUTER if is_above else -_OUTER
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = (runs.x - runs.x[back]) / (own - place[runs.level[back]])[:, None]

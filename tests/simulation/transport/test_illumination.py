@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from gpuvision.reference.sheet import first_hits
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.envelope import upper_envelope
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
+from gpuvision.simulation.transport.lit_sheets import SheetLighting
 from gpuvision.simulation.transport.sheet_cut import SheetIndex
 
 UPRIGHT = StraightTransport()
@@ -219,6 +222,18 @@ def test_profile_along_the_sheet() -> None:
         assert np.trapezoid(exact, dense) == pytest.approx(power, rel=1e-6)
         # Apart from most ends within its triangle, segments are cut at the knots of the table.
         assert np.ptp(exact) <= 0.0501 * exact.max() or np.ptp(exact) <= 0.0501 * 2.0 * table[:, 1].max()
+
+
+@BOTH
+def test_lit_points_move_in_their_planes_along_the_light(sheet: LightSheet, rng: np.random.Generator) -> None:
+    """A step of the sheet moves a lit point by the step and along the ray, and leaves it in its plane."""
+    sheet = replace(sheet, sigma=1e-4)
+    lighting = SimpleNamespace(sheet=sheet)
+    points, normals = rng.uniform(-0.1, 0.1, (2, 20, 3))
+    found = SheetLighting.shift_per_sigma(cast(SheetLighting, lighting), normals, points)
+    light, step = sheet.direction_to_light(points), sheet.sigma * np.array(sheet.transport.direction)
+    np.testing.assert_allclose(np.sum(found * normals, axis=1) / sheet.sigma, 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.cross(found - step, light) / sheet.sigma, 0.0, atol=1e-12)
 
 
 def test_uniformity_of_a_fan() -> None:

@@ -34,7 +34,7 @@ def test_centre_from_curvature(rng: np.random.Generator) -> None:
 
 
 def test_centre_of_quartic_curves() -> None:
-    """Quartics, symmetric about the centre's row or column: only the slope of their chords, below 0.4 %, is an error."""
+    """Quartics, symmetric about the centre's row or column: an error only from the slope of their chords."""
     centre, along = np.array([0.2, -0.1]), np.linspace(-1.0, 1.0, 21)
     lines: list[list[np.ndarray]] = [[], []]
     for offset in (-0.6, 0.7):

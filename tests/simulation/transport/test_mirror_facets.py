@@ -42,13 +42,11 @@ def all_windows(corners: np.ndarray, lines: np.ndarray) -> Any:
 
 
 def test_a_mirror_seen_edge_on_shows_nothing() -> None:
-    """The lens is above the plane of the mirror by 1e-9, or 0.1, of its distance; the line stands on the far side."""
+    """Lens and line are above the plane of the mirror by 1e-9 of their distance, or by a tenth: the rays are alike."""
     corners = np.array([[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]])
-    line = np.array([[[0.8, 0.0, 0.01], [0.8, 0.0, 0.4]]])
-    first = np.zeros(1, np.int64)
-    shown = []
+    first, shown = np.zeros(1, np.int64), []
     for height in (1e-9, 0.1):
-        lens = np.array([-2.0, 0.0, 2.0 * height])
+        lens, line = np.array([-2.0, 0.0, 2.0 * height]), np.array([[[0.8, 0.0, height], [0.8, 0.0, 4.0 * height]]])
         windows = mirror_windows(lens, line, corners, triangle_planes(corners), first, first, min_height=1e-6)
         shown.append(len(windows.line))
     assert shown == [0, 1]

@@ -76,8 +76,24 @@ def _fused_form(measure: Any, *, parallel: bool) -> Any:
     """
 
     @numba.njit(parallel=parallel, error_model="numpy", fastmath=_SUMS)
-    def fused(frame, plain, rulers, lines, taps, numbers, pairs, starts, edges, status, pose, covariance):
-        measure(frame, plain, taps, numbers, edges, status)
+    def fused(
+        image,
+        pixels,
+        adjacent,
+        packed,
+        plain,
+        rulers,
+        lines,
+        taps,
+        numbers,
+        pairs,
+        starts,
+        edges,
+        status,
+        pose,
+        covariance,
+    ):
+        measure(image, pixels, adjacent, packed, plain, taps, numbers, edges, status)
         count = lines.shape[0]
         rows = np.empty((7, 2 * count), np.float32)
         for i in numba.prange(count):
@@ -202,7 +218,7 @@ def _fused_pose(device: Device) -> Case:
     found, status = np.empty((4, len(flat)), np.float32), np.empty(len(flat), np.uint8)
     pose, covariance = np.empty(3, np.float32), np.empty((3, 3), np.float32)
 
-    given = (ruler_peers.Frame.of(image), plain, flat, lines, taps, numbers, by_numpy.pairs, by_numpy.starts)
+    given = (*ruler_peers.Frame.of(image), plain, flat, lines, taps, numbers, by_numpy.pairs, by_numpy.starts)
     forms: dict[str, Callable[[], object]] = {}
     results = []
     for name, measure in ruler_peers.expert_forms(len(flat)).items():

@@ -101,7 +101,7 @@ def _estimator(measure: Any) -> Any:
         placed, edges, status, rows, origin, board, covariance, found = work
         views.image[:] = frame
         _place(point, normal, pose, np.float32(_HALF * (frame.shape[1] - 1)), placed)
-        measure(views, placed, taps, numbers, edges, status)
+        measure(views.image, views.pixels, views.pairs, views.packed, placed, taps, numbers, edges, status)
         pixel = np.float32(PIXEL)
         for i in range(placed.shape[0]):
             sigma = edges[3, i] * np.exp(_HALF / (edges[2, i] * edges[2, i] + numbers[1]))

@@ -132,7 +132,7 @@ def numba_calls(
     forms = [("numba", name, form) for name, form in ruler_peers.expert_forms(len(rulers)).items()]
     for peer, name, form in [*forms, ("numba-plain", "", ruler_peers.plain_form())]:
         edges, status = np.empty((4, len(rulers)), np.float32), np.empty(len(rulers), np.uint8)
-        call = functools.partial(form, frame, rulers, taps, numbers, edges, status)
+        call = functools.partial(form, *frame, rulers, taps, numbers, edges, status)
         yield peer, name, call, edges, status
 
 

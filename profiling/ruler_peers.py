@@ -1,8 +1,8 @@
 """Calipers (rulers) in Numba: forms of an expert, and the loop that a user writes first.
 
-All functions take a frame (`Frame`), rulers (n, 4), the taps of the gradient, and three numbers: least gradient,
-variance of the smoothing and noise. They fill the edges (4, n), position, amplitude, width and predicted standard
-deviation, and the status (n,). The expert's forms differ in how they load the four pixels of a bilinear sample, which
+All functions take the arrays of a frame (`Frame`), rulers (n, 4), the taps of the gradient, and three numbers: least
+gradient, variance of the smoothing and noise. They fill the edges (4, n), position, amplitude, width and sigma,
+and the status (n,). The expert's forms differ in how they load the four pixels of a bilinear sample, which
 takes most of the time: two pairs of pixels for the samples of one ruler or of 16 rulers side by side, or one cell of
 2 x 2 pixels after all cells of the frame were packed.
 """
@@ -167,13 +167,13 @@ def _by_ruler(packs: bool, parallel: bool) -> Any:
     load = _load_cells if packs else _load_pairs
 
     @numba.njit(parallel=parallel, error_model="numpy")
-    def measure(frame, rulers, taps, numbers, edges, status):
-        count, (rows, pitch) = rulers.shape[0], frame.image.shape
+    def measure(image, pixels, pairs, packed, rulers, taps, numbers, edges, status):
+        count, (rows, pitch) = rulers.shape[0], image.shape
         if packs:
             for row in numba.prange(rows - 1):
                 begin, end = row * pitch, (row + 1) * pitch
-                _pack_row(frame.pixels[begin:end], frame.pixels[end : end + pitch], frame.packed[begin:end])
-        source = frame.packed if packs else frame.pairs
+                _pack_row(pixels[begin:end], pixels[end : end + pitch], packed[begin:end])
+        source = packed if packs else pairs
         each = min(_BLOCK, (count + 3) // 4)
         for task in numba.prange((count + each - 1) // each):
             at, share, cells = np.empty(_SAMPLES, _U), np.empty(2 * _SAMPLES, _F), np.empty(_SAMPLES, _U)
@@ -251,8 +251,8 @@ def _by_lanes(parallel: bool) -> Any:
     """Return the form that measures 16 rulers side by side; the last lanes repeat the last ruler."""
 
     @numba.njit(parallel=parallel, error_model="numpy", fastmath=_FAST)
-    def measure(frame, rulers, taps, numbers, edges, status):
-        count, pitch = rulers.shape[0], frame.image.shape[1]
+    def measure(image, pixels, pairs, packed, rulers, taps, numbers, edges, status):
+        count, pitch = rulers.shape[0], image.shape[1]
         middle, lines = _F(0.5 * (LENGTH - 1)), _F(0.5 * (WIDTH - 1))
         for task in numba.prange((count + _LANES - 1) // _LANES):
             at, share = np.empty(WIDTH * _LANES, _U), np.empty(2 * WIDTH * _LANES, _F)
@@ -265,7 +265,7 @@ def _by_lanes(parallel: bool) -> Any:
                 layout[n] = rulers[r, 0] - middle * cosine + lines * sine
                 layout[_LANES + n] = rulers[r, 1] - middle * sine - lines * cosine
                 layout[2 * _LANES + n], layout[3 * _LANES + n] = cosine, sine
-            _sample_lanes(frame.pairs, _U(pitch), layout, at, share, cells, profile)
+            _sample_lanes(pairs, _U(pitch), layout, at, share, cells, profile)
             _peaks_of_lanes(profile, slopes, taps, where, peaks)
             _refine(peaks, min(_LANES, count - task * _LANES), numbers, edges, status, task * _LANES)
 
@@ -273,7 +273,7 @@ def _by_lanes(parallel: bool) -> Any:
 
 
 @numba.njit(parallel=True)
-def _plain(frame, rulers, taps, numbers, edges, status):
+def _plain(image, pixels, pairs, packed, rulers, taps, numbers, edges, status):
     """Measure one ruler after the other, as a user writes it first."""
     for r in numba.prange(len(rulers)):
         x, y, cosine, sine = rulers[r]
@@ -284,8 +284,8 @@ def _plain(frame, rulers, taps, numbers, edges, status):
                 at_x, at_y = x + along * cosine - across * sine, y + along * sine + across * cosine
                 column, row = int(at_x), int(at_y)
                 dx, dy = at_x - column, at_y - row
-                above = (1.0 - dx) * frame.image[row, column] + dx * frame.image[row, column + 1]
-                below = (1.0 - dx) * frame.image[row + 1, column] + dx * frame.image[row + 1, column + 1]
+                above = (1.0 - dx) * image[row, column] + dx * image[row, column + 1]
+                below = (1.0 - dx) * image[row + 1, column] + dx * image[row + 1, column + 1]
                 profile[i] += (1.0 - dy) * above + dy * below
         for i in range(REACH, LENGTH - REACH):
             for k in range(REACH):

@@ -6,7 +6,10 @@
 // for neighbouring rays: a ray first tests the leaf that occluded the ray before it (bvh_occluder).
 // gpuvision/simulation/scene/bvh.py builds the tree.
 //
-// Build options: BVH_DEPTH, not less than the number of nodes on any path from the root; REAL_IS_DOUBLE; VECTOR_VARIANT.
+// Build options: BVH_DEPTH, not less than the number of nodes on any path from the root; REAL_IS_DOUBLE; VECTOR_VARIANT;
+// FOUR_WIDE, work-item variant: nodes with four children and leaves with four triangles. A work-item tests a whole node or
+// leaf with vectors of four: 6 or 9 loads of 16 bytes in single precision. The items of a warp read different nodes, and
+// each load of an item touches a sector: with 16 children and loads of single numbers these are 96 sectors for a node.
 //
 // Watertight intersection (Woop, Benthin, Wald: Watertight Ray/Triangle Intersection, JCGT 2013): the corners are
 // transformed into the ray's frame, and the sign of each edge function is the sign of the exact difference of products. No
@@ -17,7 +20,33 @@
 
 #include "common/lanes.h"
 
+#ifdef FOUR_WIDE
+#define WIDTH 4
+typedef real4 node_reals;
+#ifdef REAL_IS_DOUBLE
+typedef long4 node_masks;
+#else
+typedef int4 node_masks;
+#endif
+INLINE node_reals load_node(global const real *from) { return *(global const node_reals *)from; }
+INLINE node_reals node_max(node_reals a, node_reals b) { return a > b ? a : b; }
+INLINE node_reals node_min(node_reals a, node_reals b) { return a < b ? a : b; }
+INLINE uint node_bits(node_masks mask) {
+    const node_masks set = mask & (node_masks)(1, 2, 4, 8);
+    return (uint)(set.x | set.y | set.z | set.w);
+}
+#define mask_of_nodes(comparison) (comparison)
+#else
 #define WIDTH 16
+typedef reals node_reals;
+typedef masks node_masks;
+#define load_node load_reals
+#define node_max lane_max
+#define node_min lane_min
+#define node_bits lane_bits
+#define mask_of_nodes mask_of
+#endif
+typedef node_reals node_reals_at __attribute__((aligned(sizeof(real))));
 #define BOX_SLACK ((real)1 + (real)8 * (real)REAL_EPSILON)
 #define NO_HIT (-1)
 
@@ -38,11 +67,11 @@ typedef struct {
 } bvh_hit;
 
 typedef struct {
-    global const real *nodes;    // (n, 6, 16): low x, y, z of 16 boxes, then high x, y, z
-    global const int *children;  // (n, 16): index of a node, or ~index of a leaf
+    global const real *nodes;    // (n, 6, WIDTH): low x, y, z of the boxes, then high x, y, z
+    global const int *children;  // (n, WIDTH): index of a node, or ~index of a leaf
     global const int *axes;      // (n,): axis along which the children are sorted
-    global const real *leaves;   // (m, 9, 16): x, y, z of the first corners, of the second, of the third
-    global const int *triangles; // (m, 16): triangle indices
+    global const real *leaves;   // (m, 9, WIDTH): x, y, z of the first corners, of the second, of the third
+    global const int *triangles; // (m, WIDTH): triangle indices
 } bvh_tree;
 
 // Reciprocal of a direction component. A component near zero is replaced by 1e-30: the slab of a parallel ray is then
@@ -84,57 +113,58 @@ static inline bvh_ray bvh_ray_of(real x, real y, real z, real dx, real dy, real 
 
 // Slab test: boxes that the ray meets before `end`. A plane at p is met at (p - origin) per = p per - origin per, one fused
 // multiply-add. The product is bounded outward on either side, so no box is missed for any origin.
-INLINE masks bvh_boxes(const bvh_ray *ray, real end, global const real *node) {
+INLINE node_masks bvh_boxes(const bvh_ray *ray, real end, global const real *node) {
     global const real *far = node + 3 * WIDTH;
-    const reals per_x = (reals)ray->per_x, per_y = (reals)ray->per_y, per_z = (reals)ray->per_z;
-    const reals in_x = lane_fma(load_reals(node + ray->near_x), per_x, (reals)ray->enter_x);
-    const reals in_y = lane_fma(load_reals(node + ray->near_y), per_y, (reals)ray->enter_y);
-    const reals in_z = lane_fma(load_reals(node + ray->near_z), per_z, (reals)ray->enter_z);
-    const reals out_x = lane_fma(load_reals(far - ray->near_x), per_x, (reals)ray->leave_x);
-    const reals out_y = lane_fma(load_reals(far + 2 * WIDTH - ray->near_y), per_y, (reals)ray->leave_y);
-    const reals out_z = lane_fma(load_reals(far + 4 * WIDTH - ray->near_z), per_z, (reals)ray->leave_z);
-    const reals enter = lane_max(lane_max(in_x, in_y), lane_max(in_z, (reals)ray->start));
-    const reals leave = lane_min(lane_min(out_x, out_y), lane_min(out_z, (reals)end));
-    return mask_of(enter <= leave * BOX_SLACK);
+    const node_reals per_x = (node_reals)ray->per_x, per_y = (node_reals)ray->per_y, per_z = (node_reals)ray->per_z;
+    const node_reals in_x = lane_fma(load_node(node + ray->near_x), per_x, (node_reals)ray->enter_x);
+    const node_reals in_y = lane_fma(load_node(node + ray->near_y), per_y, (node_reals)ray->enter_y);
+    const node_reals in_z = lane_fma(load_node(node + ray->near_z), per_z, (node_reals)ray->enter_z);
+    const node_reals out_x = lane_fma(load_node(far - ray->near_x), per_x, (node_reals)ray->leave_x);
+    const node_reals out_y = lane_fma(load_node(far + 2 * WIDTH - ray->near_y), per_y, (node_reals)ray->leave_y);
+    const node_reals out_z = lane_fma(load_node(far + 4 * WIDTH - ray->near_z), per_z, (node_reals)ray->leave_z);
+    const node_reals enter = node_max(node_max(in_x, in_y), node_max(in_z, (node_reals)ray->start));
+    const node_reals leave = node_min(node_min(out_x, out_y), node_min(out_z, (node_reals)end));
+    return mask_of_nodes(enter <= leave * BOX_SLACK);
 }
 
 // a b - c d with the sign of the exact difference (Kahan): the rounding error of c d, from a fused multiply-add, is added
 // back.
-INLINE reals bvh_cross(reals a, reals b, reals c, reals d) {
-    const reals product = c * d;
+INLINE node_reals bvh_cross(node_reals a, node_reals b, node_reals c, node_reals d) {
+    const node_reals product = c * d;
     return lane_fma(a, b, -product) + lane_fma(-c, d, product);
 }
 
 // Triangles that the ray meets before `end`. Returns t, u, v times the determinant, and the determinant.
-INLINE masks bvh_triangles(const bvh_ray *ray, real end, global const real *leaf, reals *t, reals *u,
-                                   reals *v, reals *det) {
-    const reals at_i = ray->at_i, at_j = ray->at_j, at_k = ray->at_k;
-    const reals lean_i = ray->lean_i, lean_j = ray->lean_j;
-    const reals az = load_reals(leaf + ray->k) - at_k;
-    const reals bz = load_reals(leaf + 3 * WIDTH + ray->k) - at_k;
-    const reals cz = load_reals(leaf + 6 * WIDTH + ray->k) - at_k;
-    const reals ax = lane_fma(lean_i, az, load_reals(leaf + ray->i) - at_i);
-    const reals ay = lane_fma(lean_j, az, load_reals(leaf + ray->j) - at_j);
-    const reals bx = lane_fma(lean_i, bz, load_reals(leaf + 3 * WIDTH + ray->i) - at_i);
-    const reals by = lane_fma(lean_j, bz, load_reals(leaf + 3 * WIDTH + ray->j) - at_j);
-    const reals cx = lane_fma(lean_i, cz, load_reals(leaf + 6 * WIDTH + ray->i) - at_i);
-    const reals cy = lane_fma(lean_j, cz, load_reals(leaf + 6 * WIDTH + ray->j) - at_j);
-    const reals a = bvh_cross(cx, by, cy, bx), b = bvh_cross(ax, cy, ay, cx), c = bvh_cross(bx, ay, by, ax);
-    const reals whole = a + b + c;
+INLINE node_masks bvh_triangles(const bvh_ray *ray, real end, global const real *leaf, node_reals *t, node_reals *u,
+                                   node_reals *v, node_reals *det) {
+    const node_reals at_i = ray->at_i, at_j = ray->at_j, at_k = ray->at_k;
+    const node_reals lean_i = ray->lean_i, lean_j = ray->lean_j;
+    const node_reals az = load_node(leaf + ray->k) - at_k;
+    const node_reals bz = load_node(leaf + 3 * WIDTH + ray->k) - at_k;
+    const node_reals cz = load_node(leaf + 6 * WIDTH + ray->k) - at_k;
+    const node_reals ax = lane_fma(lean_i, az, load_node(leaf + ray->i) - at_i);
+    const node_reals ay = lane_fma(lean_j, az, load_node(leaf + ray->j) - at_j);
+    const node_reals bx = lane_fma(lean_i, bz, load_node(leaf + 3 * WIDTH + ray->i) - at_i);
+    const node_reals by = lane_fma(lean_j, bz, load_node(leaf + 3 * WIDTH + ray->j) - at_j);
+    const node_reals cx = lane_fma(lean_i, cz, load_node(leaf + 6 * WIDTH + ray->i) - at_i);
+    const node_reals cy = lane_fma(lean_j, cz, load_node(leaf + 6 * WIDTH + ray->j) - at_j);
+    const node_reals a = bvh_cross(cx, by, cy, bx), b = bvh_cross(ax, cy, ay, cx), c = bvh_cross(bx, ay, by, ax);
+    const node_reals whole = a + b + c;
     // Inside: all edge functions have one sign.
-    const reals least = lane_min(a, lane_min(b, c)), most = lane_max(a, lane_max(b, c));
-    const masks inside = mask_of(least >= 0) | mask_of(most <= 0);
-    const reals size = fabs(whole);
-    const reals along = (a * az + b * bz + c * cz) * ray->per_k;
-    const reals forward = whole < 0 ? -along : along;
+    const node_reals least = node_min(a, node_min(b, c)), most = node_max(a, node_max(b, c));
+    const node_masks inside = mask_of_nodes(least >= 0) | mask_of_nodes(most <= 0);
+    const node_reals size = fabs(whole);
+    const node_reals along = (a * az + b * bz + c * cz) * ray->per_k;
+    const node_reals forward = whole < 0 ? -along : along;
     *t = along, *u = b, *v = c, *det = whole;
-    return inside & mask_of(size > 0) & mask_of(forward > ray->start * size) & mask_of(forward < end * size);
+    return inside & mask_of_nodes(size > 0) & mask_of_nodes(forward > ray->start * size) &
+           mask_of_nodes(forward < end * size);
 }
 
 // Boxes that the ray meets before `end`, one bit per box.
 INLINE uint bvh_met(const bvh_ray *ray, real end, global const real *node) {
-#ifdef VECTOR_VARIANT
-    return lane_bits(bvh_boxes(ray, end, node));
+#if defined(VECTOR_VARIANT) || defined(FOUR_WIDE)
+    return node_bits(bvh_boxes(ray, end, node));
 #else
     uint met = 0;
     for (int lane = 0; lane < WIDTH; lane++) met |= bvh_boxes(ray, end, node + lane) ? 1u << lane : 0;
@@ -144,9 +174,9 @@ INLINE uint bvh_met(const bvh_ray *ray, real end, global const real *node) {
 
 // Whether the ray meets any triangle of a leaf.
 INLINE int bvh_leaf_any(const bvh_ray *ray, global const real *leaf) {
-    reals t, u, v, det;
-#ifdef VECTOR_VARIANT
-    return lane_bits(bvh_triangles(ray, ray->end, leaf, &t, &u, &v, &det)) != 0;
+    node_reals t, u, v, det;
+#if defined(VECTOR_VARIANT) || defined(FOUR_WIDE)
+    return node_bits(bvh_triangles(ray, ray->end, leaf, &t, &u, &v, &det)) != 0;
 #else
     for (int lane = 0; lane < WIDTH; lane++)
         if (bvh_triangles(ray, ray->end, leaf + lane, &t, &u, &v, &det)) return 1;
@@ -162,16 +192,23 @@ INLINE void bvh_keep_nearest(real t, real u, real v, real det, int triangle, bvh
 
 INLINE void bvh_leaf_closest(const bvh_ray *ray, global const real *leaf, global const int *triangles,
                                  bvh_hit *hit) {
-    reals t, u, v, det;
-#ifdef VECTOR_VARIANT
-    uint met = lane_bits(bvh_triangles(ray, hit->t, leaf, &t, &u, &v, &det));
+    node_reals t, u, v, det;
+#if defined(VECTOR_VARIANT) || defined(FOUR_WIDE)
+    uint met = node_bits(bvh_triangles(ray, hit->t, leaf, &t, &u, &v, &det));
     if (!met) return;
     real ts[WIDTH], us[WIDTH], vs[WIDTH], dets[WIDTH];
-    store_private(t, ts), store_private(u, us), store_private(v, vs), store_private(det, dets);
+    *(node_reals_at *)ts = t, *(node_reals_at *)us = u, *(node_reals_at *)vs = v, *(node_reals_at *)dets = det;
+#ifdef FOUR_WIDE
+    // Unrolled, with constant indices: the arrays stay in registers.
+#pragma unroll
+    for (int lane = 0; lane < WIDTH; lane++)
+        if (met >> lane & 1) bvh_keep_nearest(ts[lane], us[lane], vs[lane], dets[lane], triangles[lane], hit);
+#else
     for (; met; met &= met - 1) {
         const int lane = lowest_bit(met);
         bvh_keep_nearest(ts[lane], us[lane], vs[lane], dets[lane], triangles[lane], hit);
     }
+#endif
 #else
     for (int lane = 0; lane < WIDTH; lane++)
         if (bvh_triangles(ray, hit->t, leaf + lane, &t, &u, &v, &det)) bvh_keep_nearest(t, u, v, det, triangles[lane], hit);

@@ -20,8 +20,9 @@ from gpuvision.host import capacity
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Children of a node and triangles of a leaf: lanes of the kernels' vectors.
+# Children of a node and triangles of a leaf: lanes of the kernels' vectors, and numbers of a load of a GPU (16 bytes).
 WIDTH = 16
+GPU_WIDTH = 4
 # Bins of the surface-area heuristic. Scenes of up to _FEW_TRIANGLES are split triangle by triangle with the finer bins:
 # their build time is small anyway.
 _BINS, _FINE_BINS, _FEW_TRIANGLES = 16, 64, 8192
@@ -50,14 +51,14 @@ class Bvh:
     numbers
         int64 (n,), numbers of the triangles in the scene.
     members
-        int64 (m, 16), triangles of each leaf as indices of `corners`; -1: an empty place.
+        int64 (m, width), triangles of each leaf as indices of `corners`; -1: an empty place.
     children
-        int32 (k, 16), children of each node: a node, or ~leaf. -1 after the last child; its box is empty.
+        int32 (k, width), children of each node: a node, or ~leaf. -1 after the last child; its box is empty.
     axes
         int32 (k,), axis along which the children of a node are sorted.
     boxes
-        float64 (k, 6, 16), lower corners, then upper corners of the children's boxes [m]. The box of an empty place is
-        +infinity, -infinity.
+        float64 (k, 6, width), lower corners, then upper corners of the children's boxes [m]. The box of an empty place
+        is +infinity, -infinity.
     depth
         Number of levels of nodes.
     """
@@ -72,7 +73,9 @@ class Bvh:
     depth: int
 
     @classmethod
-    def build(cls, corners: npt.NDArray[Any], wanted: npt.NDArray[np.bool_] | None = None) -> Bvh:
+    def build(
+        cls, corners: npt.NDArray[Any], wanted: npt.NDArray[np.bool_] | None = None, *, width: int = WIDTH
+    ) -> Bvh:
         """Build a BVH.
 
         Parameters
@@ -81,6 +84,8 @@ class Bvh:
             (n, 3, 3), triangles with finite corners [m]; n may be 0.
         wanted
             bool (n,), triangles that belong to the tree; None: all.
+        width
+            Most children of a node and triangles of a leaf.
 
         Raises
         ------
@@ -92,16 +97,16 @@ class Bvh:
         1. Triangles are bundled, up to four neighbours along the Morton curve whose boxes are close. This halves the
            build time, at a cost of 2 % in the summed area of the boxes. Up to 8192 triangles are not bundled.
         2. A binary tree is built level by level by the surface-area heuristic in bins along the widest axis of the
-           centroids (Wald 2007), to leaves of at most 16 triangles. There are 16 bins, 64 for up to 8192 triangles. The
-           cost of a box counts its triangles and its leaves in equal parts.
+           centroids (Wald 2007), to leaves of at most `width` triangles. There are 16 bins, 64 for up to 8192
+           triangles. The cost of a box counts its triangles and its leaves in equal parts.
         3. The binary tree is collapsed: the child with the largest area is replaced by its two children until a node
-           has 16 (Wald, Benthin and Boulos 2008).
+           has `width` (Wald, Benthin and Boulos 2008).
         """
         if corners.ndim != 3 or corners.shape[1:] != (3, 3):
             raise ValueError(f"Bvh.build takes triangles (n, 3, 3), got shape {corners.shape}")
         numbers = np.arange(len(corners)) if wanted is None else np.flatnonzero(wanted)
         if not len(numbers):
-            return cls._empty()
+            return cls._empty(width)
         corners = corners[numbers]
         # Coordinates as rows of a contiguous array: NumPy is slow along short axes.
         rows = np.ascontiguousarray(corners.reshape(-1, 9).T, np.float64).reshape(3, 3, -1)
@@ -109,8 +114,8 @@ class Bvh:
         rows -= middle[:, None]
         extents = np.concatenate([rows.min(axis=0), -rows.max(axis=0)])
         moved = rows.reshape(9, -1).T.reshape(-1, 3, 3)
-        binary = _binary_tree(extents)
-        children, depth = _collapse(binary)
+        binary = _binary_tree(extents, width)
+        children, depth = _collapse(binary, width)
         boxes = binary.extents.T[children].transpose(0, 2, 1)
         boxes[:, 3:] *= -1.0
         # Sort the children of each node by their centres along the widest axis of the node.
@@ -123,7 +128,7 @@ class Bvh:
         children = np.take_along_axis(children, order, axis=1)
         boxes = np.take_along_axis(boxes, order[:, None], axis=2)
         leaf = (children >= 0) & (binary.left[children] < 0)
-        members = _members(binary, children[leaf])
+        members = _members(binary, children[leaf], width)
         inner = np.flatnonzero((children >= 0) & ~leaf)
         links = np.full(children.size, -1, np.int32)
         # Nodes were numbered when they were collapsed: level by level, by the places in their parents before sorting.
@@ -132,9 +137,9 @@ class Bvh:
         return cls(moved, middle, numbers, members, links.reshape(children.shape), axes.astype(np.int32), boxes, depth)
 
     @classmethod
-    def _empty(cls) -> Bvh:
-        boxes = np.tile(np.repeat([np.inf, -np.inf], 3)[:, None], (1, 1, WIDTH)).astype(np.float64)
-        nowhere = np.full((1, WIDTH), -1)
+    def _empty(cls, width: int) -> Bvh:
+        boxes = np.tile(np.repeat([np.inf, -np.inf], 3)[:, None], (1, 1, width)).astype(np.float64)
+        nowhere = np.full((1, width), -1)
         return cls(
             np.zeros((0, 3, 3)),
             np.zeros(3),
@@ -280,22 +285,25 @@ class _BinaryTree:
             self.extents[:, nodes] = np.minimum(self.extents[:, left], self.extents[:, left + 1])
 
 
-def _binary_tree(extents: Reals) -> _BinaryTree:
+def _binary_tree(extents: Reals, width: int) -> _BinaryTree:
     """Build the binary tree over triangles with the given extents, (6, n)."""
     bundles = _bundles(extents)
     tree, levels = _BinaryTree(bundles.size), []
-    active = np.flatnonzero(tree.load > WIDTH)
+    active = np.flatnonzero(tree.load > width)
     bins = _FINE_BINS if extents.shape[1] <= _FEW_TRIANGLES else _BINS
     while len(active):
         levels.append(active)
-        fresh = _split_level(tree, active, bundles, bins, halve=len(levels) > _MAX_HEURISTIC_DEPTH)
-        active = fresh[tree.load[fresh] > WIDTH]
+        halve = len(levels) > _MAX_HEURISTIC_DEPTH
+        fresh = _split_level(tree, active, bundles, bins, width, halve=halve)
+        active = fresh[tree.load[fresh] > width]
     tree.unbundle(bundles)
     tree.measure(extents, levels)
     return tree
 
 
-def _split_level(tree: _BinaryTree, active: Integers, bundles: _Bundles, bins: int, *, halve: bool) -> Integers:
+def _split_level(
+    tree: _BinaryTree, active: Integers, bundles: _Bundles, bins: int, width: int, *, halve: bool
+) -> Integers:
     """Split each active node once and sort its bundles by child; return the children."""
     start, count = tree.start[active], tree.count[active]
     owner = np.repeat(np.arange(len(active)), count)
@@ -323,12 +331,12 @@ def _split_level(tree: _BinaryTree, active: Integers, bundles: _Bundles, bins: i
     sums = np.append(0, np.cumsum(bundles.size[members]))
     held[0, cells] = np.diff(cuts, append=len(key))
     held[1, cells] = np.diff(sums[cuts], append=sums[-1])
-    left_count = _best_cuts(grid.reshape(6, -1, bins), *held.reshape(2, -1, bins))
+    left_count = _best_cuts(grid.reshape(6, -1, bins), *held.reshape(2, -1, bins), width)
     left_count = np.where((left_count <= 0) | (left_count >= count) | halve, count // 2, left_count)
     return tree.split(active, left_count, sums[first + left_count] - sums[first])
 
 
-def _best_cuts(grid: npt.NDArray[Any], filled: Integers, load: Integers) -> Integers:
+def _best_cuts(grid: npt.NDArray[Any], filled: Integers, load: Integers, width: int) -> Integers:
     """Return the number of bundles to the left of the cut with the least cost, for each node.
 
     Parameters are the extents of the bins, (6, n, bins), and the number of bundles and triangles in each, (n, bins).
@@ -337,14 +345,14 @@ def _best_cuts(grid: npt.NDArray[Any], filled: Integers, load: Integers) -> Inte
     right = _areas(np.minimum.accumulate(grid[:, :, ::-1], axis=2))[:, ::-1][:, 1:]
     below = np.cumsum(load, axis=1)[:, :-1]
     above = load.sum(axis=1, keepdims=True) - below
-    cost = np.where((below > 0) & (above > 0), left * _work(below) + right * _work(above), np.inf)
+    cost = np.where((below > 0) & (above > 0), left * _work(below, width) + right * _work(above, width), np.inf)
     best: Integers = np.cumsum(filled, axis=1)[np.arange(len(below)), np.argmin(cost, axis=1)]
     return best
 
 
-def _work(triangles: Integers) -> Integers:
-    """Return the cost of a box by its number of triangles: triangles plus 16 for each leaf, with full leaves."""
-    return triangles - (-triangles // WIDTH) * WIDTH
+def _work(triangles: Integers, width: int) -> Integers:
+    """Return the cost of a box by its number of triangles: triangles plus the width for each leaf, with full leaves."""
+    return triangles - (-triangles // width) * width
 
 
 def _areas(extents: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -354,18 +362,18 @@ def _areas(extents: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.asarray(x * y + y * z + z * x)
 
 
-def _members(tree: _BinaryTree, leaves: Integers) -> Integers:
-    """Return the triangles of leaves, (n, 16); -1 in empty places."""
-    places = tree.begins[leaves, None] + np.arange(WIDTH)
+def _members(tree: _BinaryTree, leaves: Integers, width: int) -> Integers:
+    """Return the triangles of leaves, (n, width); -1 in empty places."""
+    places = tree.begins[leaves, None] + np.arange(width)
     members: Integers = tree.triangles[np.minimum(places, len(tree.triangles) - 1)]
-    members[np.arange(WIDTH) >= tree.load[leaves, None]] = -1
+    members[np.arange(width) >= tree.load[leaves, None]] = -1
     return members
 
 
-def _collapse(tree: _BinaryTree) -> tuple[Integers, int]:
-    """Collapse the binary tree to nodes of 16 children.
+def _collapse(tree: _BinaryTree, width: int) -> tuple[Integers, int]:
+    """Collapse the binary tree to nodes of `width` children.
 
-    Returns the children of every wide node as nodes of the binary tree, (k, 16) (-1: none), and the depth. Sets
+    Returns the children of every wide node as nodes of the binary tree, (k, width) (-1: none), and the depth. Sets
     ``tree.number``, the number of the wide node of a binary node.
     """
     area = np.where(tree.left >= 0, _areas(tree.extents), -1.0)
@@ -375,10 +383,10 @@ def _collapse(tree: _BinaryTree) -> tuple[Integers, int]:
         tree.number[roots] = numbered + np.arange(len(roots))
         numbered += len(roots)
         depth += 1
-        children = np.full((len(roots), WIDTH), -1)
+        children = np.full((len(roots), width), -1)
         children[:, 0] = roots
         rows = np.arange(len(roots))
-        for column in range(1, WIDTH):
+        for column in range(1, width):
             largest = np.argmax(np.where(children >= 0, area[children], -1.0), axis=1)
             chosen = children[rows, largest]
             able = rows[area[chosen] >= 0.0]

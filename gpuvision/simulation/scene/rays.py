@@ -100,9 +100,10 @@ class _Rays(VisionOperation[R]):
         """
         build.check_dtype("float32", "float64", of=of)
         build.check_shape(build.shape[-1:] == (6,), f"{of} (..., 6)")
-        where, tree = build.shape[:-1], self.scene.bvh
+        where = build.shape[:-1]
         count = math.prod(where)
         work = build.work(count, each=_RAYS_PER_STRIP, group=_GROUP)
+        tree = self.scene.bvh if work.vectors else self.scene.gpu_bvh
         # The vector variant traces rays one by one, too: two floats are built for one ray per work-item.
         two_floats = not (build.doubles_positions or work.vectors)
         place = build.widest if not two_floats else np.dtype(np.float32)
@@ -115,6 +116,7 @@ class _Rays(VisionOperation[R]):
                 **type_defines("INPUT", build.dtype),
                 "BVH_DEPTH": tree.stack_size,
                 **flags(
+                    FOUR_WIDE=not work.vectors,
                     ANY_HIT=kernel == "any_hit",
                     DOUBLE_POSITIONS=place == np.float64,
                     TWO_FLOAT_POSITIONS=two_floats,
@@ -151,8 +153,8 @@ class ClosestHit(_Rays[Hits]):
         "single" or "double" arithmetic and outputs; None: the type of the input. "single" takes float64 rays too: the
         centre of the scene is subtracted in double, and a distant ray is clipped to the scene.
     variant : {"auto", "vector", "work_item"}
-        "vector" (one ray against 16 boxes per vector, for CPU runtimes), "work_item" (one work-item per ray, for GPUs)
-        or "auto".
+        "vector" (one ray against 16 boxes per vector, for CPU runtimes), "work_item" (one work-item per ray, which
+        tests the four boxes of a node with vector loads, for GPUs) or "auto".
 
     Raises
     ------

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from gpuvision.host.errors import ReadError
 from gpuvision.host.reading import reading
-from gpuvision.simulation.scene.bvh import Bvh, radix_argsort
+from gpuvision.simulation.scene.bvh import GPU_WIDTH, WIDTH, Bvh, radix_argsort
 from gpuvision.simulation.scene.mesh_file import SUFFIXES, check_mesh
 
 # Multiplier of the hash: 2^64 over the golden ratio, made odd (Fibonacci hashing, Knuth).
@@ -101,9 +101,17 @@ class Scene:
     @functools.cached_property
     def bvh(self) -> Bvh:
         """BVH over the triangles that are finite and not degenerate, built at the first use."""
+        return self._tree(WIDTH)
+
+    @functools.cached_property
+    def gpu_bvh(self) -> Bvh:
+        """BVH over the same triangles with four children per node, for GPUs; built at the first use."""
+        return self._tree(GPU_WIDTH)
+
+    def _tree(self, width: int) -> Bvh:
         good = np.ones(len(self.corners), bool)
         good[[*self.defects.not_finite, *self.defects.degenerate]] = False
-        return Bvh.build(self.corners, good)
+        return Bvh.build(self.corners, good, width=width)
 
     @classmethod
     def of(cls, meshes: Any, *, metres: float = 1.0) -> Scene:

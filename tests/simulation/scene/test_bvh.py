@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gpuvision.simulation.scene.bvh import WIDTH, Bvh
+from gpuvision.simulation.scene.bvh import GPU_WIDTH, WIDTH, Bvh
 
 
 def corners_of(kind: str, rng: np.random.Generator) -> np.ndarray:
@@ -28,11 +28,12 @@ def corners_of(kind: str, rng: np.random.Generator) -> np.ndarray:
 KINDS = ("none", "one", "sixteen", "seventeen", "soup", "same", "line", "clusters", "geometric", "sphere")
 
 
+@pytest.mark.parametrize("width", [WIDTH, GPU_WIDTH])
 @pytest.mark.parametrize("kind", KINDS)
-def test_each_triangle_in_one_leaf_within_its_boxes(kind: str, rng: np.random.Generator) -> None:
+def test_each_triangle_in_one_leaf_within_its_boxes(kind: str, width: int, rng: np.random.Generator) -> None:
     corners = corners_of(kind, rng)
-    tree = Bvh.build(corners)
-    assert tree.members.shape[1] == WIDTH
+    tree = Bvh.build(corners, width=width)
+    assert tree.members.shape[1] == tree.children.shape[1] == tree.boxes.shape[2] == width
     np.testing.assert_array_equal(np.sort(tree.members[tree.members >= 0]), np.arange(len(corners)))
     reached, deepest = np.zeros(len(tree.members), int), 0
     todo = [(0, 1, np.full(3, -np.inf), np.full(3, np.inf))]

@@ -331,12 +331,12 @@ def _split_level(
     sums = np.append(0, np.cumsum(bundles.size[members]))
     held[0, cells] = np.diff(cuts, append=len(key))
     held[1, cells] = np.diff(sums[cuts], append=sums[-1])
-    left_count = _best_cuts(grid.reshape(6, -1, bins), *held.reshape(2, -1, bins), width)
+    left_count = _best_cuts(grid.reshape(6, -1, bins), *held.reshape(2, -1, bins), width=width)
     left_count = np.where((left_count <= 0) | (left_count >= count) | halve, count // 2, left_count)
     return tree.split(active, left_count, sums[first + left_count] - sums[first])
 
 
-def _best_cuts(grid: npt.NDArray[Any], filled: Integers, load: Integers, width: int) -> Integers:
+def _best_cuts(grid: npt.NDArray[Any], filled: Integers, load: Integers, *, width: int) -> Integers:
     """Return the number of bundles to the left of the cut with the least cost, for each node.
 
     Parameters are the extents of the bins, (6, n, bins), and the number of bundles and triangles in each, (n, bins).

@@ -152,7 +152,6 @@ INLINE void store_vector(places x, places y, places z, local place *to) {
     to[0] = as_place(x), to[TILE] = as_place(y), to[2 * TILE] = as_place(z);
 }
 
-// No loop over the members by a pointer: Mesa's llvmpipe compiles such a loop for minutes.
 INLINE void store_frame(const segment_frame *of, local place *to) {
     store_vector(of->x, of->y, of->z, to);
     store_vector(of->ux, of->uy, of->uz, to + 3 * TILE);

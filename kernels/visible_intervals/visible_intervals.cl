@@ -10,6 +10,11 @@
 // Coordinates in the plane of the fan: place = apex + a (end 0 - apex) + b (end 1 - apex). The fan is a >= 0, b >= 0; the
 // segment is a + b = 1, at the fraction b / (a + b) of its length; rays begin where a / near 0 + b / near 1 = 1. All these
 // are linear along the line in which a triangle cuts the plane, so clipping is exact.
+//
+// A short segment makes a narrow fan: a and b of a far corner are large (distance / length of the segment), while a + b is
+// moderate, and 1 along the whole line in which the segment's own triangle cuts the plane. A sum of a and b would lose these
+// digits, and the triangle would hide the segment. So a + b (`far`) has its own gradient, a is far - b, and the plane's
+// normal is (end 0 - apex) x (end 1 - end 0).
 #include "common/bvh.h"
 #include "common/status.h"
 
@@ -23,7 +28,7 @@ typedef struct {
 typedef struct {
     Vector apex, across;    // apex; unit normal of the plane
     Vector a, b, far, near; // gradients of a, b, a + b, a / near 0 + b / near 1
-    real per_0, per_1;      // reciprocals of near 0 and near 1
+    real per_0, change;     // 1 / near 0; 1 / near 1 - 1 / near 0
     real flat;              // a corner within this distance of the plane counts as in the plane [m]
 } Fan;
 
@@ -40,7 +45,7 @@ static inline Vector combined(real a, Vector u, real b, Vector v) {
 // Set up a fan; return 0 for a segment on a line through the apex.
 static inline int fan_of(const Vector *corners, real near_0, real near_1, real least_near, Fan *fan) {
     const Vector one = minus(corners[1], corners[0]), two = minus(corners[2], corners[0]);
-    const Vector normal = cross_of(one, two);
+    const Vector along = minus(corners[2], corners[1]), normal = cross_of(one, along);
     const real square = dot_of(normal, normal), reach = dot_of(one, one) + dot_of(two, two);
     if (!(square > (real)64 * (real)REAL_EPSILON * (real)REAL_EPSILON * reach * reach)) return 0;
     fan->apex = corners[0];
@@ -48,9 +53,9 @@ static inline int fan_of(const Vector *corners, real near_0, real near_1, real l
     fan->a = scaled(cross_of(two, normal), (real)1 / square);
     fan->b = scaled(cross_of(normal, one), (real)1 / square);
     fan->per_0 = (real)1 / max(near_0, least_near);
-    fan->per_1 = (real)1 / max(near_1, least_near);
-    fan->far = combined(1, fan->a, 1, fan->b);
-    fan->near = combined(fan->per_0, fan->a, fan->per_1, fan->b);
+    fan->change = (real)1 / max(near_1, least_near) - fan->per_0;
+    fan->far = scaled(cross_of(along, normal), (real)1 / square);
+    fan->near = combined(fan->per_0, fan->far, fan->change, fan->b);
     fan->flat = (real)16 * (real)REAL_EPSILON * sqrt(reach);
     return 1;
 }
@@ -90,14 +95,14 @@ INLINE void cut(reals start, reals end, reals *low, reals *high) {
 
 // Triangles that hide a part of the segment, and the hidden intervals.
 INLINE masks fan_triangles(const Fan *fan, real slack, global const real *leaf, reals *from, reals *to) {
-    reals d[3], a[3], b[3];
+    reals d[3], f[3], b[3]; // f: a + b
     for (int n = 0; n < 3; n++) {
         global const real *at = leaf + 3 * n * WIDTH;
         const reals x = load_reals(at) - fan->apex.x, y = load_reals(at + WIDTH) - fan->apex.y;
         const reals z = load_reals(at + 2 * WIDTH) - fan->apex.z;
         const reals off = fan->across.x * x + fan->across.y * y + fan->across.z * z;
         d[n] = fabs(off) <= (reals)fan->flat ? (reals)(real)0 : off;
-        a[n] = fan->a.x * x + fan->a.y * y + fan->a.z * z;
+        f[n] = fan->far.x * x + fan->far.y * y + fan->far.z * z;
         b[n] = fan->b.x * x + fan->b.y * y + fan->b.z * z;
     }
     const reals zero = (real)0, one = (real)1;
@@ -105,21 +110,20 @@ INLINE masks fan_triangles(const Fan *fan, real slack, global const real *leaf, 
     const masks lone_0 = (s0 ^ s1) & (s0 ^ s2), lone_1 = (s1 ^ s0) & (s1 ^ s2), crossed = (s0 ^ s1) | (s0 ^ s2);
     // k: the corner alone on its side of the plane; i, j: the other two.
     const reals dk = lone_0 ? d[0] : lone_1 ? d[1] : d[2], di = lone_0 ? d[1] : d[0];
-    const reals ak = lone_0 ? a[0] : lone_1 ? a[1] : a[2], ai = lone_0 ? a[1] : a[0];
+    const reals fk = lone_0 ? f[0] : lone_1 ? f[1] : f[2], fi = lone_0 ? f[1] : f[0];
     const reals bk = lone_0 ? b[0] : lone_1 ? b[1] : b[2], bi = lone_0 ? b[1] : b[0];
     const masks early = lone_0 | lone_1;
-    const reals dj = early ? d[2] : d[1], aj = early ? a[2] : a[1], bj = early ? b[2] : b[1];
+    const reals dj = early ? d[2] : d[1], fj = early ? f[2] : f[1], bj = early ? b[2] : b[1];
     const reals i = dk / (dk - di), j = dk / (dk - dj);
-    const reals a0 = ak + i * (ai - ak), b0 = bk + i * (bi - bk), a1 = ak + j * (aj - ak), b1 = bk + j * (bj - bk);
+    const reals f0 = fk + i * (fi - fk), b0 = bk + i * (bi - bk), f1 = fk + j * (fj - fk), b1 = bk + j * (bj - bk);
     reals low = zero, high = one;
-    cut(a0, a1, &low, &high);
+    cut(f0 - b0, f1 - b1, &low, &high);
     cut(b0, b1, &low, &high);
     const real most = (real)1 - slack, least = (real)1 + slack;
-    cut(most - a0 - b0, most - a1 - b1, &low, &high);
-    cut(fan->per_0 * a0 + fan->per_1 * b0 - least, fan->per_0 * a1 + fan->per_1 * b1 - least, &low, &high);
-    const reals al = a0 + low * (a1 - a0), bl = b0 + low * (b1 - b0);
-    const reals ah = a0 + high * (a1 - a0), bh = b0 + high * (b1 - b0);
-    const reals start = bl / (al + bl), end = bh / (ah + bh);
+    cut(most - f0, most - f1, &low, &high);
+    cut(fan->per_0 * f0 + fan->change * b0 - least, fan->per_0 * f1 + fan->change * b1 - least, &low, &high);
+    const reals start = (b0 + low * (b1 - b0)) / (f0 + low * (f1 - f0));
+    const reals end = (b0 + high * (b1 - b0)) / (f0 + high * (f1 - f0));
     *from = lane_min(start, end);
     *to = lane_max(start, end);
     return crossed & mask_of(high > low);

@@ -66,9 +66,10 @@ class VisibleIntervals(VisionOperation[Intervals]):
     Notes
     -----
     Each triangle that intersects the fan occludes an interval of the segment; the visible parts are the complement of
-    their union. The ends of the parts are exact to rounding: 1e-10 of the segment in double, 1e-5 in single precision.
-    Shorter parts, and occluders closer to the segment or the mirror than this fraction of the ray, are ignored. A
-    segment that is collinear with the apex has no visible part.
+    their union. The ends of the parts are exact to rounding: 1e-10 of the segment in double, 1e-5 in single precision;
+    on a segment shorter than 1/100 of its distance from the apex, a few roundings of that distance. Shorter parts, and
+    occluders closer to the segment or the mirror than this fraction of the ray, are ignored. A segment that lies on a
+    line through the apex has no visible part.
     """
 
     Result: ClassVar[type[Any]] = Intervals

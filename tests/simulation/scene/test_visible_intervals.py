@@ -107,6 +107,24 @@ def test_a_square_before_a_line(device: Device, variant: Any, dtype: Any) -> Non
 
 
 @WAYS
+def test_short_segments_are_not_hidden_by_their_own_triangle(
+    device: Device, variant: Any, dtype: Any, rng: np.random.Generator
+) -> None:
+    """Segments of a thousandth of their triangle: its corners are up to 1000 segments away, and their fans narrow."""
+    corners = 0.1 * np.array([[[-1.0, -1.0, 0.3], [1.0, -1.0, -0.2], [0.0, 1.0, 0.1]]])
+    a, b, c = corners[0]
+    middles = a + rng.uniform(0.05, 0.45, (500, 1)) * (b - a) + rng.uniform(0.05, 0.45, (500, 1)) * (c - a)
+    angle = rng.uniform(0.0, 2.0 * np.pi, (500, 1))
+    half = 5e-4 * (np.cos(angle) * (b - a) + np.sin(angle) * (c - a))
+    apex = rng.uniform([-0.1, -0.1, 0.15], [0.1, 0.1, 0.35], (500, 3))
+    fans = np.hstack([apex, middles - half, middles + half, np.zeros((500, 2))]).astype(dtype)
+    result = VisibleIntervals(scene=Scene(corners), variant=variant)(fans, device=device)
+    assert not result.status.any()
+    np.testing.assert_array_equal(result.interval_count, 1)
+    np.testing.assert_array_equal(result.intervals[:, 0], np.broadcast_to([0.0, 1.0], (500, 2)))
+
+
+@WAYS
 @pytest.mark.parametrize("corner", [0, 1, 2])
 def test_a_corner_that_touches_the_plane_from_above_hides_nothing(
     device: Device, variant: Any, dtype: Any, corner: int

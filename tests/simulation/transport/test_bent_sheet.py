@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -105,8 +106,11 @@ def test_without_bend_terms_the_sheet_is_flat() -> None:
     np.testing.assert_allclose(two.power, one.power, rtol=1e-12)
 
 
-def test_lit_points_are_not_hidden_by_their_own_triangle(device: Device) -> None:
+@pytest.mark.parametrize("doubles", [pytest.param(True, marks=pytest.mark.double), False])
+def test_lit_points_are_not_hidden_by_their_own_triangle(device: Device, doubles: bool) -> None:
     """All light of a plane in view of the lens arrives: points beside their triangle would be occluded by it."""
+    device = copy.copy(device)
+    device.has_double = device.has_double and doubles
     # The plane rises along the normal of the sheet, so that the discretisation moves points off the plane.
     scene = Scene(plane(1e-3) @ Rotation.from_euler("x", 0.5).as_matrix().T)
     found = {}

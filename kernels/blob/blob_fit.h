@@ -155,8 +155,10 @@ static inline blob_quality quality_of(private blob_edges *edges, blob_layout lay
         of[SPOKES + i] = of[i];
         height[SPOKES + i] = height[i];
     }
+    // The loop ends at SPOKES, not at PADDED_SPOKES: without lanes it would read beyond the repeated numbers, which nothing
+    // wrote, and a NaN there times the weight 0 of the padding is NaN. With lanes the last vector holds the padding.
     reals agreed = 0;
-    for (int i = 0; i < PADDED_SPOKES; i += LANES) {
+    for (int i = 0; i < SPOKES; i += LANES) {
         const reals here = READ(height, i), there = READ(height, i + SPOKES / 2);
         const reals low = here < there ? here : there, high = here < there ? there : here;
         const reals product = READ(of, i) * READ(of, i + SPOKES / 2) * FROM(layout.counts, i);

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import shutil
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from canary import Guarded
 from gpuvision.host import Device
 from gpuvision.matching.features.blob import FindBlobs
 from gpuvision.matching.features.ruler import RulerEdges
+from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.reference import blob as reference
 from gpuvision.status import Status
 
@@ -153,6 +156,30 @@ def test_any_number_of_rulers(device: Device, spokes: int, match: bool) -> None:
     assert blobs.status[0] == 0
     assert blobs.inliers[0] == spokes
     assert np.hypot(*(centre(blobs) - TRUE)) < (2e-3 if match else 0.02)
+
+
+@pytest.mark.slow
+@VARIANTS
+def test_unwritten_memory_does_not_reach_the_symmetry(
+    device: Device, variant: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """24 rulers are padded to 32: with NaN in the arrays before they are written, the results have the same bits."""
+    image = a_disc().astype(np.float32)
+    operation = replace(PLAIN, spokes=24, match=False, count=1, variant=variant)
+    plain = operation.bind(device, image.shape, image.dtype).on_host([image, place()])
+    shutil.copytree(KERNEL_FOLDER, tmp_path / "kernels")
+    header = tmp_path / "kernels" / "blob" / "blob_fit.h"
+    count = "PADDED_SPOKES + SPOKES / 2 + LANES"
+    declared = f"real height[{count}];"
+    filled = f"{declared}\nfor (int i = 0; i < {count}; i++) height[i] = quality.weights[i] = REAL_NAN;"
+    before, after = header.read_text().split(declared)
+    header.write_text(before + filled + after)
+    monkeypatch.setattr(FindBlobs, "kernel_folder", tmp_path / "kernels")
+    blobs = operation.bind(device, image.shape, image.dtype).on_host([image, place()])
+    assert 0.95 < plain.symmetry[0] <= 1.0
+    for name, expected in plain._asdict().items():
+        if expected is not None:
+            np.testing.assert_array_equal(getattr(blobs, name), expected, err_msg=name)
 
 
 def occluded(image: np.ndarray, kind: str, rng: np.random.Generator) -> np.ndarray:

@@ -19,6 +19,7 @@ SIZES = (1 << 20, 8 << 20, 192 << 20)
 _COPIES, _COPYING = 12, 0.03  # least number of copies of a size, and least time for them [s]
 _VECTOR = 64  # bytes that a work-item moves per step
 _ITEMS_PER_UNIT = 64
+_LAUNCH = 0.2  # a launch of the multiply-adds that takes longer gets no more work-items [s]
 _FLOPS_PER_STEP = 8 * 16 * 2  # 8 vectors of 16 floats, one multiplication and one addition each
 
 
@@ -101,17 +102,27 @@ def _event_time(event: Any) -> float:
 def flop_rate(device: Device, *, seconds: float = 0.15) -> float:
     """Return the rate of single-precision multiply-adds on all cores [FLOP/s]: median of short launches.
 
-    Two calls differ if the machine changed its speed between them.
+    Two calls differ if the machine changed its speed between them. A launch has fewer work-items on devices that would
+    take long: Mesa's llvmpipe computes multiply-adds in software, at less than 1 GFLOP/s.
     """
-    items = device.compute_units * (4 if device.prefers_vectors else 4096)
-    target = device.empty((items * 16,), np.float32)
+    most = device.compute_units * (4 if device.prefers_vectors else 4096)
+    items = device.compute_units * 4
+    target = device.empty((most * 16,), np.float32)
     kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "compute")
     steps = 20_000 if device.prefers_vectors else 2_000
-    kernel.set_args(memory_of(target), np.float32(1.0), np.float32(0.5), np.int32(steps))
+
+    def launch(items: int, steps: int) -> float:
+        """Return the time of a launch [s]."""
+        kernel.set_args(memory_of(target), np.float32(1.0), np.float32(0.5), np.int32(steps))
+        start = time.perf_counter()
+        cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.prefers_vectors else None).wait()
+        return time.perf_counter() - start
+
+    launch(items, 1)  # compiles
+    while items < most and min(launch(items, steps), launch(items, steps)) < _LAUNCH:
+        items = min(4 * items, most)
     rates: list[float] = []
     end = time.perf_counter() + seconds
     while len(rates) < 5 or time.perf_counter() < end:
-        start = time.perf_counter()
-        cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.prefers_vectors else None).wait()
-        rates.append(items * steps * _FLOPS_PER_STEP / (time.perf_counter() - start))
+        rates.append(items * steps * _FLOPS_PER_STEP / launch(items, steps))
     return float(np.median(rates[1:]))

@@ -44,7 +44,7 @@ CASES: dict[str, Callable[[Device, np.random.Generator], Case]] = {
     "lines": lambda device, rng: lines(device, rng, scale=0.05),
     "lines, free scale": lines,
 }
-SLOW = {"pose", "lines, free scale"}
+SLOW = {"pose", "pose, free scale", "lines, free scale"}  # a pose takes 10 s to build in groups of 8
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES])

@@ -128,7 +128,7 @@ def test_fits_of_lines_of_any_width(device, rng, variant):
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_bound_of_the_fit_for_the_narrowest_lines_with_strong_noise(device, rng, variant):
     """Worst case of the model at pixel middles: sigma 1.6 px, and noise that scatters the position by 0.09 px."""
-    place, parameters = 20 + rng.uniform(-0.5, 0.5, 1000), {"method": "ml", "window": 8, "read_noise": 4.0}
+    place, parameters = 20 + rng.uniform(-0.5, 0.5, 300), {"method": "ml", "window": 8, "read_noise": 4.0}
     light = pixel_gaussian(np.arange(41)[:, None], place, 1.6, 60.0, 20.0)
     frame = np.rint(light + rng.normal(0.0, 4.0, light.shape)).astype(np.uint8)
     reading = LineReadout(variant=variant, threshold=35, **parameters)(frame, device=device)

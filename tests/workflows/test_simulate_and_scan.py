@@ -200,7 +200,7 @@ def test_the_sensor_file_of_a_sensor_with_an_encoder(commands: Commands, profile
 @pytest.mark.parametrize(
     "method", [pytest.param(name, marks=[] if name == "ml" else pytest.mark.slow) for name in METHODS]
 )
-@pytest.mark.parametrize("noise", ["--noise", "--no-noise"])
+@pytest.mark.parametrize("noise", [pytest.param("--noise", marks=pytest.mark.slow), "--no-noise"])
 def test_a_scan_has_the_readings_of_the_simulation(commands: Commands, method: str, noise: str) -> None:
     commands.table["line"] |= {"method": method}
     commands.write("sensor.toml", commands.table)

@@ -244,8 +244,8 @@ def plan_stream(
         Function that takes a batch size and whether kernels run inline, and returns a `Cost`; it replaces the
         measurement on the device, and the choice between devices.
     sample : (frames, ...) array, optional
-        Frames to measure on; default: a blank frame. Give some where the time depends on the content: an iterative fit
-        has nothing to do on a blank frame.
+        Frames to measure on; default: a blank frame. Give some where the time depends on the content: on a blank frame
+        an iterative fit ends at once.
     limits : PlanLimits
         Limits of the measurements and of the memory.
 

@@ -125,7 +125,7 @@ def judge(job: Job, device: Device, limits: ScanPlanLimits = ScanPlanLimits()) -
 def true_error(job: Job, readout: LineReadout, device: Device) -> float:
     """Return the root mean square error of the heights of a recording [m]."""
     sensor = dataclasses.replace(job.sensor, readout=readout)
-    operation = range_readout(sensor, readout.precision)
+    operation = range_readout(sensor)
     reading = operation(job.frames, device=device)
     fields = {name: to_numpy(getattr(reading, name)) for name in operation.outputs or ()}
     found = to_numpy(measure_points(sensor, fields, np.arange(_FRAMES), device)[0].z).astype(np.float64)
@@ -154,7 +154,7 @@ def _lost(job: Job, plan: ScanPlan, rate: float) -> int:
     """Return the number of frames that the stream of a plan loses at its rate."""
     assert plan.stream is not None
     count = max(math.ceil(_SECONDS * rate), 10)
-    readout = range_readout(plan.sensor, plan.chosen.readout.precision)
+    readout = range_readout(plan.sensor)
     source = PacedSource(ArraySource(job.frames, count), rate)
     stream: Pipeline[Any] = Pipeline(source, readout, policy="drop_oldest", **plan.stream.settings)
     with stream:
@@ -168,13 +168,14 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     made = [each for each in outcomes if each.plan is not None]
     refused = [each for each in outcomes if each.plan is None]
     costs = np.array([each.cost for each in made if math.isfinite(each.cost)])
+    cheap, largest = int(np.sum(costs <= 1.5)), costs.max(initial=0.0)
     accurate = sum(each.error <= each.tolerance for each in made)
     return "\n".join(
         [
             f"{len(outcomes)} jobs: {len(made)} plans, {len(refused)} refused",
             f"error within the tolerance: {accurate} of {len(made)}",
             f"no frame lost at the rate: {sum(not each.lost for each in made)} of {len(made)}",
-            f"cost at most 1.5 times the best: {int(np.sum(costs <= 1.5))} of {len(costs)}, largest {costs.max():.2f}",
+            f"cost at most 1.5 times the best: {cheap} of {len(costs)}, largest {largest:.2f}",
             f"refused although a readout truly meets the tolerance: {sum(each.possible for each in refused)}",
         ]
     )

@@ -203,7 +203,7 @@ def scan(
     if tolerance is not None:
         reject_unused("with --tolerance, which chooses it", precision=precision)
         plan = make_plan(recording, described, tolerance, rate, chosen)
-        described, asked = plan.sensor, plan.chosen.readout.precision
+        described = plan.sensor
     with progress_bar(f"scanning {recording.name}") as progress:
         done = run(
             recording,

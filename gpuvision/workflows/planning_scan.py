@@ -24,7 +24,15 @@ from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.validation import finite
 from gpuvision.workflows.opened_recording import open_for_scan
-from gpuvision.workflows.scan_plan import PlanError, ReadoutTrial, ScanPlan, ScanPlanLimits, micrometres, usable_trials
+from gpuvision.workflows.scan_plan import (
+    PlanError,
+    ReadoutTrial,
+    ScanPlan,
+    ScanPlanLimits,
+    at_least,
+    micrometres,
+    usable_trials,
+)
 from gpuvision.workflows.scanning import measure_points, range_readout
 
 Array = npt.NDArray[Any]
@@ -34,6 +42,7 @@ Progress = Callable[[int, int | None], object]
 _WINDOWS = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 180)
 _HALF_WIDTHS = (1.2, 2.0)  # of the windows, over half the width of the line: noise moves the peak within the line
 _UNKNOWN_LENGTH = 1 << 40  # frames of a recording that does not tell: its stream has no end
+_QUIET = 1.5  # times the least noise of a readout, up to which its scatter shows the texture. Chosen
 _EDGE = 8.0  # robust standard deviations of the second differences of heights. Chosen: noise stays below
 _ROUNDS = 7  # of the timing, of which the median counts. Chosen: pauses of a shared machine hit a few
 
@@ -113,7 +122,8 @@ def plan_scan(
     `gpuvision.ranging.line_phase.phase_error`. Where the heights of one readout scatter more along their profiles than
     its noise explains, and than those of the other readouts do, the difference is added. Not covered: errors of the
     threshold, light of reflections, the texture of the surface (unless ``[line] speckle`` is given), and interpolation
-    to the height map. The precision is double where rounding would exceed the tolerance.
+    to the height map. The precision is double where rounding would exceed the tolerance; a device without doubles
+    cannot check that (``rounding`` is None).
 
     References
     ----------
@@ -123,7 +133,7 @@ def plan_scan(
     _check(sensor, tolerance, rate, latency)
     device = Device.best() if device is None else device
     sensor, sample = _sampled(recording, sensor)
-    trials = _try_readouts(sensor, sample, device, progress)
+    trials = _try_readouts(sensor, sample, device, limits, progress)
     chosen = _chosen(trials, tolerance, limits)
     chosen, rounding = _with_precision(chosen, sensor, sample, device, tolerance / limits.margin)
     stream = None
@@ -165,21 +175,29 @@ def _sampled(recording: str | Path | Array, sensor: Sensor) -> tuple[Sensor, _Sa
     return opened.sensor, _Sample(sample.frames[:, 0], sample.numbers, _UNKNOWN_LENGTH if length is None else length)
 
 
-def _try_readouts(sensor: Sensor, sample: _Sample, device: Device, progress: Progress) -> tuple[ReadoutTrial, ...]:
+def _try_readouts(
+    sensor: Sensor, sample: _Sample, device: Device, limits: ScanPlanLimits, progress: Progress
+) -> tuple[ReadoutTrial, ...]:
     """Return the readouts with their errors and times on the sample, fastest first."""
     readouts = _readouts(sensor, sample, device)
-    on_device = device.empty(sample.frames.shape, sample.frames.dtype)
-    on_device.set(sample.frames)
-    trials, calls = [], []
+    trials = []
     for number, readout in enumerate(readouts):
-        other = dataclasses.replace(sensor, readout=readout)
-        trials.append(_errors(other, sample, device))
-        operation = range_readout(other, readout.precision)
-        calls.append(operation.bind(device, on_device.shape, on_device.dtype, inputs=(on_device,)).run)
+        trials.append(_errors(dataclasses.replace(sensor, readout=readout), sample, device))
         progress(number + 1, len(readouts))
-    seconds = [each / len(sample.frames) for each in _median_times(calls)]
-    timed = [each._replace(seconds=one) for each, one in zip(_with_unexplained(trials), seconds, strict=True)]
+    seconds = _times(sensor, readouts, sample, device)
+    timed = [each._replace(seconds=one) for each, one in zip(_with_unexplained(trials, limits), seconds, strict=True)]
     return tuple(sorted(timed, key=lambda each: each.seconds))
+
+
+def _times(sensor: Sensor, readouts: Sequence[LineReadout], sample: _Sample, device: Device) -> list[float]:
+    """Return the time of each readout for a frame of the sample [s]."""
+    frames = device.empty(sample.frames.shape, sample.frames.dtype)
+    frames.set(sample.frames)
+    calls = []
+    for readout in readouts:
+        operation = range_readout(dataclasses.replace(sensor, readout=readout))
+        calls.append(operation.bind(device, frames.shape, frames.dtype, inputs=(frames,)).run)
+    return [each / len(sample.frames) for each in _median_times(calls)]
 
 
 def _readouts(sensor: Sensor, sample: _Sample, device: Device) -> list[LineReadout]:
@@ -192,7 +210,7 @@ def _readouts(sensor: Sensor, sample: _Sample, device: Device) -> list[LineReado
     """
     given = sensor.readout
     assert isinstance(given, LineReadout)  # `_check` refuses other sensors
-    reading: Any = range_readout(sensor, None)(sample.frames, device=device)
+    reading: Any = range_readout(sensor)(sample.frames, device=device)
     good = to_numpy(reading.status) == Status.OK
     if not good.any():
         raise ValueError(f"no line in {len(sample.frames)} frames of the recording; look at `gpuvision scan --preview`")
@@ -242,12 +260,16 @@ def _scatter(z: Array) -> float:
     return _rms(known[known <= _EDGE * MAD_TO_SIGMA * np.median(known)]) / math.sqrt(6.0)
 
 
-def _with_unexplained(trials: Sequence[ReadoutTrial]) -> list[ReadoutTrial]:
+def _with_unexplained(trials: Sequence[ReadoutTrial], limits: ScanPlanLimits) -> list[ReadoutTrial]:
     """Add the scatter that the noise model of a readout does not explain to its error.
 
-    The least unexplained scatter of all readouts is taken as the texture of the surface, which is no error.
+    The least unexplained scatter of the readouts with little noise is taken as the texture of the surface, which is no
+    error: a readout with much noise would not show it, nor one that loses samples.
     """
-    texture = min((each.unexplained for each in trials if each.lost < 1.0), default=0.0)
+    usable = usable_trials(trials, limits)
+    quiet = min((each.random for each in usable), default=0.0)
+    shown = [each.unexplained for each in usable if each.random <= _QUIET * quiet]
+    texture = min(shown, default=0.0)
     own = [math.sqrt(max(each.unexplained**2 - texture**2, 0.0)) for each in trials]
     return [
         each._replace(unexplained=one, error=math.hypot(each.error, one)) for each, one in zip(trials, own, strict=True)
@@ -256,8 +278,7 @@ def _with_unexplained(trials: Sequence[ReadoutTrial]) -> list[ReadoutTrial]:
 
 def _points(sensor: Sensor, sample: _Sample, device: Device) -> Any:
     """Return the points of the sample, and their errors."""
-    readout: Any = sensor.readout
-    operation = range_readout(sensor, readout.precision)
+    operation = range_readout(sensor)
     reading = operation(sample.frames, device=device)
     fields = {name: to_numpy(getattr(reading, name)) for name in operation.outputs or ()}
     return measure_points(sensor, fields, sample.numbers, device)
@@ -299,7 +320,7 @@ def _chosen(trials: Sequence[ReadoutTrial], tolerance: float, limits: ScanPlanLi
         f"no readout meets an error of {micrometres(tolerance)}; the most accurate, {best.name}, is predicted "
         f"{micrometres(best.error)} (random {micrometres(best.random)}, phase {micrometres(best.phase)}, calibration "
         f"{micrometres(best.systematic)}, unexplained {micrometres(best.unexplained)}): ask for "
-        f"{micrometres(limits.margin * best.error)} or more",
+        f"{at_least(limits.margin * best.error)} or more",
         trials,
     )
 
@@ -316,7 +337,10 @@ def _with_precision(
         for each in (chosen, double)
     ]
     rounding = _rms(heights[0] - heights[1])
-    return (double if math.hypot(chosen.error, rounding) > largest else chosen), rounding
+    if math.hypot(chosen.error, rounding) <= largest:
+        return chosen, rounding
+    (seconds,) = _times(sensor, [double.readout], sample, device)
+    return double._replace(seconds=seconds), rounding
 
 
 def _plan_stream(
@@ -338,8 +362,8 @@ def _plan_stream(
     """
 
     def planned(trial: ReadoutTrial) -> Plan:
-        operation = range_readout(dataclasses.replace(sensor, readout=trial.readout), trial.readout.precision)
-        source = ArraySource(sample.frames)
+        operation = range_readout(dataclasses.replace(sensor, readout=trial.readout))
+        source = ArraySource(sample.frames, sample.length)
         return plan_stream(
             source,
             operation,
@@ -362,9 +386,8 @@ def _plan_stream(
             continue
         raise PlanError(
             f"{chosen.name} meets the tolerance and is too slow: {slow}; at this rate {each.name} keeps up with a "
-            f"predicted error of {micrometres(each.error)}: ask for {micrometres(limits.margin * each.error)} or more",
+            f"predicted error of {micrometres(each.error)}: ask for {at_least(limits.margin * each.error)} or more",
             trials,
         ) from slow
-    raise PlanError(
-        f"{chosen.name} meets the tolerance and is too slow, as all {len(quicker)} faster ones: {slow}", trials
-    ) from slow
+    others = f", as all {len(quicker)} faster ones" if quicker else ", and no usable readout is faster"
+    raise PlanError(f"{chosen.name} meets the tolerance and is too slow{others}: {slow}", trials) from slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,7 +15,9 @@ from gpuvision.ranging.line import LineReadout
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.validation import finite
 
-_LESS = 0.95  # a smaller gain in time or error is no reason to change a setting. Chosen: the scatter of the timing
+_SMALL_GAIN = (
+    0.95  # a smaller gain in time or error is no reason to change a setting. Chosen: the scatter of the timing
+)
 _LEGEND = "errors of the heights in um; other: scatter that the noise does not explain; - loses too many samples"
 PLAN_FILE = "plan.png"
 """Name of the file that `ScanPlan.write` writes."""
@@ -134,14 +137,14 @@ class ScanPlan:
 
     @property
     def faster(self) -> ReadoutTrial | None:
-        """Most accurate readout that is faster by 5 % or more: what a larger tolerance buys. None if none is."""
-        quicker = [each for each in self._usable() if each.seconds < _LESS * self.chosen.seconds]
+        """Most accurate readout that is faster by 5 % or more: what a larger tolerance allows. None if none is."""
+        quicker = [each for each in self._usable() if each.seconds < _SMALL_GAIN * self.chosen.seconds]
         return min(quicker, key=lambda each: each.error, default=None)
 
     @property
     def finer(self) -> ReadoutTrial | None:
-        """Fastest readout that is more accurate by 5 % or more: what more time buys. None if none is."""
-        finer = [each for each in self._usable() if each.error < _LESS * self.chosen.error]
+        """Fastest readout that is more accurate by 5 % or more: what a longer time allows. None if none is."""
+        finer = [each for each in self._usable() if each.error < _SMALL_GAIN * self.chosen.error]
         return min(finer, key=lambda each: each.seconds, default=None)
 
     def table(self) -> str:
@@ -179,14 +182,15 @@ class ScanPlan:
             f"{self.chosen.name}: predicted error {micrometres(self.chosen.error)} of {micrometres(self.tolerance)}, "
             f"{_millionths(self.chosen.seconds)} us per frame"
         ]
-        if self.faster is not None:
-            parts.append(
-                f"the tolerance binds; {micrometres(self.faster.error)} would allow {self._relative('faster')}"
-            )
-        else:
+        if self.faster is None:
             parts.append("no usable readout is faster")
+        else:
+            wanted = at_least(self.limits.margin * self.faster.error)
+            parts.append(f"a tolerance of {wanted} would allow {self._relative('faster')}")
         if self.finer is not None:
-            parts.append(f"{micrometres(self.finer.error)} takes {self._relative('finer')}")
+            parts.append(f"{at_least(self.limits.margin * self.finer.error)} takes {self._relative('finer')}")
+        if self.rounding is None:
+            parts.append("rounding is not checked, because the device has no doubles")
         if self.stream is not None:
             parts.append(str(self.stream))
         return "; ".join(parts)
@@ -210,7 +214,7 @@ class ScanPlan:
 
 
 def usable_trials(trials: Sequence[ReadoutTrial], limits: ScanPlanLimits) -> list[ReadoutTrial]:
-    """Return the readouts with a predicted error that lose hardly more samples than the best of them."""
+    """Return the readouts with a predicted error that lose at most ``limits.max_lost`` more samples than the best."""
     known = [each for each in trials if each.error > 0.0]
     fewest = min((each.lost for each in known), default=0.0)
     return [each for each in known if each.lost <= fewest + limits.max_lost]
@@ -226,12 +230,13 @@ def readout_table(trials: Sequence[ReadoutTrial], limits: ScanPlanLimits, chosen
         numbers = (each.seconds, each.error, each.random, each.phase, each.systematic, each.unexplained)
         mark = "*" if chosen is not None and _same(each, chosen) else " " if each in usable else "-"
         lines.append(f"{mark} {each.name:<16}{''.join(f'{_millionths(one):>9}' for one in numbers)}{each.lost:8.1%}")
-    return "\n".join(
-        [
-            *lines,
-            _LEGEND,
-        ]
-    )
+    return "\n".join([*lines, _LEGEND])
+
+
+def at_least(length: float) -> str:
+    """Return a length [m] in micrometres, rounded up: a tolerance that the length meets."""
+    step = 10.0 ** (math.floor(math.log10(1e6 * length)) - 2)
+    return f"{math.ceil(1e6 * length / step * (1.0 - 1e-12)) * step:.6g} um"
 
 
 def micrometres(length: float) -> str:

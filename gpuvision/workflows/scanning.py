@@ -61,7 +61,7 @@ def scan(
     device : Device, optional
         Device of the computation; default `Device.best`.
     precision : {"single", "double"}, optional
-        Precision of the arithmetic; default: the precision of the recording.
+        Precision of the arithmetic; default: that of the sensor's readout, and without one that of the recording.
     rate : float, optional
         Replay the recording at this rate [frames/s]; batch and ring size of the stream are planned for it. Default:
         read as fast as the device processes.
@@ -69,7 +69,7 @@ def scan(
         Handling of a frame when the queue is full; default "block" without a rate and "drop_oldest" with one.
     stream_plan : Plan, optional
         Plan of the stream at this rate, such as ``ScanPlan.stream``. Default: a plan by measurements on blank frames,
-        on which ``"ml"`` is faster than on a line.
+        on which ``"ml"`` is faster than on a line. A plan gives the device, too.
     progress : callable, optional
         Called with the number of processed frames and the number of all frames (None if unknown).
     limits : ScanLimits, optional
@@ -89,9 +89,11 @@ def scan(
         The frames do not fit the sensor, or no sample is valid.
     """
     if isinstance(sensor.readout, FocusStack):
-        if rate is not None or policy is not None:
-            raise ValueError("a focus stack is one measurement; rate and policy have no effect on it")
+        if rate is not None or policy is not None or stream_plan is not None:
+            raise ValueError("a focus stack is one measurement; rate, policy and stream_plan have no effect on it")
         return _scan_stack(recording, sensor, sensor.readout, device, precision, progress, limits)
+    if stream_plan is not None:
+        _check_plan(stream_plan, rate, device)
     opened = open_for_scan(recording, sensor)
     source, name, sensor = opened.source, opened.name, opened.sensor
     try:
@@ -125,6 +127,21 @@ def scan(
         limits=limits,
         errors=errors,
     )
+
+
+def _check_plan(plan: Plan, rate: float | None, device: Device | None) -> None:
+    """Check that the plan of a stream is for the rate and the device of a scan.
+
+    Raises
+    ------
+    ValueError
+        It is not.
+    """
+    if rate != plan.rate:
+        asked = "no rate is asked for" if rate is None else f"{rate:g} frames/s are asked for"
+        raise ValueError(f"stream_plan is for {plan.rate:g} frames/s, and {asked}; give both the same rate")
+    if device is not None and device != plan.device:
+        raise ValueError(f"stream_plan is for {plan.device.label}, and {device.label} is asked for; leave out device")
 
 
 def _scan_stack(
@@ -201,7 +218,7 @@ def _encoder(sensor: Sensor) -> dict[str, Any] | None:
     return {"file": str(sensor.encoder.file), "scale": sensor.encoder.scale, **known}
 
 
-def range_readout(sensor: Sensor, precision: Precision) -> LineReadout | PsdReadout:
+def range_readout(sensor: Sensor, precision: Precision = None) -> LineReadout | PsdReadout:
     """Return the sensor's readout with only the outputs that a range image and its errors need.
 
     Parameters
@@ -209,7 +226,7 @@ def range_readout(sensor: Sensor, precision: Precision) -> LineReadout | PsdRead
     sensor : Sensor
         Camera or PSD.
     precision : {"single", "double", None}
-        Precision of the readout.
+        Precision of the readout; None: as the sensor's readout says.
 
     Returns
     -------
@@ -222,6 +239,7 @@ def range_readout(sensor: Sensor, precision: Precision) -> LineReadout | PsdRead
     # Of the line, for the error of its phase.
     shape = ("position", "width", "total") if errors and sensor.kind == "camera" else ()
     outputs = tuple(dict.fromkeys((*positions, light, "status", *shape, *errors)))
+    precision = sensor.readout.precision if precision is None else precision
     return dataclasses.replace(sensor.readout, outputs=outputs, precision=precision)
 
 

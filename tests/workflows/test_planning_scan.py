@@ -18,7 +18,7 @@ from gpuvision.reference.line import pixel_gaussian
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows import planning_scan
 from gpuvision.workflows.planning_scan import plan_scan
-from gpuvision.workflows.scan_plan import PlanError, ReadoutTrial, ScanPlan, ScanPlanLimits, usable_trials
+from gpuvision.workflows.scan_plan import PlanError, ReadoutTrial, ScanPlan, ScanPlanLimits, at_least, usable_trials
 from gpuvision.workflows.scanning import scan
 
 READ_NOISE, GAIN = 1.5, 0.1
@@ -39,7 +39,7 @@ def few_readouts(monkeypatch: pytest.MonkeyPatch) -> None:
         lambda sensor, *_: [dataclasses.replace(sensor.readout, **change) for change in FEW],
     )
     # A busy machine must not change their order.
-    monkeypatch.setattr(planning_scan, "_median_times", lambda calls: [1e-4, 2e-4, 9e-4])
+    monkeypatch.setattr(planning_scan, "_median_times", lambda calls: [1e-4, 2e-4, 9e-4][: len(calls)])
 
 
 def noisy_camera(**changes: Any) -> Sensor:
@@ -93,11 +93,20 @@ def test_the_fastest_readout_within_the_margin_is_chosen(tolerance: float, name:
 
 
 def test_a_refusal_names_a_tolerance_that_is_met() -> None:
-    with pytest.raises(PlanError, match="the most accurate, ml 8, is predicted 4000000 um") as refusal:
-        planning_scan._chosen(TRIALS, 4.0, ScanPlanLimits())
-    wanted = re.search(r"ask for (\d+) um or more", str(refusal.value))
+    trials = [trial("ml", 8.0, error) for error in (7.2218e-6, 8e-6)]
+    with pytest.raises(PlanError, match=r"the most accurate, ml 8, is predicted 7\.22 um") as refusal:
+        planning_scan._chosen(trials, 7.94e-6, ScanPlanLimits())
+    wanted = re.search(r"ask for ([\d.]+) um or more", str(refusal.value))
     assert wanted is not None
-    assert float(wanted[1]) * 1e-6 == pytest.approx(4.4)
+    assert wanted[1] == "7.95"  # 7.944 rounded up
+    assert planning_scan._chosen(trials, 1e-6 * float(wanted[1]), ScanPlanLimits()) == trials[0]
+
+
+@pytest.mark.parametrize(
+    ("length", "text"), [(7.944e-6, "7.95 um"), (4.4e-6, "4.4 um"), (1.2341e-3, "1240 um"), (9.999e-9, "0.01 um")]
+)
+def test_lengths_are_rounded_up(length: float, text: str) -> None:
+    assert at_least(length) == text
 
 
 def test_readouts_that_lose_samples_or_have_no_error_are_not_chosen() -> None:
@@ -114,8 +123,9 @@ def test_the_plan_says_what_a_little_more_buys() -> None:
     assert plan.faster == TRIALS[0]
     assert plan.finer == TRIALS[3]
     assert str(plan) == (
-        "windowed 8: predicted error 5000000 um of 6000000 um, 2000000 us per frame; the tolerance binds; 9000000 um "
-        "would allow fir 4 at 0.5 times the time; 4000000 um takes ml 8 at 4 times the time"
+        "windowed 8: predicted error 5000000 um of 6000000 um, 2000000 us per frame; a tolerance of 9.9e+06 um "
+        "would allow fir 4 at 0.5 times the time; 4.4e+06 um takes ml 8 at 4 times the time; rounding is not checked, "
+        "because the device has no doubles"
     )
     near = (trial("fir", 1.92, 5.1), trial("windowed", 2.0, 5.0), trial("ml", 8.0, 4.8))
     plan = plan_of(near[1], near)
@@ -125,7 +135,7 @@ def test_the_plan_says_what_a_little_more_buys() -> None:
     report = plan_of(TRIALS[1]).to_dict()
     assert report["chosen"]["readout"] == "windowed 8"
     assert [each["error"] for each in report["trials"]] == [9.0, 5.0, 7.0, 4.0]
-    assert report["faster"]["readout"], report["finer"]["readout"] == ("fir 4", "ml 8")
+    assert (report["faster"]["readout"], report["finer"]["readout"]) == ("fir 4", "ml 8")
 
 
 @pytest.mark.parametrize(
@@ -147,10 +157,13 @@ def test_windows_hold_the_line(half: float, windows: list[int]) -> None:
 
 
 def test_scatter_beyond_the_texture_of_the_surface_is_an_error() -> None:
-    trials = [trial("fir", 1.0, 9.0), trial("windowed", 2.0, 4.0), trial("ml", 3.0, 5.0)]
-    texture, noisy = 3.0, 5.0  # all scatter by 3 more than their noise explains, one by 5
-    seen = [each._replace(unexplained=one) for each, one in zip(trials, (texture, noisy, texture), strict=True)]
-    assert [each.error for each in planning_scan._with_unexplained(seen)] == [9.0, math.hypot(4.0, 4.0), 5.0]
+    """The readouts with little noise scatter by 3 more than it explains, one by 5; others do not tell the texture."""
+    trials = [trial("fir", 1.0, 4.5), trial("windowed", 2.0, 4.0), trial("ml", 3.0, 4.0)]
+    trials += [trial("gauss3", 1.0, 30.0), trial("centroid", 1.0, 4.0, lost=0.9)]
+    unexplained = (3.0, 5.0, 3.0, 0.0, 0.0)
+    seen = [each._replace(unexplained=one) for each, one in zip(trials, unexplained, strict=True)]
+    found = planning_scan._with_unexplained(seen, ScanPlanLimits())
+    assert [each.error for each in found] == [4.5, math.hypot(4.0, 4.0), 4.0, 30.0, 4.0]
 
 
 def test_the_scatter_is_the_noise_of_a_curved_surface(rng: np.random.Generator) -> None:
@@ -224,6 +237,9 @@ def test_rounding_beyond_the_tolerance_takes_double_precision(device: Device, rn
     assert rounding == plan.rounding
     assert chosen.readout.precision == "double"
     assert chosen.name.endswith(" double")
+    assert chosen.seconds > 0.0
+    double = dataclasses.replace(sensor, readout=chosen.readout)
+    assert to_numpy(scan(frames, double, device=device).points.z).dtype == np.float64
     chosen, _ = planning_scan._with_precision(plan.chosen, sensor, sample, device, plan.chosen.error + rounding)
     assert chosen.readout.precision is None
 
@@ -235,8 +251,13 @@ def test_a_rate_gives_the_plan_of_its_stream(device: Device, rng: np.random.Gene
     assert plan.stream is not None
     assert plan.stream.rate == 10.0
     assert plan.stream.batch == 1
-    done = scan(frames, plan.sensor, device=device, rate=1000.0, stream_plan=plan.stream, policy="block")
+    assert plan.stream.ring == 7  # for 5 frames of a stall of 0.5 s, the source and the consumer
+    done = scan(frames, plan.sensor, device=device, rate=10.0, stream_plan=plan.stream, policy="block")
     assert len(done.frame_numbers) == len(frames)
+    with pytest.raises(ValueError, match="stream_plan is for 10 frames/s, and no rate is asked for"):
+        scan(frames, plan.sensor, stream_plan=plan.stream)
+    with pytest.raises(ValueError, match="stream_plan is for 10 frames/s, and 20 frames/s are asked for"):
+        scan(frames, plan.sensor, rate=20.0, stream_plan=plan.stream)
 
 
 @pytest.mark.slow

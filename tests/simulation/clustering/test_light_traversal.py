@@ -183,6 +183,7 @@ def test_triangles_that_may_occlude(device: Device, variant: Any) -> None:
     assert sum(each.tests == 0 for each in expected) >= 1
 
 
+@pytest.mark.double
 @pytest.mark.slow
 def test_clusters_switched_off(device: Device) -> None:
     assert not any(each.tallies[1] for each in compare(device, "vector", without_clusters))

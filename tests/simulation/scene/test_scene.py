@@ -118,6 +118,7 @@ def test_the_same_points_have_the_same_number(rng: np.random.Generator) -> None:
     assert len(np.unique(numbers)) == len(first)
 
 
+@pytest.mark.double
 @pytest.mark.slow
 def test_a_million_triangles(device: Device, rng: np.random.Generator) -> None:
     """A sphere of 1.3 million: each triangle is in the tree once, flipped ones are found, rays hit the sphere."""

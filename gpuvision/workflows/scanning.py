@@ -199,12 +199,20 @@ def _metadata(name: str, sensor: Sensor, rate: float | None, source: Source) -> 
         "kind": sensor.kind,
         "background": str(sensor.recording.background),
         "threshold": None if isinstance(sensor.readout, PsdReadout) else sensor.readout.threshold,
+        "readout": _line_settings(sensor.readout),
         "sensor_rate": sensor.recording.rate,
         "rate": rate,
         "encoder": _encoder(sensor),
         "damaged_frames": sorted(source.damaged_frames()),
         "late": source.late * 1e-9 if isinstance(source, PacedSource) else None,
     }
+
+
+def _line_settings(readout: LineReadout | PsdReadout | FocusStack) -> dict[str, Any] | None:
+    """Return method, window, filter length and precision of a line readout, which ``--tolerance`` chooses."""
+    if not isinstance(readout, LineReadout):
+        return None
+    return {name: getattr(readout, name) for name in ("method", "window", "fir_length", "precision")}
 
 
 def _encoder(sensor: Sensor) -> dict[str, Any] | None:

@@ -52,8 +52,10 @@ def test_a_plan_is_printed_drawn_and_reported(folder: Path) -> None:
 
 def test_a_tolerance_scans_with_the_chosen_readout(folder: Path) -> None:
     text = run("--tolerance", "1mm")
-    assert text.startswith("plan: ")
-    assert (folder / "out" / "range_image.ply").exists()
+    report = json.loads((folder / "out" / "report.json").read_text())
+    chosen = report["readout"]
+    assert text.startswith(f"plan: {chosen['method']} {chosen['window']}: predicted error")
+    assert chosen == {"method": "windowed", "window": 4, "fir_length": 4, "precision": None}
 
 
 def test_a_plan_without_a_tolerance_and_options_without_effect_are_refused(folder: Path) -> None:

@@ -1,8 +1,8 @@
-// Bounding volume hierarchy (BVH): nodes with 16 children, leaves with 16 triangles; rays are traced one after the
-// other.
+// Bounding volume hierarchy (BVH): nodes with 16 children and leaves with 16 triangles, or four of each (FOUR_WIDE); rays
+// are traced one after the other.
 //
-// One ray is tested against 16 boxes or 16 triangles at once; the 16 are a vector in the vector variant, else a loop. No
-// work is shared between rays, so bvh_closest costs the same for unrelated and for neighbouring rays. bvh_any costs less
+// One ray is tested against all boxes of a node or all triangles of a leaf. 16 are a vector in the vector variant, a loop
+// in the work-item variant; four are a vector. No work is shared between rays, so bvh_closest costs the same for unrelated and for neighbouring rays. bvh_any costs less
 // for neighbouring rays: a ray first tests the leaf that occluded the ray before it (bvh_occluder).
 // gpuvision/simulation/scene/bvh.py builds the tree.
 //

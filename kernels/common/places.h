@@ -41,7 +41,8 @@ INLINE places places_times(places a, places b) { return two_times(a, b); }
 INLINE places places_dot(places x, places a, places y, places b, places z, places c) {
     return two_dot_plus(x, a, y, b, z, c, convert_places((reals)0));
 }
-// 1 / sqrt(v), relative error 2^-43: one Newton step from single precision.
+// 1 / sqrt(v), relative error 2^-40: one Newton step from single precision. OpenCL allows 3 ulp for the square root and 2.5
+// ulp for the division: y is wrong by e < 5.5 * 2^-23, and a step leaves 3/2 e^2 and a rounding of e, below 2^-40 together.
 INLINE places place_per_root(places v) {
     const reals y = (reals)1 / sqrt(v.high);
     const two_floats product = two_times(v, two_product(y, y));

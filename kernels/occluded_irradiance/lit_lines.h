@@ -1,7 +1,7 @@
 // Lit segments in structure-of-arrays form, grouped by the line on which they lie.
 //
-// For the vector variant. Segments on one line, such as the segments of a sheet of light on a board between its parts, share one visibility
-// traversal.
+// For the vector variant. Segments on one line, such as the segments of a sheet of light on a board between its parts,
+// share one visibility traversal.
 #ifndef LIT_LINES_H
 #define LIT_LINES_H
 #include "common/places.h"
@@ -33,7 +33,7 @@ typedef struct {
 } chunk;
 
 // Load the frames of LANES segments from `first` on, by their indices; repeat the last one to fill the lanes.
-static void load_frames(global const INPUT *rows, const uint *numbers, uint count, uint first, constant place *middle,
+static inline void load_frames(global const INPUT *rows, const uint *numbers, uint count, uint first, constant place *middle,
                  chunk *all) {
     place at[10][LANES];
     for (uint lane = 0; lane < LANES; lane++) {
@@ -73,7 +73,7 @@ static inline reals change_of(const place *component, uint first, int one) {
 }
 
 // Set of segments that lie on the line of segment `one`, have its direction, and emit on the same side.
-static uint on_line_of(const frames *each, int one, uint last) {
+static inline uint on_line_of(const frames *each, int one, uint last) {
     const place x = each->x[one], y = each->y[one], z = each->z[one];
     const place ux = each->along_x[one], uy = each->along_y[one], uz = each->along_z[one];
     const real slack = LINE_SLACK * (real)(fabs(x) + fabs(y) + fabs(z) + each->length[one]);
@@ -97,7 +97,7 @@ static uint on_line_of(const frames *each, int one, uint last) {
 }
 
 // Append the line from the first to the last of its member segments.
-static void add_line(chunk *all, uint members) {
+static inline void add_line(chunk *all, uint members) {
     const frames *each = &all->each;
     const int one = lowest_bit(members), n = all->line_count++;
     const place ux = each->along_x[one], uy = each->along_y[one], uz = each->along_z[one];
@@ -121,7 +121,7 @@ static void add_line(chunk *all, uint members) {
     all->members[n] = members;
 }
 
-static void load_chunk(global const INPUT *rows, const uint *numbers, uint count, constant place *middle, chunk *all) {
+static inline void load_chunk(global const INPUT *rows, const uint *numbers, uint count, constant place *middle, chunk *all) {
     all->lit = 0, all->line_count = 0, all->is_good = 1;
     for (uint first = 0; first < count; first += LANES) load_frames(rows, numbers, count, first, middle, all);
     for (uint left = all->lit; left;) {
@@ -135,7 +135,7 @@ static void load_chunk(global const INPUT *rows, const uint *numbers, uint count
 
 #ifdef SELECTED
 // Load picked segments from pick `next` on; return the next pick.
-static int load_selected(global const INPUT *rows, global const int *selected, int next, int end, uint segment_count,
+static inline int load_selected(global const INPUT *rows, global const int *selected, int next, int end, uint segment_count,
                 constant place *middle, chunk *all, uchar *flag) {
     uint numbers[SEGMENTS], count = 0;
     all->unseen = 0;
@@ -153,7 +153,7 @@ static int load_selected(global const INPUT *rows, global const int *selected, i
     return next;
 }
 #else
-static void load_from(global const INPUT *rows, int first, int end, constant place *middle, chunk *all) {
+static inline void load_from(global const INPUT *rows, int first, int end, constant place *middle, chunk *all) {
     uint numbers[SEGMENTS];
     const uint count = (uint)min(SEGMENTS, end - first);
     for (uint n = 0; n < count; n++) numbers[n] = (uint)first + n;

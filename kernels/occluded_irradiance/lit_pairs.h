@@ -13,8 +13,9 @@
 // Most pairs do not face each other. With one item for each receiver, the items of a warp would wait for the item that has
 // most facing segments, and each item would compute the frames of all segments.
 //
-// Positions are `places` (common/places.h): doubles, or two floats. With two floats, frames are exact to 2^-42 and the
-// heights of receivers above segments to 2^-42 of their distance, as in line_irradiance.cl.
+// Positions are `places` (common/places.h): doubles, or two floats. With two floats, the directions of frames are exact to
+// 2^-42, the lengths of their axes to 2^-40 (place_per_root), and the heights of receivers above segments to 2^-42 of their
+// distance, as in line_irradiance.cl, and to 2^-40 of the height.
 //
 // Local memory in single precision: 16 KiB hidden intervals, 6.5 KiB frames, 4 KiB list, and 2 KiB more, of the 32 KiB that
 // every device has. In double precision the hidden intervals stay in private memory.
@@ -34,8 +35,8 @@
 #define SHARE (TILE / SUMMERS)     // segments that each of them adds up
 #define FRAME 13                   // numbers of a frame
 
-// Counts of a tile in one word, so that one prefix sum serves all: pairs, segments that are not finite, picks that are
-// no segment.
+// Counts of a tile in one word, so that one prefix sum serves all: pairs, segments with NaN or infinity, picks whose
+// index is out of range.
 #define ONE_BAD (1u << 11)
 #define ONE_BEYOND (1u << 18)
 #define PAIRS_OF(counts) ((counts) & (ONE_BAD - 1))
@@ -110,41 +111,45 @@ static inline void add_seen(const hidden *dark, real start, real stop, receiving
 
 // ---- segments --------------------------------------------------------------------------------------------------------
 
-// Normal of any length. Two floats: scaled by a power of two to a length of about 1, so that squares neither overflow nor
-// underflow.
-INLINE void load_normal(global const INPUT *row, places *normal) {
-#ifdef TWO_FLOAT_POSITIONS
-    const bits most = as_bits(fmax(fmax(fabs(row[0]), fabs(row[1])), fabs(row[2])));
-    const real per = as_real((254 << 23) - min(most & EXPONENT_BITS, 253 << 23));
-    for (int k = 0; k < 3; k++) normal[k] = place_of_number(row[k] * per);
+// Scale a vector by a power of two to a length of about 1, so that squares neither overflow nor underflow; return the
+// reciprocal of the power. Doubles have the exponents for any vector of floats, and stay as they are.
+static inline real scale_to_one(places *vector) {
+#ifdef DOUBLE_POSITIONS
+    return 1;
 #else
-    for (int k = 0; k < 3; k++) normal[k] = place_of_number(row[k]);
+    const real most = fmax(fmax(fabs(real_of(vector[0])), fabs(real_of(vector[1]))), fabs(real_of(vector[2])));
+    const bits exponent = min(as_bits(most) & EXPONENT_BITS, 253 << 23);
+    const places scale = convert_places(as_real((254 << 23) - exponent));
+    for (int k = 0; k < 3; k++) vector[k] = places_times(vector[k], scale);
+    return as_real(exponent);
 #endif
 }
 
 // Frame of a segment. Returns whether it emits; `is_bad`: a number is not finite, or it emits without a normal.
-static int frame_of(global const INPUT *row, constant place *middle, segment_frame *of, real *exitance, int *is_bad) {
+static inline int frame_of(global const INPUT *row, constant place *middle, segment_frame *of, real *exitance, int *is_bad) {
     of->x = place_minus(row[0], middle[0]), of->y = place_minus(row[1], middle[1]);
     of->z = place_minus(row[2], middle[2]);
     places u[3], n[3];
     for (int k = 0; k < 3; k++) u[k] = places_minus(place_of_number(row[k + 3]), place_of_number(row[k]));
-    load_normal(row + 6, n);
+    for (int k = 0; k < 3; k++) n[k] = place_of_number(row[k + 6]);
+    scale_to_one(n);
+    const real unit = scale_to_one(u);
     const places square = places_dot(u[0], u[0], u[1], u[1], u[2], u[2]);
     const places lean = places_dot(u[0], n[0], u[1], n[1], u[2], n[2]);
     for (int k = 0; k < 3; k++) n[k] = places_minus(places_times(square, n[k]), places_times(lean, u[k]));
     const real size = fabs(real_of(n[0])) + fabs(real_of(n[1])) + fabs(real_of(n[2]));
     *exitance = (real)((wide_number)row[9] * (wide_number)0.15915494309189533577);
-    const int emits = *exitance > 0 && real_of(square) > 0;
+    const places per = place_per_root(square);
+    of->length = places_times(places_times(square, per), convert_places(unit));
+    const int emits = *exitance > 0 && real_of(square) > 0 && real_of(of->length) > 0;
     *is_bad = not_finite(real_of(of->x) + real_of(of->y) + real_of(of->z)) | not_finite(real_of(square) + size) |
               not_finite(*exitance) | (emits && size == 0);
-    const places per = place_per_root(square);
     const places per_size = place_per_root(places_dot(n[0], n[0], n[1], n[1], n[2], n[2]));
     of->ux = places_times(u[0], per), of->uy = places_times(u[1], per), of->uz = places_times(u[2], per);
     of->ex = places_times(n[0], per_size), of->ey = places_times(n[1], per_size), of->ez = places_times(n[2], per_size);
     of->wx = places_minus(places_times(of->uy, of->ez), places_times(of->uz, of->ey));
     of->wy = places_minus(places_times(of->uz, of->ex), places_times(of->ux, of->ez));
     of->wz = places_minus(places_times(of->ux, of->ey), places_times(of->uy, of->ex));
-    of->length = places_times(square, per);
     return emits && !*is_bad;
 }
 
@@ -213,7 +218,7 @@ static inline int face(const group_receiver *here, const segment_frame *of, plac
 
 // (1) Store the frame of this item's segment; return the set of receivers that face it. A negative pick ~k is segment k,
 // which no surface can hide.
-static uint facing_receivers(global const INPUT *segments, int pick, uint segment_count, constant place *middle,
+static inline uint facing_receivers(global const INPUT *segments, int pick, uint segment_count, constant place *middle,
                              uint receivers, local pair_memory *memory, uint *wrong) {
     const uint item = get_local_id(0), number = pick < 0 ? ~pick : pick;
     *wrong = 0;
@@ -258,13 +263,13 @@ INLINE void list_pairs(uint facing, uint first, local pair_memory *memory) {
 }
 
 // (3) Light of a pair, with the sign bit set where the visible parts are incomplete.
-static real light_of(uint pair, const bvh_tree *tree, real clearance, uint samples, int *hint,
+static inline real light_of(uint pair, const bvh_tree *tree, real clearance, uint samples, int *hint,
                      local pair_memory *memory) {
     const uint segment = pair / BLOCK;
     const segment_frame frame = load_frame(memory->frames + segment);
     const group_receiver here = receiver_at(memory, pair % BLOCK);
     placement from;
-    face(&here, &frame, &from);
+    if (!face(&here, &frame, &from)) return 0;
     const real length = real_of(frame.length);
     receiving seen = {&from, length, convert_places(0)};
     int is_whole = 1;

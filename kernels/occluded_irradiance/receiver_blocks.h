@@ -32,7 +32,7 @@ typedef struct {
 } pieces;
 
 // Evaluate the closed form of the waiting parts; unused lanes have height 0, which gives 0.
-static __attribute__((noinline)) void finish(pieces *waiting, place *sums) {
+static inline __attribute__((noinline)) void finish(pieces *waiting, place *sums) {
     for (int n = waiting->count; n < LANES; n++) waiting->height[n] = 0;
     const reals factor = LANED(line_factor)(load_private(waiting->along), load_private(waiting->height),
                                             load_private(waiting->aside), load_private(waiting->past),
@@ -45,7 +45,7 @@ static __attribute__((noinline)) void finish(pieces *waiting, place *sums) {
 }
 
 // Append the part of segment k from fraction `start` to `stop`, which is visible from the receiver of a lane.
-static __attribute__((noinline)) void add_piece(const chunk *lit, int k, const facing *all, int lane, real start, real stop,
+static inline __attribute__((noinline)) void add_piece(const chunk *lit, int k, const facing *all, int lane, real start, real stop,
                                          pieces *waiting, place *sums) {
     if (!(start < stop)) return;
     const int n = waiting->count++;
@@ -75,7 +75,7 @@ typedef struct {
 
 #ifdef INTERVALS
 // Append the visible parts of segment k: the part of the line from `from` to `to` without the sorted hidden intervals.
-static void add_segment(const hidden *dark, real from, real to, int k, receiving *seen) {
+static inline void add_segment(const hidden *dark, real from, real to, int k, receiving *seen) {
     const chunk *lit = seen->lit;
     const facing *own = seen->all->own + k;
     const real begin = lit->begin[k], end = lit->end[k], per = (real)1 / (end - begin), stop = fmin(to, end);
@@ -89,7 +89,7 @@ static void add_segment(const hidden *dark, real from, real to, int k, receiving
 }
 
 // Append the visible parts of all segments of the line that the receiver faces.
-static void add_seen(const hidden *dark, real from, real to, receiving *seen) {
+static inline void add_seen(const hidden *dark, real from, real to, receiving *seen) {
     for (uint left = seen->lit->members[seen->line]; left; left &= left - 1) {
         const int k = lowest_bit(left);
         if (seen->all->lanes[k] >> seen->lane & 1) add_segment(dark, from, to, k, seen);
@@ -98,7 +98,7 @@ static void add_seen(const hidden *dark, real from, real to, receiving *seen) {
 #endif
 
 #ifdef RAYS
-static void add_part(real start, real stop, receiving *seen) {
+static inline void add_part(real start, real stop, receiving *seen) {
     const int k = seen->segment;
     add_piece(seen->lit, k, seen->all->own + k, seen->lane, start, stop, seen->waiting, seen->sums);
 }
@@ -116,7 +116,7 @@ typedef struct {
 } block;
 
 // Load a block; repeat the last receiver to fill the lanes.
-static void load_block(global const INPUT *receivers, constant place *middle, uint count, block *here) {
+static inline void load_block(global const INPUT *receivers, constant place *middle, uint count, block *here) {
     here->count = count;
     for (int lane = 0; lane < LANES; lane++) {
         global const INPUT *row = receivers + 6 * min((uint)lane, count - 1);
@@ -137,7 +137,7 @@ static void load_block(global const INPUT *receivers, constant place *middle, ui
 }
 
 // Lanes whose receiver and a segment face each other; if any, the receivers' coordinates in the segment's frame.
-static uint face(const block *here, const frames *of, int n, facing *all) {
+static inline uint face(const block *here, const frames *of, int n, facing *all) {
     const places dx = load_places(here->wide[0]) - of->x[n], dy = load_places(here->wide[1]) - of->y[n];
     const places dz = load_places(here->wide[2]) - of->z[n];
     const reals zero = (reals)0, height = convert_to_reals(dx * of->off_x[n] + dy * of->off_y[n] + dz * of->off_z[n]);
@@ -179,7 +179,7 @@ static inline observer observer_of(const block *here, int lane) {
 }
 
 // Append the visible parts of a line that the receiver of a lane faces.
-static void add_light(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, real clearance,
+static inline void add_light(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, real clearance,
                       uint samples, int *hint, block *here, pieces *waiting) {
     const uint members = lit->members[line];
 #if defined(INTERVALS)
@@ -213,7 +213,7 @@ static void add_light(const bvh_tree *tree, const chunk *lit, int line, const be
 }
 
 // Append the visible parts of a line for all receivers of a block.
-static void light_block(const bvh_tree *tree, const chunk *lit, int line, real clearance, uint samples, int *hint, block *here,
+static inline void light_block(const bvh_tree *tree, const chunk *lit, int line, real clearance, uint samples, int *hint, block *here,
                  pieces *waiting) {
     before all;
     uint lanes = face(here, &lit->lines, line, &all.whole);
@@ -231,7 +231,7 @@ static void light_block(const bvh_tree *tree, const chunk *lit, int line, real c
 static inline int has_no_number(place value) { return not_finite((real)value); }
 
 // Store the result of a receiver; return its contribution to the currents per unit of weight.
-static place result_of(const block *here, int lane, uchar flag, global real *irradiance, global uchar *status) {
+static inline place result_of(const block *here, int lane, uchar flag, global real *irradiance, global uchar *status) {
     int is_bad = 0;
     for (int k = 0; k < 6; k++) is_bad |= not_finite(here->at[k][lane]) && !(k >= 3 && here->is_none[lane]);
     const uchar wrong = flag | (is_bad || has_no_number(here->sums[lane]) ? STATUS_NOT_FINITE : 0);
@@ -243,7 +243,7 @@ static place result_of(const block *here, int lane, uchar flag, global real *irr
 }
 
 // Store the results of a block and add them to the currents.
-static void store_block(const block *here, uchar flag, global real *irradiance, global uchar *status,
+static inline void store_block(const block *here, uchar flag, global real *irradiance, global uchar *status,
                  global const INPUT *weights, place *to_left, place *to_right) {
     for (uint lane = 0; lane < here->count; lane++) {
         const place light = result_of(here, lane, flag, irradiance + lane, status + lane);
@@ -253,7 +253,7 @@ static void store_block(const block *here, uchar flag, global real *irradiance, 
 }
 
 // Add the light of a chunk of segments to a block of receivers.
-static void light_chunk(const bvh_tree *tree, const chunk *lit, real clearance, uint samples, int *hint, block *here,
+static inline void light_chunk(const bvh_tree *tree, const chunk *lit, real clearance, uint samples, int *hint, block *here,
                         pieces *waiting, uchar *flag) {
     if (!lit->is_good) *flag |= STATUS_NOT_FINITE;
     for (int line = 0; line < lit->line_count; line++)

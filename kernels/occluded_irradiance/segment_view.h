@@ -24,7 +24,7 @@ typedef struct {
 
 #ifdef INTERVALS
 // View of a segment from a receiver.
-static view view_from(const segment_axes *of, const placement *from, const observer *at, real clearance) {
+static inline view view_from(const segment_axes *of, const placement *from, const observer *at, real clearance) {
     view v;
     const real height = from->height, aside = from->aside, along = from->along;
     const real toward = from->toward, most = fmax(toward, from->toward_end);

@@ -9,7 +9,7 @@
 #ifdef INTERVALS
 // Pass the visible parts to add_seen. Returns 0 if the hidden intervals exceed the capacity even in the smallest window:
 // the result is then incomplete (AMBIGUOUS).
-static int add_visible(const bvh_tree *tree, const placement *from, view *v, int *hint, hidden *dark, receiving *to) {
+static inline int add_visible(const bvh_tree *tree, const placement *from, view *v, int *hint, hidden *dark, receiving *to) {
     // Part above the receiver's plane, widened by rounding; the closed form cuts it exactly.
     const real toward = from->toward, toward_end = from->toward_end;
     const real slack = (real)8 * (real)REAL_EPSILON, horizon = toward / (toward - toward_end);
@@ -36,7 +36,7 @@ static int add_visible(const bvh_tree *tree, const placement *from, view *v, int
 
 #ifdef RAYS
 // Pass the visible parts to add_part: one ray from the receiver to the middle of each of `samples` parts.
-static void add_sampled(const bvh_tree *tree, const segment_axes *of, const placement *from, const observer *at,
+static inline void add_sampled(const bvh_tree *tree, const segment_axes *of, const placement *from, const observer *at,
                         real clearance, uint samples, receiving *to) {
     const real over = fmin(clearance, CLEARANCE_SHARE * from->height);
     const real lift = fmin(clearance, CLEARANCE_SHARE * fmax(from->toward, from->toward_end));

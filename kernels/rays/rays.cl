@@ -3,8 +3,8 @@
 // Inputs:  rays (count, 6), closest_hit: origin [m] and direction of any length; any_hit: both ends of a segment [m].
 // Outputs: closest_hit: triangle (count,) index or -1, distance (count,) [m], barycentric (count, 2), status (count,);
 //          any_hit: occluded (count,) 0 or 1, status (count,).
-// Options: ANY_HIT (any_hit), INPUT, REAL_IS_DOUBLE, BVH_DEPTH, FOUR_WIDE (common/bvh.h); DOUBLE_POSITIONS or, in the work-item variant with INPUT
-//          float, TWO_FLOAT_POSITIONS (common/places.h).
+// Options: ANY_HIT (any_hit), INPUT, REAL_IS_DOUBLE, BVH_DEPTH, FOUR_WIDE (common/bvh.h); DOUBLE_POSITIONS or, in the
+//          work-item variant with INPUT float, TWO_FLOAT_POSITIONS (common/places.h).
 // Variants: vector: a strip of `each` rays per work-item, each ray against 16 boxes at once; work-item: a ray per item,
 //          against the four boxes of a node at once (FOUR_WIDE).
 //

@@ -60,9 +60,10 @@ void undistort(global const CODE *image, global CODE *made, global uchar *status
 #define SAMPLES 1
 #endif
 
-// SAMPLES neighbouring samples of a row per work-item. One sample: a warp so reads adjacent samples for each tap, where
-// with a pixel of three channels for each work-item it would read every third one. Source positions from the camera model
-// cost more than requests: a work-item computes a whole pixel.
+// SAMPLES neighbouring samples of a row per work-item. With one sample per work-item, a warp reads adjacent samples for each
+// tap; with a pixel of three channels per work-item it would read every third one. Source positions from the camera model
+// cost more than requests: without QUAD, a work-item computes a whole pixel. With QUAD and three channels, it computes the
+// positions of the two pixels to which its four samples belong: 1.5 times as many positions as pixels.
 kernel void undistort(global const CODE *image, global CODE *made, global uchar *status, global const int4 *heads,
                       global const float8 *curves, global const float2 *points, constant real *model,
                       constant int *size, const float fill) {

@@ -3,8 +3,9 @@
 // pixels of three interleaved channels.
 //
 // A lens is smooth: the taps of a quad lie in a few neighbouring samples of two rows, or of three rows where the source
-// row changes within the quad. Aligned loads of four samples hold the taps of a row, and shifts select them. A warp so
-// reads 128 neighbouring samples with 4 to 8 requests instead of 64, each of adjacent memory, and stores them with one.
+// row changes within the quad. Aligned loads of four samples hold the taps of a row, and shifts select them. In
+// this way a warp reads 128 neighbouring samples with 4 to 8 requests instead of 64, each of adjacent memory, and stores
+// them with one.
 // The later loads and the third row are read by the work-items that need them. Quads whose taps do not fit the windows, or
 // lie beyond the border, are computed sample by sample.
 #ifndef UNDISTORT_IMAGE_QUAD_H

@@ -1,4 +1,6 @@
-"""Bounding volume hierarchy (BVH) over triangles with 16 children per node, built with NumPy, traversed on devices.
+"""Bounding volume hierarchy (BVH) over triangles, built with NumPy, traversed on devices.
+
+Nodes have up to 16 children and leaves up to 16 triangles for CPU runtimes, four of each for rays on GPUs.
 
 References
 ----------
@@ -16,11 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import capacity
+from gpuvision.validation import integer
 
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Children of a node and triangles of a leaf: lanes of the kernels' vectors, and numbers of a load of a GPU (16 bytes).
+# Children of a node and triangles of a leaf: WIDTH is the number of lanes of the kernels' vectors. GPU_WIDTH is the
+# number of floats that a work-item of a GPU loads at once (16 bytes).
 WIDTH = 16
 GPU_WIDTH = 4
 # Bins of the surface-area heuristic. Scenes of up to _FEW_TRIANGLES are split triangle by triangle with the finer bins:
@@ -32,6 +36,8 @@ MIN_STACK_SIZE = 8
 _MAX_HEURISTIC_DEPTH = 48
 # Boxes grow by this many roundings of the largest coordinate: the conversion to the real type moves their corners.
 _BOX_PADDING_ULPS = 4.0
+# Most triangles of a bundle (`_bundles` pairs them twice). A bundle is not split: a leaf must have room for one.
+_MAX_BUNDLE = 4
 # Neighbours are bundled if their common box has at most this fraction of the area of their boxes together.
 _MAX_BUNDLE_AREA = 0.8
 # Shifts and masks that insert two zero bits between the bits of a 16-bit number (Morton code).
@@ -85,12 +91,12 @@ class Bvh:
         wanted
             bool (n,), triangles that belong to the tree; None: all.
         width
-            Most children of a node and triangles of a leaf.
+            Most children of a node and triangles of a leaf, 4 or more, because up to four triangles are bundled.
 
         Raises
         ------
         ValueError
-            The corners have another shape.
+            The corners have another shape, or `width` is less than 4.
 
         Notes
         -----
@@ -104,6 +110,7 @@ class Bvh:
         """
         if corners.ndim != 3 or corners.shape[1:] != (3, 3):
             raise ValueError(f"Bvh.build takes triangles (n, 3, 3), got shape {corners.shape}")
+        integer(width, "Bvh.build: width", minimum=_MAX_BUNDLE)
         numbers = np.arange(len(corners)) if wanted is None else np.flatnonzero(wanted)
         if not len(numbers):
             return cls._empty(width)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,23 @@ def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
     assert np.all(ours.cut.bound <= tolerance)
     if tolerance == 0.0:
         np.testing.assert_allclose(ours.irradiance, exact, rtol=2e-5, atol=1e-6 * exact.max())
+
+
+def test_a_device_without_doubles_takes_receivers_in_double(device: Device) -> None:
+    single = copy.copy(device)
+    single.has_double = single.has_fast_double = False
+    triangles, segments = boxes(np.random.default_rng(0), 12)
+    receivers = strips(triangles, 6, 50)
+    weights = np.full((6, 50, 2), 1e-4)
+    reading = StripErrorModel(power=np.full(6, 0.01), moment=np.zeros(6), slope=np.ones(6), limits=(-0.03, 0.03))
+    scene = Scene(triangles)
+    light = ClusteredIrradiance(scene=scene, tolerance=0.0, min_facing_pairs=None, device=single)
+    assert receivers.dtype == np.float64
+    result = light(segments, receivers, weights, reading)
+    assert result.cut.has_pairs
+    every = light.compute_all(segments, receivers)
+    np.testing.assert_allclose(result.irradiance, every, rtol=2e-5, atol=1e-6 * every.max())
+    assert every.max() > 0.0
 
 
 @pytest.mark.double

@@ -97,3 +97,9 @@ def test_a_tree_without_triangles_is_empty() -> None:
 def test_triangles_of_another_shape() -> None:
     with pytest.raises(ValueError, match=r"\(n, 3, 3\)"):
         Bvh.build(np.zeros((4, 3)))
+
+
+@pytest.mark.parametrize("width", [3, 0, 4.5])
+def test_a_node_has_room_for_a_bundle(width: int) -> None:
+    with pytest.raises((TypeError, ValueError), match=r"Bvh\.build: width"):
+        Bvh.build(np.zeros((10, 3, 3)), width=width)

@@ -384,6 +384,40 @@ def test_positions_with_slow_doubles(device: Device, exponent: int, rng: np.rand
     assert np.all(error <= (2e-6 + 2.0**-41 * (1.0 + reach)) * most), f"{np.max(error / most)} of the whole light"
 
 
+def test_light_of_short_segments_with_slow_doubles(device: Device) -> None:
+    """The light of a segment of 1e-12 m is 2^-28 of the light of a segment of 2^-12 m: no square underflows."""
+    receivers = np.zeros((1, 4, 6), np.float32)
+    receivers[0, :, 2], receivers[0, :, 5] = (0.25, 0.5, 0.75, 1.0), -1.0
+    slow = without_fast_doubles(device)
+    lights = []
+    for length in (2.0**-12, 2.0**-40):
+        row = FLOOR * np.where(np.arange(10) < 6, length, 1.0)
+        result = light_of(NO_TRIANGLES, receivers, row[None], slow, variant="work_item", visibility="none")
+        assert not result.status.any()
+        lights.append(result.irradiance / np.float32(length))
+    np.testing.assert_allclose(lights[1], lights[0], rtol=5e-6)
+    assert lights[0].min() > 0.1
+
+
+@pytest.mark.parametrize("variant", ["vector", "work_item"])
+def test_more_shadows_than_the_smallest_part_holds(device: Device, variant: Any) -> None:
+    """The 44 teeth of a comb hide intervals of 1e-6 within 1e-4: AMBIGUOUS, with the light of the rest."""
+    corners = comb(44)
+    corners[..., 0] = (corners[..., 0] + 0.3) * 5.5e-5
+    receivers = np.zeros((1, 20, 6), np.float32)
+    receivers[0, :, :3], receivers[0, :, 5] = (0.0, 0.0, 1.0), -1.0
+    receivers[0, 17, 5] = 1.0
+    segments = np.tile(FLOOR, (60, 1))
+    segments[:, 9] = 0.0
+    segments[40] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0)
+    result = light_of(corners, receivers, segments, device, variant=variant, clearance=1e-3)
+    turned_away = np.arange(20) == 17
+    np.testing.assert_array_equal(result.status[0], np.where(turned_away, Status.OK, Status.AMBIGUOUS))
+    free = light_of(NO_TRIANGLES, receivers, segments, device, variant=variant).irradiance
+    assert np.all(result.irradiance[0, ~turned_away] > 0.0)
+    np.testing.assert_allclose(result.irradiance, free, rtol=1e-3)
+
+
 # ---- segments on one line --------------------------------------------------------------------------------------
 
 
@@ -469,6 +503,25 @@ def test_selected_indices_without_a_segment(device: Device, variant: Any, rng: n
     weights, starts = np.ones((1, 64, 2), np.float32), np.array([-1, 1, 1, 1, 7], np.int32)
     beyond = operation(receivers, weights, segments.astype(np.float32), starts, np.zeros(1, np.int32), device=device)
     np.testing.assert_array_equal(beyond.status[0] != 0, np.repeat([True, False, False, True], 16))
+
+
+@pytest.mark.parametrize("is_slow", [False, True])
+def test_long_lists_with_a_wrong_index(device: Device, is_slow: bool, rng: np.random.Generator) -> None:
+    """Lists of more than two tiles: a wrong index in the second tile spoils the light of its own block only."""
+    device = without_fast_doubles(device) if is_slow else device
+    corners, segments = soup(rng, 40, 0.3), segments_of(rng, 150)
+    receivers = receivers_of(rng, 1, 48).astype(np.float32)
+    wrong = np.arange(150)
+    wrong[100] = 150
+    lists = [rng.permutation(150), wrong, ~np.arange(150)]
+    result = selected_of(corners, receivers, segments, lists, device, "work_item")
+    np.testing.assert_array_equal(result.status[0], np.repeat([0, Status.OUT_OF_RANGE, 0], 16))
+    np.testing.assert_array_equal(np.isnan(result.irradiance), result.status != 0)
+    seen = light_of(corners, receivers, segments, device, variant="work_item").irradiance[0]
+    free = light_of(corners, receivers, segments, device, variant="work_item", visibility="none").irradiance[0]
+    np.testing.assert_allclose(result.irradiance[0, :16], seen[:16], rtol=1e-5)
+    np.testing.assert_allclose(result.irradiance[0, 32:], free[32:], rtol=1e-5)
+    assert np.mean(seen < 0.99 * free) > 0.5
 
 
 # ---- inputs ---------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import ArraySource, Device, PacedSource, Pipeline, to_numpy
+from gpuvision.host import ArraySource, Device, PacedSource, Pipeline, plan_stream, to_numpy
 from gpuvision.ranging.line import LineReadout
 from gpuvision.reference.line import pixel_gaussian
 from gpuvision.sensor.sensor import Sensor
@@ -27,6 +27,7 @@ from gpuvision.workflows.scanning import measure_points, range_readout
 Float64 = npt.NDArray[np.float64]
 
 _FRAMES, _ROWS, _COLUMNS = 48, 64, 480  # of the sensor "camera_line"
+_ENDLESS = 1 << 40  # frames
 _SECONDS = 0.5  # duration of a stream
 
 
@@ -151,12 +152,21 @@ def _cost(plan: ScanPlan, meeting: Sequence[ReadoutTrial]) -> float:
 
 
 def _lost(job: Job, plan: ScanPlan, rate: float) -> int:
-    """Return the number of frames that the stream of a plan loses at its rate."""
-    assert plan.stream is not None
-    count = max(math.ceil(_SECONDS * rate), 10)
+    """Return the number of frames that a stream of the chosen readout loses at a rate.
+
+    It is planned as that of the plan, but for an endless recording: the ring of a short one holds all its frames.
+    """
     readout = range_readout(plan.sensor)
-    source = PacedSource(ArraySource(job.frames, count), rate)
-    stream: Pipeline[Any] = Pipeline(source, readout, policy="drop_oldest", **plan.stream.settings)
+    settings = plan_stream(
+        ArraySource(job.frames, _ENDLESS),
+        readout,
+        rate=rate,
+        margin=plan.limits.rate_margin,
+        device=plan.stream.device if plan.stream else None,
+        sample=job.frames,
+    ).settings
+    source = PacedSource(ArraySource(job.frames, max(math.ceil(_SECONDS * rate), 10)), rate)
+    stream: Pipeline[Any] = Pipeline(source, readout, policy="drop_oldest", **settings)
     with stream:
         for _ in stream:
             pass

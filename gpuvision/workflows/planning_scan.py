@@ -120,7 +120,8 @@ def plan_scan(
     -----
     Errors are predicted to first order for Gaussian lines, see `LineReadout` and
     `gpuvision.ranging.line_phase.phase_error`. Where the heights of one readout scatter more along their profiles than
-    its noise explains, and than those of the other readouts do, the difference is added. Not covered: errors of the
+    its noise explains, and than those of the other readouts do, the difference is added. Windows narrower than the line
+    are not chosen: noise moves them off the line, which the prediction does not cover. Not covered: errors of the
     threshold, light of reflections, the texture of the surface (unless ``[line] speckle`` is given), and interpolation
     to the height map. The precision is double where rounding would exceed the tolerance; a device without doubles
     cannot check that (``rounding`` is None).
@@ -179,10 +180,12 @@ def _try_readouts(
     sensor: Sensor, sample: _Sample, device: Device, limits: ScanPlanLimits, progress: Progress
 ) -> tuple[ReadoutTrial, ...]:
     """Return the readouts with their errors and times on the sample, fastest first."""
-    readouts = _readouts(sensor, sample, device)
+    half = _half_width(sensor, sample, device)
+    readouts = _readouts(sensor, half)
     trials = []
     for number, readout in enumerate(readouts):
-        trials.append(_errors(dataclasses.replace(sensor, readout=readout), sample, device))
+        found = _errors(dataclasses.replace(sensor, readout=readout), sample, device)
+        trials.append(found._replace(error=math.nan) if _is_narrow(readout, half) else found)
         progress(number + 1, len(readouts))
     seconds = _times(sensor, readouts, sample, device)
     timed = [each._replace(seconds=one) for each, one in zip(_with_unexplained(trials, limits), seconds, strict=True)]
@@ -200,21 +203,30 @@ def _times(sensor: Sensor, readouts: Sequence[LineReadout], sample: _Sample, dev
     return [each / len(sample.frames) for each in _median_times(calls)]
 
 
-def _readouts(sensor: Sensor, sample: _Sample, device: Device) -> list[LineReadout]:
-    """Return the readouts to try: the sensor's first.
+def _half_width(sensor: Sensor, sample: _Sample, device: Device) -> float:
+    """Return half the median width of the line above the threshold [px].
 
     Raises
     ------
     ValueError
         The sample has no line.
     """
-    given = sensor.readout
-    assert isinstance(given, LineReadout)  # `_check` refuses other sensors
     reading: Any = range_readout(sensor)(sample.frames, device=device)
     good = to_numpy(reading.status) == Status.OK
     if not good.any():
         raise ValueError(f"no line in {len(sample.frames)} frames of the recording; look at `gpuvision scan --preview`")
-    half = 0.5 * float(np.median(to_numpy(reading.width)[good]))
+    return 0.5 * float(np.median(to_numpy(reading.width)[good]))
+
+
+def _is_narrow(readout: LineReadout, half: float) -> bool:
+    """Return whether noise can move the window off the line: the predicted noise is then too small."""
+    return readout.method in ("windowed", "ml") and readout.window < half + 1.0
+
+
+def _readouts(sensor: Sensor, half: float) -> list[LineReadout]:
+    """Return the readouts to try for a line of this half width [px]: the sensor's first."""
+    given = sensor.readout
+    assert isinstance(given, LineReadout)  # `_check` refuses other sensors
     windows = _windows(half)
     changes: list[dict[str, Any]] = [
         {},

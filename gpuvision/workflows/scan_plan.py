@@ -18,7 +18,8 @@ from gpuvision.validation import finite
 _SMALL_GAIN = (
     0.95  # a smaller gain in time or error is no reason to change a setting. Chosen: the scatter of the timing
 )
-_LEGEND = "errors of the heights in um; other: scatter that the noise does not explain; - loses too many samples"
+_LEGEND = """errors of the heights in um; other: scatter that the noise does not explain
+- loses too many samples, or its window is narrower than the line"""
 PLAN_FILE = "plan.png"
 """Name of the file that `ScanPlan.write` writes."""
 
@@ -59,7 +60,7 @@ class ReadoutTrial(NamedTuple):
         Median time of the kernel for a frame [s].
     error : float
         Predicted error of the heights [m]: root mean square over the samples of ``random``, ``phase``, ``systematic``
-        and ``unexplained`` together. NaN without a sample with a line.
+        and ``unexplained`` together. NaN without a sample with a line, and for a window narrower than the line.
     random, phase, systematic : float
         Its parts [m], see `gpuvision.workflows.scan_errors.ScanErrors`; 0 where unknown.
     unexplained : float

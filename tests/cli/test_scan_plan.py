@@ -26,7 +26,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Gener
     frames = rng.poisson(np.broadcast_to(light, (6, 64, 480)) / 0.1) * 0.1
     np.save("in.npy", np.clip(np.rint(frames), 0, 255).astype(np.uint8))
     text = resources.files("gpuvision").joinpath("presets", "sensors", "camera_line.toml").read_text(encoding="utf-8")
-    Path("s.toml").write_text(text.replace("threshold = 16", "threshold = 16\nread_noise = 0.5\ngain = 0.1"))
+    text = text.replace("threshold = 16", "threshold = 16\nread_noise = 0.5\ngain = 0.1")
+    Path("s.toml").write_text(text.replace("window = 4", "window = 8"))
     return tmp_path
 
 
@@ -55,7 +56,7 @@ def test_a_tolerance_scans_with_the_chosen_readout(folder: Path) -> None:
     report = json.loads((folder / "out" / "report.json").read_text())
     chosen = report["readout"]
     assert text.startswith(f"plan: {chosen['method']} {chosen['window']}: predicted error")
-    assert chosen == {"method": "windowed", "window": 4, "fir_length": 4, "precision": None}
+    assert chosen == {"method": "windowed", "window": 8, "fir_length": 4, "precision": None}
 
 
 def test_a_plan_without_a_tolerance_and_options_without_effect_are_refused(folder: Path) -> None:

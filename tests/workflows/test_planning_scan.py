@@ -176,7 +176,7 @@ def test_the_scatter_is_the_noise_of_a_curved_surface(rng: np.random.Generator) 
 
 @pytest.mark.slow
 def test_predicted_errors_of_all_readouts_are_the_scatter(device: Device, rng: np.random.Generator) -> None:
-    frames, sensor = recording(rng), noisy_camera()
+    frames, sensor = recording(rng), noisy_camera(window=8)
     plan = plan_scan(frames, sensor, tolerance=1.0, device=device)
     assert plan.chosen == min(usable_trials(plan.trials, plan.limits), key=lambda each: each.seconds)
     assert {each.readout.method for each in plan.trials} == {"windowed", "gauss3", "fir", "ml"}
@@ -200,6 +200,38 @@ def test_a_window_that_noise_moves_off_the_line_is_seen(device: Device, rng: np.
     found = scatter(frames, dataclasses.replace(plan_of(TRIALS[0]), sensor=sensor), device)
     assert found > 2.0 * narrow.random
     assert math.hypot(narrow.random, narrow.unexplained) == pytest.approx(found, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"window": 5}, True),
+        ({"window": 6}, False),
+        ({"method": "ml", "window": 5}, True),
+        ({"method": "gauss3", "window": 1}, False),
+        ({"method": "fir", "window": 1}, False),
+        ({"method": "centroid", "window": 1}, False),
+    ],
+)
+def test_which_windows_are_narrower_than_the_line(change: dict[str, Any], expected: bool) -> None:
+    assert planning_scan._is_narrow(LineReadout(**change), 5.0) == expected
+
+
+def test_a_window_narrower_than_the_line_is_not_chosen(
+    device: Device, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is tried, and it would be the fastest."""
+    monkeypatch.setattr(
+        planning_scan,
+        "_readouts",
+        lambda sensor, _: [dataclasses.replace(sensor.readout, window=window) for window in (3, 6)],
+    )
+    monkeypatch.setattr(planning_scan, "_median_times", lambda calls: [1e-4, 2e-4][: len(calls)])
+    plan = plan_scan(recording(rng, 3), noisy_camera(), tolerance=1.0, device=device)
+    assert plan.chosen.readout.window == 6
+    assert [each.readout.window for each in plan.trials] == [3, 6]
+    assert math.isnan(plan.trials[0].error)
+    assert plan.table().splitlines()[1].startswith("- windowed 3")
 
 
 @pytest.mark.slow

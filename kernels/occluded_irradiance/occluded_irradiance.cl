@@ -27,15 +27,15 @@
 #else
 #define SEGMENT_LISTS
 #endif
-#define ARGUMENTS                                                                                                          \
-    global const INPUT *restrict receivers, global const INPUT *restrict weights, global const INPUT *restrict segments,    \
-        SEGMENT_LISTS global real *restrict irradiance, global real *restrict left, global real *restrict right,            \
-        global uchar *restrict status, global const real *nodes, global const int *children, global const int *axes,        \
-        global const real *leaves, global const int *triangles, constant place *middle, const real clearance,               \
-        const uint samples, const uint each, const uint segment_count, const uint pick_count, const uint strips
 
 #ifdef VECTOR_VARIANT
-AS_IT_IS kernel void occluded_irradiance(ARGUMENTS) {
+AS_IT_IS kernel void occluded_irradiance(
+    global const INPUT *restrict receivers, global const INPUT *restrict weights, global const INPUT *restrict segments,
+    SEGMENT_LISTS global real *restrict irradiance, global real *restrict left, global real *restrict right,
+    global uchar *restrict status, global const real *nodes, global const int *children, global const int *axes,
+    global const real *leaves, global const int *triangles, constant place *middle, const real clearance,
+    const uint samples, const uint each, const uint segment_count, const uint pick_count, const uint strips
+) {
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
     const ulong group = get_group_id(0), groups = get_num_groups(0);
     chunk lit;
@@ -71,7 +71,13 @@ AS_IT_IS kernel void occluded_irradiance(ARGUMENTS) {
     }
 }
 #else
-kernel void occluded_irradiance(ARGUMENTS) {
+kernel void occluded_irradiance(
+    global const INPUT *restrict receivers, global const INPUT *restrict weights, global const INPUT *restrict segments,
+    SEGMENT_LISTS global real *restrict irradiance, global real *restrict left, global real *restrict right,
+    global uchar *restrict status, global const real *nodes, global const int *children, global const int *axes,
+    global const real *leaves, global const int *triangles, constant place *middle, const real clearance,
+    const uint samples, const uint each, const uint segment_count, const uint pick_count, const uint strips
+) {
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
     const ulong strip = get_group_id(0);
     const uint item = get_local_id(0);

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gpuvision.inspection.apertures import BoardPlacement
-from gpuvision.inspection.coplanarity import measure_coplanarity, seating_plane
+from gpuvision.inspection.coplanarity import _compare_tops, measure_coplanarity, seating_plane
 from gpuvision.inspection.top_height import top_height
 from paste_maps import Box, Cap, board_grid, circle, paste_map, rectangle
 
@@ -109,6 +109,42 @@ def test_leads_without_heights_are_left_out():
         measure_coplanarity(z, grid, [regions[0], regions[1]], sigma=1e-6)
     with pytest.raises(ValueError, match="0 of 9 leads"):
         measure_coplanarity(np.full(grid.shape, np.nan), grid, regions)
+
+
+def test_a_component_stands_around_the_centre_of_all_its_leads(rng):
+    """Leads far from the origin, more at one side, one without a top; also around a centre that is given."""
+    place = rng.uniform((30e-3, -12e-3), (40e-3, -2e-3), (14, 2))
+    place[:5] = place[5] + rng.uniform(-1e-3, 1e-3, (5, 2))
+    regions = [rectangle(str(number), tuple(each), (0.2e-3, 0.3e-3)) for number, each in enumerate(place)]
+    tops = np.stack([1e-3 + 0.03 * place[:, 0] + rng.normal(0, 30e-6, 14), rng.uniform(1e-6, 4e-6, 14)], axis=1)
+    tops[3] = np.nan
+    known = np.arange(14) != 3
+    x, y, z = *place[known].T, tops[known, 0]
+    names = np.array([each.name for each in regions])[known]
+    beside = tuple(0.5 * place.mean(axis=0) + place[[0, 6, 9]].mean(axis=0) / 2)
+    for given, centre in ((None, tuple(place.mean(axis=0))), (beside, beside)):
+        found = _compare_tops(regions, tops, given, 2e-6)
+        seats, plane = _brute_force(x, y, z, centre)
+        assert set(found.seats) == set(names[sorted(seats)])
+        design = np.stack([np.ones(13), x, y], axis=1)
+        gap = design @ plane - z
+        np.testing.assert_allclose(found.gap[known], gap, atol=1e-11)
+        # A gap is a sum of tops with weights: the shares of the three seats, and -1 of the lead itself.
+        index = sorted(seats)
+        weights = np.zeros((13, 13))
+        weights[:, index] = np.linalg.solve(design[index].T, design.T).T
+        spread = np.sqrt(((weights - np.eye(13)) ** 2) @ tops[known, 1] ** 2)
+        np.testing.assert_allclose(found.gap_sigma[known], spread, rtol=1e-6, atol=1e-12)
+        hat = design @ np.linalg.solve(design.T @ design, design.T)
+        np.testing.assert_allclose(found.deviation[known], z - hat @ z, atol=1e-9)
+        spread = np.sqrt(((np.eye(13) - hat) ** 2) @ tops[known, 1] ** 2)
+        np.testing.assert_allclose(found.deviation_sigma[known], spread, rtol=1e-6)
+        worst = int(np.argmax(gap))
+        assert (found.lowest, found.noise) == (names[worst], 2e-6)
+        assert (found.coplanarity, found.coplanarity_sigma) == (found.gap[known][worst], found.gap_sigma[known][worst])
+        np.testing.assert_array_equal(found.top, tops[:, 0])
+        np.testing.assert_array_equal(found.top_sigma, tops[:, 1])
+        assert np.isnan(found.gap[3])
 
 
 def test_the_top_of_a_flat_lead_has_no_bias(rng):

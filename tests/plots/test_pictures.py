@@ -324,6 +324,9 @@ def test_picture_of_a_track(drawn: list[Figure], tmp_path: Path) -> None:
     np.testing.assert_allclose(data(ambiguous), [each.pose[:2] for each in states[1:5]])
     texts = [each.get_text() for each in axes.get_legend().get_texts()]
     assert texts == ["8 frames certain", "4 frames ambiguous"]
+    colours = [to_hex(each) for each in (axes.get_facecolor(), certain.get_color(), ambiguous.get_color())]
+    assert colours == ["#2e7d4f", "#00e5ff", "#ff9f1c"]
+    assert axes.get_aspect() == 1.0
     tenth, last = axes.patches
     check_ellipse(cast("Ellipse", tenth), states[10].pose, "#5d4037")
     check_ellipse(cast("Ellipse", last), states[12].pose, "#d50000")
@@ -357,12 +360,17 @@ def test_picture_of_a_located_robot(drawn: list[Figure], tmp_path: Path) -> None
     assert ranges(view) == pytest.approx([-2.0, 2.0, -1.5, 1.5])
     reach = 1.05 * np.abs(located.points).max()
     assert ranges(drawn[1].axes[0]) == pytest.approx([-reach, reach, -reach, reach])
+    # The image lies on black, points alone lie on the carpet, as the field does.
+    grounds = [to_hex(axes.get_facecolor()) for figure in drawn for axes in figure.axes]
+    assert grounds == ["#000000", "#2e7d4f", "#2e7d4f", "#2e7d4f"]
+    assert {axes.get_aspect() for figure in drawn for axes in figure.axes} == {1.0}
     on, beside, robot = view.lines
     np.testing.assert_allclose(data(on), located.points[:2])
     np.testing.assert_allclose(data(beside), located.points[2:])
     np.testing.assert_array_equal(data(robot), [[0.0, 0.0]])
     texts = [each.get_text() for each in view.get_legend().get_texts()]
     assert texts == ["2 points on lines", "1 points beside them"]
+    assert [to_hex(each.get_color()) for each in (on, beside, robot)] == ["#00e5ff", "#ff9f1c", "#ffffff"]
     (lines,) = view.collections
     segments = cast("Any", lines).get_segments()
     np.testing.assert_allclose(segments[0] @ to_robot.T + POSE[:2], [[-4.0, -2.0], [4.0, -2.0]], atol=1e-12)
@@ -372,11 +380,13 @@ def test_picture_of_a_located_robot(drawn: list[Figure], tmp_path: Path) -> None
     np.testing.assert_allclose(data(first), [POSE[:2]])
     np.testing.assert_allclose(data(second), [-POSE[:2]])
     np.testing.assert_allclose(data(points), on_field, atol=1e-12)
+    assert [to_hex(each.get_color()) for each in (first, second, points)] == ["#d50000", "#5d4037", "#00e5ff"]
     (ellipse,) = field.patches
     check_ellipse(cast("Ellipse", ellipse), POSE, "#d50000")
     arrows = [cast("Any", each) for each in field.texts if not each.get_text()]
     scores = [each.get_text() for each in field.texts if each.get_text()]
     assert scores == [" 2: 0.250", " 1: 0.125"]
+    assert [to_hex(each.arrow_patch.get_edgecolor()) for each in arrows] == ["#5d4037", "#d50000"]
     for arrow, pose in zip(arrows, (-POSE, POSE), strict=True):
         tip = pose[:2] + 0.6 * np.array([math.cos(pose[2]), math.sin(pose[2])])
         assert (*arrow.xy, *arrow.xyann) == pytest.approx((*tip, *pose[:2]))

@@ -198,6 +198,17 @@ def test_takes_the_sides_of_pads_in_the_open(tmp_path: Path) -> None:
         assert edges.length[index] == pytest.approx(along - 2 * 50e-6)
 
 
+def test_a_side_of_a_pad_ends_where_the_pad_ends(tmp_path: Path) -> None:
+    """Three pads side by side overlap: their copper and its upper contour go on beyond the ends of the middle pad."""
+    row = "%ADD13R,1.5X0.9*%\nD13*\n" + "".join(at(x, 8, "D03") for x in (4.0, 5.2, 6.4))
+    copper, wider = (COPPER + row.replace("1.5X0.9", size) for size in ("1.5X0.9", "1.7X1.1"))
+    edges = read(tmp_path, copper=copper, mask=MASK + wider.removeprefix(COPPER)).edges
+    upper = np.flatnonzero((edges.pad >= 0) & (edges.normal[:, 1] > 0.99) & (edges.start[:, 1] > 7e-3))
+    spans = sorted(sorted((edges.start[i, 0], edges.end[i, 0])) for i in upper)
+    expected = [(x - 0.7e-3, x + 0.7e-3) for x in (4e-3, 5.2e-3, 6.4e-3)]
+    assert np.array(spans) == pytest.approx(np.array(expected), abs=1e-9)
+
+
 def test_a_mask_just_as_large_as_its_pad_hides_the_sides(tmp_path: Path) -> None:
     same = MASK.replace("1.7X1.1", "1.5X0.9")
     board = read(tmp_path, mask=same)

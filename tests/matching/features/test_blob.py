@@ -439,3 +439,29 @@ def test_integer_frames_have_the_noise_of_rounding() -> None:
     )
     for one, other in zip(rounded.arguments, exact.arguments, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+@pytest.mark.parametrize("width", [1, 2, 5])
+@pytest.mark.parametrize(("shape", "ratio"), [("circle", 0.5), ("ring", 0.25), ("square", 0.5), ("cross", 0.3)])
+def test_numbers_of_the_kernel_follow_from_the_shape(shape: Any, ratio: float, width: int) -> None:
+    """Spread of the lines of a ruler, size at which rulers share pixels, extent, noise, contour for each ruler."""
+    blobs = FindBlobs(threshold=20.0, shape=shape, ratio=ratio, width=width, spokes=24, noise=0.75, count=2)
+    launch = blobs.launch(Device.best(), (64, 64), np.dtype(np.float32))
+    spread, overlap, extent, noise, each = (float(value) for value in launch.arguments[-6:-1])
+    contour = {
+        "circle": 2.0 * math.pi,
+        "ring": 2.5 * math.pi,
+        "square": 4.0 * 0.7 * 2.0,
+        # Half of the end of each arm, and half of its flanks, which reach from the ratio to 1.
+        "cross": 4.0 * (0.5 * 2.0 * 0.3 + 2.0 * 0.5 * 0.7),
+    }[shape]
+    assert spread == pytest.approx(np.var(np.arange(width)), abs=1e-7)
+    # Bilinear interpolation gives neighbouring lines a correlation: w lines have the noise of w^2 / (w - 1/3).
+    assert overlap == pytest.approx(24 * width**2 / (width - 1 / 3) / contour, rel=1e-6)
+    assert extent == pytest.approx({"square": math.sqrt(2.0), "cross": math.hypot(1.0, 0.3)}.get(shape, 1.0), rel=1e-6)
+    assert (noise, each) == pytest.approx((0.75, contour / 24), rel=1e-6)
+    assert int(launch.arguments[-1]) == blobs.passes
+    # Of 24 edges half must agree, and one more than the unknowns: x, y and size, and the angle of a square or a cross.
+    least = replace(blobs, min_inlier_fraction=0.01).launch(Device.best(), (64, 64), np.dtype(np.float32))
+    assert int(launch.arguments[-7]) == 12
+    assert int(least.arguments[-7]) == (5 if shape in ("square", "cross") else 4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -389,3 +390,7 @@ def test_wrong_inputs_are_refused(device: Device) -> None:
         find_pose_candidates(field_map, np.zeros((4, 2), np.float32), initial_pose=(1.0, 2.0), device=device)
     with pytest.raises(TypeError, match="DistanceMap"):
         FieldPoseSearch(map=field_map.field)
+    # A single start is short enough for the calling thread.
+    for count in (1, 2):
+        launch = replace(refine, count=count).launch(device, (4, 2), np.dtype(np.float32))
+        assert launch.passes_once == (count == 1)

@@ -344,6 +344,7 @@ def test_controls_that_cannot_work_are_refused(given: dict[str, Any], message: s
         ({"rule": "fixed"}, "wait belongs to the rule"),
         ({"wait": 0.1}, "wait belongs to the rule"),
         ({"rule": "vibration", "frequency": (90.0, 0.0, 0.0)}, "belong together"),
+        ({"rule": "vibration", "damping": (0.02,) * 3}, "belong together"),
         ({"frequency": (90.0, 0.0, 0.0), "damping": (0.02,) * 3}, 'belong to the rule "vibration"'),
         ({"miss_probability": 1e-6}, 'miss_probability and window belong to the rule "vibration"'),
         ({"rule": "fixed", "wait": 0.1, "window": 50}, 'miss_probability and window belong to the rule "vibration"'),

@@ -14,8 +14,9 @@ _LAUNCHES = 3
 class DeviceClock:
     """Offset from the clock of a device to the clock of the host, measured with a few empty launches.
 
-    No stage ends after the wait for it has returned, so that each delivery gives an upper bound of the offset. The
-    smallest bound is the estimate.
+    No stage ends after the wait for it has returned, and no command is queued after the call that enqueues it has
+    returned: each batch gives two upper bounds of the offset. The smallest bound is the estimate. Where other processes
+    take the processor, waits return milliseconds late, but the calls that enqueue are short.
 
     Parameters
     ----------
@@ -34,8 +35,9 @@ class DeviceClock:
         offsets = []
         for _ in range(_LAUNCHES):
             slot.launch()
+            enqueued = clock()
             slot.wait()
-            offsets.append(clock() - _end(slot.spans()))
+            offsets.append(_bound(slot, slot.spans(), enqueued, clock()))
         self.offset = min(offsets)
 
     def spans(self, slot: Slot[Any], delivered: int) -> dict[str, tuple[int, int]]:
@@ -49,11 +51,11 @@ class DeviceClock:
             Time at which the wait for the slot returned [ns].
         """
         spans = slot.spans()
-        self.offset = min(self.offset, delivered - _end(spans))
+        self.offset = min(self.offset, _bound(slot, spans, slot.enqueued, delivered))
         low, offset = slot.filled, self.offset
         return {stage: (max(start + offset, low), max(end + offset, low)) for stage, (start, end) in spans.items()}
 
 
-def _end(spans: dict[str, tuple[int, int]]) -> int:
-    """Return the time at which the last stage ends, on the clock of the device [ns]."""
-    return max(end for _, end in spans.values())
+def _bound(slot: Slot[Any], spans: dict[str, tuple[int, int]], enqueued: int, delivered: int) -> int:
+    """Return the upper bound of the offset that the last launch of a slot gives [ns]."""
+    return min(enqueued - slot.queued, delivered - max(end for _, end in spans.values()))

@@ -413,7 +413,8 @@ class Pipeline(Generic[R]):
             self._statistics.add_stage("sink", now - slot.delivered)
             if self.trace is not None:
                 spans = {**self._held_spans, "sink": (slot.delivered, now)}
-                self.trace.add(spans, slot.number, slot.count, stream=self._stream_number)
+                offset = 0 if self._device_clock is None else self._device_clock.offset
+                self.trace.add(spans, slot.number, slot.count, stream=self._stream_number, offset=offset)
             slot.delivered = 0
         self._give_back(slot)
 

@@ -241,6 +241,11 @@ class Slot(Generic[R]):
         """Queue of the operations."""
         return self._queues.compute
 
+    @property
+    def queued(self) -> int:
+        """Time at which the last operation was queued, on the device's clock [ns]; only after `wait`."""
+        return int(self._done.profile.queued)
+
     def launch(self) -> None:
         """Enqueue copies and operations of the batch without waiting."""
         raise NotImplementedError

@@ -103,6 +103,8 @@ class Trace:
         self._count = self._left_out = self._without_times = 0
         self._lanes: dict[Hashable, str] = {}
         self._streams: dict[int, frozenset[Any]] = {}  # queues of the open streams
+        # Device stages of the open streams, with the offset of the clocks by which each was moved to the host's clock.
+        self._on_device: dict[int, list[tuple[int, _Span]]] = {}
 
     def __enter__(self) -> Trace:
         """Check that the file can be written, and record from now on."""
@@ -197,13 +199,16 @@ class Trace:
         """
         with self._lock:
             self._streams.pop(number, None)
+            self._spans += _with_one_offset(self._on_device.pop(number, []))
 
     def is_of_stream(self, queue: Any) -> bool:
         """Return whether a queue belongs to a stream, which records its launches."""
         with self._lock:
             return any(queue in queues for queues in self._streams.values())
 
-    def add(self, spans: dict[str, tuple[int, int]], number: int, count: int, *, stream: int = 1) -> None:
+    def add(
+        self, spans: dict[str, tuple[int, int]], number: int, count: int, *, stream: int = 1, offset: int = 0
+    ) -> None:
         """Add the stages of a batch of a stream.
 
         Parameters
@@ -214,13 +219,21 @@ class Trace:
             Number of the first frame, and number of frames.
         stream : int
             Number of the stream, of `begin_stream`. Default 1.
+        offset : int
+            Estimated offset of the clocks that the times of the device contain [ns]. Estimates become better: the file
+            has all times of the device with the last estimate of the stream. Default 0.
         """
         with self._lock:
             if not self._has_room(len(spans)):
                 return
             for stage, (start, end) in spans.items():
-                lane = ("stream", stream, _LANES[stage])
-                self._keep(_Span(lane, stage, start, end, {"frame": number, "frames": count}))
+                lane = _LANES[stage]
+                span = _Span(("stream", stream, lane), stage, start, end, {"frame": number, "frames": count})
+                if lane in (_PRODUCER, _CONSUMER):
+                    self._spans.append(span)
+                else:
+                    self._on_device.setdefault(stream, []).append((offset, span))
+            self._count += len(spans)
             for each in dict.fromkeys(_LANES.values()):
                 self._lanes.setdefault(("stream", stream, each), each if stream == 1 else f"{each}, stream {stream}")
 
@@ -296,7 +309,8 @@ class Trace:
         with self._lock:
             self._read_times(wait=True)
             on_device, without_clock = self._device_spans()
-            spans = [*self._spans, *on_device]
+            of_streams = [span for spans in self._on_device.values() for span in _with_one_offset(spans)]
+            spans = [*self._spans, *of_streams, *on_device]
             without_times = self._without_times + without_clock
             beyond = self._left_out
             lanes = _lanes_of(spans, self._lanes)
@@ -314,29 +328,58 @@ class Trace:
         Outputs("trace", overwrite=self.overwrite).write_text(self.path, json.dumps(tree))
 
 
+def _with_one_offset(spans: Sequence[tuple[int, _Span]]) -> list[_Span]:
+    """Return the device stages of a stream, moved to the host's clock by the last estimate of the offset."""
+    last = spans[-1][0] if spans else 0
+    return [span._replace(start=span.start + last - used, end=span.end + last - used) for used, span in spans]
+
+
 def _lanes_of(spans: Sequence[_Span], names: Mapping[Hashable, str]) -> list[tuple[str, list[_Span]]]:
     """Return the name and the spans of each lane in the file.
 
-    Spans of a lane in the file are nested or apart, as the viewers require. Batches of a stream may overlap on the
-    device: a span that overlaps others goes to a further lane of the same name.
+    The viewers draw a span inside another one as its part. Only stages of a thread of the host nest; commands of a
+    device and batches of a stream that overlap are computed at the same time, and go to further lanes of the same name.
     """
     lanes = []
     for lane, name in names.items():
-        inside = sorted((each for each in spans if each.lane == lane), key=lambda each: (each.start, -each.end))
-        parts: list[list[_Span]] = [[]]
-        ends: list[list[int]] = [[]]  # ends of the spans of each part that contain the current time
-        for span in inside:
-            for open_ends in ends:
-                while open_ends and open_ends[-1] <= span.start:
-                    open_ends.pop()
-            place = next((n for n, each in enumerate(ends) if not each or each[-1] >= span.end), len(parts))
-            if place == len(parts):
-                parts.append([])
-                ends.append([])
-            parts[place].append(span)
-            ends[place].append(span.end)
+        inside = [each for each in spans if each.lane == lane]
+        parts = _nested_parts(inside) if _may_nest(lane) else _disjoint_parts(inside)
         lanes += [(name if not number else f"{name} ({number + 1})", part) for number, part in enumerate(parts)]
     return lanes
+
+
+def _may_nest(lane: Hashable) -> bool:
+    """Return whether the spans of a lane are the stages of one thread."""
+    return isinstance(lane, tuple) and lane[0] == "thread"
+
+
+def _nested_parts(spans: Sequence[_Span]) -> list[list[_Span]]:
+    """Return the spans in parts; two spans of a part are apart, or one contains the other."""
+    parts: list[list[_Span]] = [[]]
+    ends: list[list[int]] = [[]]  # ends of the spans of each part that contain the current time
+    for span in sorted(spans, key=lambda each: (each.start, -each.end)):
+        for open_ends in ends:
+            while open_ends and open_ends[-1] <= span.start:
+                open_ends.pop()
+        place = next((n for n, each in enumerate(ends) if not each or each[-1] >= span.end), len(parts))
+        if place == len(parts):
+            parts.append([])
+            ends.append([])
+        parts[place].append(span)
+        ends[place].append(span.end)
+    return parts
+
+
+def _disjoint_parts(spans: Sequence[_Span]) -> list[list[_Span]]:
+    """Return the spans in parts; the spans of a part are apart."""
+    parts: list[list[_Span]] = [[]]
+    for span in sorted(spans, key=lambda each: (each.start, each.end)):
+        place = next((part for part in parts if not part or part[-1].end <= span.start), None)
+        if place is None:
+            place = []
+            parts.append(place)
+        place.append(span)
+    return parts
 
 
 _active: Trace | None = None

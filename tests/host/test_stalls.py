@@ -311,6 +311,7 @@ def test_with_device_times_the_wake_up_after_the_kernel_is_the_consumer_s(
         clock.now += 250 * MS
 
     monkeypatch.setattr(kind, "wait", slow)
+    monkeypatch.setattr(kind, "queued", property(lambda slot: clock.now - 251 * MS))
     monkeypatch.setattr(kind, "spans", lambda slot: {"compute": (clock.now - 250 * MS, clock.now - 240 * MS)})
     source = Timed(2, clock)
     with Pipeline(source, READOUT, device=device, batch=1, ring=2, clock=clock, profile=True) as stream:

@@ -253,13 +253,41 @@ def test_streams_at_the_same_time_have_lanes_of_their_own(tmp_path: Path, device
 
 
 def test_spans_that_overlap_go_to_further_lanes(tmp_path: Path) -> None:
+    """A batch that the device computes during another one is no part of it, so that it is not drawn inside."""
     trace = Trace(tmp_path / "t.json")
-    for number, (start, end) in enumerate(((0, 10), (5, 15), (10, 20), (12, 14), (16, 30))):
+    for number, (start, end) in enumerate(((0, 10), (5, 15), (10, 20), (12, 14), (16, 30), (20, 20))):
         trace.add({"compute": (start, end)}, number, 1)
     trace.write()
     lanes = spans_by_lane(tmp_path / "t.json")
     frames = {name: [each["args"]["frame"] for each in spans] for name, spans in lanes.items()}
-    assert frames == {"device compute": [0, 2, 3], "device compute (2)": [1, 4]}
+    assert frames == {"device compute": [0, 2, 5], "device compute (2)": [1, 4], "device compute (3)": [3]}
+
+
+def test_commands_of_a_queue_that_overlap_go_to_further_lanes(tmp_path: Path) -> None:
+    fake_trace(tmp_path / "t.json", [(0, 100, 1000, 9000), (200, 300, 2000, 3000), (400, 500, 9000, 9500)])
+    lanes = spans_by_lane(tmp_path / "t.json")
+    assert {name: len(spans) for name, spans in lanes.items()} == {
+        "device fake, queue 1": 2,
+        "device fake, queue 1 (2)": 1,
+    }
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_the_batches_of_a_stream_have_one_offset_of_the_clocks(tmp_path: Path, ended: bool) -> None:
+    """The first estimate is 10 us too late: with its own estimate, the first batch would end after the second one."""
+    trace, queue = Trace(tmp_path / "t.json"), object()
+    stream = trace.begin_stream(queue)
+    trace.add({"compute": (20_000, 25_000), "wait": (1_000, 26_000)}, 0, 1, stream=stream, offset=15_000)
+    trace.add({"compute": (17_000, 18_000), "wait": (27_000, 28_000)}, 1, 1, stream=stream, offset=5_000)
+    if ended:
+        trace.end_stream(stream)
+        stream = trace.begin_stream(queue)
+        trace.add({"compute": (40_000, 41_000)}, 0, 1, stream=stream, offset=-7_000)  # of another stream
+    trace.write()
+    lanes = spans_by_lane(tmp_path / "t.json")
+    assert [(each["ts"], each["dur"]) for each in lanes["device compute"]][:2] == [(9.0, 5.0), (16.0, 1.0)]
+    assert [each["ts"] for each in lanes["consumer"]] == [0.0, 26.0]  # the times of the host are as they were measured
+    assert not ended or lanes["device compute"][2]["ts"] == 39.0
 
 
 def test_the_limit_bounds_the_spans_and_the_rest_is_counted(tmp_path: Path, device: Device) -> None:

@@ -245,7 +245,7 @@ def plan_stream(
         measurement on the device, and the choice between devices.
     sample : (frames, ...) array, optional
         Frames to measure on; default: a blank frame. Give some where the time depends on the content: on a blank frame
-        an iterative fit ends at once.
+        an iterative fit ends at once. Shape and dtype of the source's frames, in any byte order.
     limits : PlanLimits
         Limits of the measurements and of the memory.
 
@@ -272,11 +272,7 @@ def plan_stream(
     if not 0.0 <= stall < math.inf:
         raise ValueError(f"stall is {stall}, expected seconds >= 0")
     sample = np.zeros((1, *source.shape), source.dtype) if sample is None else sample
-    if not len(sample) or (sample.shape[1:], sample.dtype) != (source.shape, source.dtype):
-        raise ValueError(
-            f"the sample has shape {sample.shape} and dtype {sample.dtype}, expected (frames, *{source.shape}) of "
-            f"{source.dtype} with a frame at least"
-        )
+    _check_sample(sample, source)
     plan = functools.partial(
         _plan_on,
         source,
@@ -295,6 +291,25 @@ def plan_stream(
     if device is not None or measure is not None:
         return plan(Device.best() if device is None else device)
     return _fastest(plan, candidate_devices())
+
+
+def _check_sample(sample: HostArray, source: Source) -> None:
+    """Check shape and dtype of a sample. The byte order is free: a source of these frames converts it.
+
+    Raises
+    ------
+    ValueError
+        The source's frames have another shape or dtype, or the sample is empty.
+    """
+    given, expected = (np.dtype(each.dtype).newbyteorder("=") for each in (sample, source))
+    if not sample.ndim or sample.shape[1:] != source.shape or given != expected:
+        shape = ", ".join(map(str, ("frames", *source.shape)))
+        raise ValueError(
+            f"sample has shape {sample.shape} and dtype {given}, expected shape ({shape}) and dtype {expected}, as the "
+            "frames of the source"
+        )
+    if not len(sample):
+        raise ValueError(f"sample has shape {sample.shape}, expected one frame or more")
 
 
 def _fastest(plan: Callable[[Device], Plan], devices: Sequence[Device]) -> Plan:

@@ -36,6 +36,7 @@ from gpuvision.matching.field.field_pose import PoseCandidate, find_pose_candida
 from gpuvision.matching.field.line_detection import FloorScan, default_threshold, scan_tilted_view, scan_top_view
 from gpuvision.matching.field.located_robot import LocatedRobot
 from gpuvision.operation import KERNEL_FOLDER
+from gpuvision.validation import finite, integer
 
 Float32 = npt.NDArray[np.float32]
 
@@ -49,6 +50,9 @@ _MARGIN = 0.05  # default width of the border around the field, as a fraction of
 _MAX_DIAGONAL = 1.5  # range of the map in lengths of the field; the diagonal of a field is at most sqrt(2) lengths
 # Default range of a mounted camera [m]: farther away pixels resolve little and errors of the tilt grow (chosen).
 _MAX_RANGE = 12.0
+# Step of the directions of a mounted camera in the key of kept times [rad]: the count of rulers changes little within
+# one (chosen).
+_DIRECTION_STEP = math.pi / 32
 # Fields shorter than the first number [m] have lines of the second width, others of the third (RoboCup rules).
 _SMALL_FIELD, _SMALL_LINES, _LARGE_LINES = 5.0, 0.02, 0.125
 
@@ -288,19 +292,19 @@ def scan_floor(
         Grey or colour (blue, green, red) image: the floor from above with the robot in its centre, ahead to the right;
         or the image of a `MountedCamera`.
     scale
-        Size of a pixel on the floor [m]; None for a mounted camera.
+        Size of a pixel on the floor [m], above 0; None for a mounted camera.
     line_width
-        Width of the stripes [m].
+        Width of the stripes [m], above 0.
     rays
-        Number of rays, all around.
+        Number of rays, all around, at least 1. Default 128.
     blind
-        Distance from the centre up to which the image shows the robot itself [m]. Default 0.0.
+        Distance from the centre up to which the image shows the robot itself [m], at least 0. Default 0.0.
     threshold
         Least height of an edge [grey levels]; None: 4 times the noise, at least a tenth of the image's range.
     model
         Lens or camera model, or a camera mounted on the robot. None: no distortion.
     max_range
-        Of a mounted camera: largest distance from it [m].
+        Of a mounted camera: largest distance from it [m], above 0. Default 12.0.
     device
         Where to run; None: `Device.best`, and beside a GPU the faster device. A `StepDevices` keeps the choice, for
         the report of `locate_robot`.
@@ -308,9 +312,13 @@ def scan_floor(
     Raises
     ------
     ValueError
-        Lines are too narrow in the image, the image is too small, or the scale is missing, or given for a mounted
-        camera.
+        Lines are too narrow in the image, the image is too small, the scale is missing, or given for a mounted camera,
+        or a number is out of its range.
     """
+    finite(line_width, "line_width", above=0.0)
+    integer(rays, "rays", minimum=1)
+    finite(blind, "blind", minimum=0.0)
+    finite(max_range, "max_range", above=0.0)
     white = white_of(image)
     least = default_threshold(white) if threshold is None else threshold
     if isinstance(model, MountedCamera):
@@ -325,6 +333,7 @@ def scan_floor(
     else:
         if scale is None:
             raise ValueError("scale is missing: the size of a pixel on the floor [m]")
+        finite(scale, "scale", above=0.0)
         view = BoardView(scale=scale, shape=white.shape, pose=(0.0, 0.0, 0.0), model=model)
 
         def scan(device: Device) -> FloorScan:
@@ -332,8 +341,26 @@ def scan_floor(
                 white, view, line_width=line_width, rays=rays, blind=blind, threshold=least, device=device
             )
 
-    size = (white.shape, white.dtype.str, type(model).__name__, rays, 0.0 if scale is None else scale / line_width)
+    lengths = {"line_width": line_width, "scale": scale, "blind": blind, "max_range": max_range}
+    geometry = _scan_geometry(model, **lengths)
+    size = (white.shape, white.dtype.str, type(model).__name__, rays, *geometry)
     return scan(_step_devices(device).choose("scan", scan, *size))
+
+
+def _scan_geometry(
+    model: Lens | Camera | MountedCamera | None,
+    *,
+    line_width: float,
+    scale: float | None,
+    blind: float,
+    max_range: float,
+) -> tuple[object, ...]:
+    """Return the numbers of a scan that determine count and length of the rulers, for the key of its kept times."""
+    if not isinstance(model, MountedCamera):
+        return ("from above", (scale or 0.0) / line_width, blind / line_width)
+    distances = (model.height / line_width, max_range / line_width)
+    directions = [round(each / _DIRECTION_STEP) for each in (model.tilt, model.roll)]
+    return ("mounted", type(model.model).__name__, *distances, float(model.matrix[0, 0]), *directions)
 
 
 def _step_devices(device: Device | StepDevices | None) -> StepDevices:

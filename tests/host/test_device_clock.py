@@ -70,8 +70,7 @@ def test_each_delivered_batch_can_improve_the_estimate(late: int) -> None:
 
 
 def test_no_stage_begins_before_the_batch_was_filled() -> None:
-    slot: Any = SimpleNamespace(
-        filled=100, enqueued=200, queued=190, spans=lambda: {"compute": (50, 60)}, launch=lambda: None, wait=lambda: None
-    )
+    slot: Any = SimpleNamespace(filled=100, enqueued=200, queued=190, launch=lambda: None, wait=lambda: None)
+    slot.spans = lambda: {"compute": (50, 60)}
     clock = DeviceClock(slot, lambda: 200)
     assert clock.spans(slot, 200) == {"compute": (100, 100)}

@@ -18,7 +18,7 @@ from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.camera.lens import Lens
 from gpuvision.cli import main as cli
 from gpuvision.formats.field_file import read_field
-from gpuvision.host import Device, StepDevices
+from gpuvision.host import Device, StepDevices, device_choice
 from gpuvision.matching.field.distance_map import Arc, Field
 from gpuvision.matching.field.evidence import detected_fraction, distances_to_lines, expected_crossings, robot_to_field
 from gpuvision.matching.field.line_detection import FloorScan
@@ -201,6 +201,70 @@ def test_the_floor_scan_runs_on_its_fastest_device(
     assert ran[-1] is device
     scan_floor(image, line_width=WIDE, device=gpu, **how)
     assert ran[-1] is gpu
+
+
+def key_of_scan(device: Device, monkeypatch: pytest.MonkeyPatch, **how: Any) -> str:
+    """Return the key under which the time of a scan on a device is kept."""
+    keys: list[str] = []
+
+    def choose(self: StepDevices, step: str, run: Any, *size: object) -> Device:
+        keys.append(repr(device_choice._key_of(step, size, device)))
+        return device
+
+    empty = FloorScan(np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty((0, 4), np.float32), WIDE)
+    monkeypatch.setattr(StepDevices, "choose", choose)
+    for name in ("scan_tilted_view", "scan_top_view"):
+        monkeypatch.setattr(locating_robot, name, lambda *_, **__: empty)
+    scan_floor(np.zeros((96, 128), np.uint8), **{"line_width": WIDE, "device": device, **how})
+    return keys[0]
+
+
+def mounted_camera(**changes: Any) -> MountedCamera:
+    """Return a camera on a robot, with changes."""
+    usual = {"height": 0.8, "tilt": 0.4, "focal_px": 500.0, "centre_px": (63.5, 47.5)}
+    return MountedCamera(**{**usual, **changes})
+
+
+def test_scans_of_other_geometry_do_not_share_their_times(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What changes count or length of the rulers is in the key: a scan of 3 m says nothing about a scan of 12 m."""
+    lens = Lens(centre=(63.5, 47.5), k1=1e-7)
+    scans: list[dict[str, Any]] = [
+        {"scale": SCALE},
+        {"scale": 4 * SCALE},
+        {"scale": SCALE, "line_width": 4 * WIDE},
+        {"scale": SCALE, "blind": 1.0},
+        {"scale": SCALE, "rays": 30},
+        {"scale": SCALE, "model": lens},
+        {"model": mounted_camera()},
+        {"model": mounted_camera(), "line_width": 4 * WIDE},
+        {"model": mounted_camera(), "max_range": 3.0},
+        {"model": mounted_camera(), "rays": 30},
+        *(
+            {"model": mounted_camera(**each)}
+            for each in ({"height": 3.2}, {"tilt": 0.8}, {"tilt": -0.4}, {"roll": 0.7}, {"focal_px": 2e3})
+        ),
+        {"model": mounted_camera(model=lens)},
+    ]
+    keys = [key_of_scan(device, monkeypatch, **each) for each in scans]
+    assert len(set(keys)) == len(keys)
+    # What does not, is not: the next image of a robot whose camera is calibrated a little differently.
+    assert key_of_scan(device, monkeypatch, model=mounted_camera(tilt=0.401, focal_px=503.0)) == keys[6]
+    assert key_of_scan(device, monkeypatch, scale=1.01 * SCALE) == keys[0]
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"line_width": 0.0}, "line_width is 0.0, expected a number > 0"),
+        ({"scale": -1.0}, "scale is -1.0, expected a number > 0"),
+        ({"rays": 0}, "rays is 0, expected .*1"),
+        ({"blind": math.nan}, "blind must be finite, got nan"),
+        ({"max_range": 0.0}, "max_range is 0.0, expected a number > 0"),
+    ],
+)
+def test_numbers_of_a_scan_out_of_range_are_refused(how: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        scan_floor(np.zeros((96, 128), np.uint8), **{"scale": SCALE, "line_width": WIDE, **how})
 
 
 def replaced(scan: FloorScan, share: float, rng: np.random.Generator) -> FloorScan:

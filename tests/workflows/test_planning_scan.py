@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gpuvision.host import Device, to_numpy
-from gpuvision.host.planning import plan_stream
+from gpuvision.host.planning import PlanLimits, plan_stream
 from gpuvision.host.sources import ArraySource
 from gpuvision.ranging.line import LineReadout
 from gpuvision.reference.line import pixel_gaussian
@@ -343,6 +343,20 @@ def test_wrong_arguments_are_refused(sensor: Sensor, options: dict[str, float], 
 
 def test_a_sample_must_be_frames_of_the_source() -> None:
     frames = np.zeros((4, 8, 64), np.uint8)
-    for sample in (frames[:0], frames.astype(np.uint16), frames[:, :7]):
-        with pytest.raises(ValueError, match=r"the sample has shape .* expected \(frames, \*\(8, 64\)\) of uint8"):
-            plan_stream(ArraySource(frames), LineReadout(), rate=10.0, sample=sample)
+    for sample in (frames.astype(np.uint16), frames[:, :7], frames[0], np.uint8(3)):
+        message = (
+            f"sample has shape {sample.shape} and dtype {sample.dtype}, expected shape (frames, 8, 64) and dtype uint8"
+        )
+        with pytest.raises(ValueError, match=re.escape(message)):
+            plan_stream(ArraySource(frames), LineReadout(), rate=10.0, sample=np.asarray(sample))
+    with pytest.raises(ValueError, match=r"sample has shape \(0, 8, 64\), expected one frame or more"):
+        plan_stream(ArraySource(frames), LineReadout(), rate=10.0, sample=frames[:0])
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_sample_may_have_any_byte_order(order: str, device: Device) -> None:
+    """A recording in the byte order of another machine: its source converts the frames, for the measurement, too."""
+    frames = np.arange(4 * 8 * 64, dtype=np.uint16).reshape(4, 8, 64).astype(f"{order}u2")
+    limits = PlanLimits(rounds=1, trial_seconds=1e-3, latency_batches=3)
+    plan = plan_stream(ArraySource(frames), LineReadout(), rate=1.0, sample=frames, device=device, limits=limits)
+    assert plan.batch == 1

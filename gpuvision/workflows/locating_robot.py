@@ -341,8 +341,7 @@ def scan_floor(
                 white, view, line_width=line_width, rays=rays, blind=blind, threshold=least, device=device
             )
 
-    lengths = {"line_width": line_width, "scale": scale, "blind": blind, "max_range": max_range}
-    geometry = _scan_geometry(model, **lengths)
+    geometry = _scan_geometry(model, line_width=line_width, scale=scale, blind=blind, max_range=max_range)
     size = (white.shape, white.dtype.str, type(model).__name__, rays, *geometry)
     return scan(_step_devices(device).choose("scan", scan, *size))
 

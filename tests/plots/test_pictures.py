@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -28,11 +29,13 @@ from gpuvision.status import Status
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """Figures that are saved from now on."""
+def drawn(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Figure]]:
+    """Figures that are saved from now on; their texts must lie on the page."""
     figures: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **how: figures.append(figure))
-    return figures
+    yield figures
+    for text in (text for figure in figures for text in figure.texts):
+        assert all(0.0 <= each <= 1.0 for each in text.get_position()), f"{text.get_text()!r} is not on the page"
 
 
 def data(line: Any) -> np.ndarray:

@@ -59,6 +59,26 @@ def test_light_falls_from_the_upper_left():
     assert shades["faces up"] > 0.95 > shades["faces down"]
 
 
+@pytest.mark.parametrize(("gx", "gy"), [(0.5, 0.0), (0.3, -0.4), (-0.2, 0.6)])
+def test_brightness_of_a_plane_is_that_of_a_matt_surface(gx, gy):
+    """Cosine of the angle between the light and the normal, 0.95 on a flat surface."""
+    x, y = np.meshgrid(2.0 * np.arange(20.0), -3.0 * np.arange(15.0))
+    light, normal = np.array(picture._LIGHT), np.array([-gx, -gy, 1.0])
+    cosine = light @ normal / np.linalg.norm(light) / np.linalg.norm(normal)
+    flat = light[2] / np.linalg.norm(light)
+    expected = picture._AMBIENT + (0.95 - picture._AMBIENT) * cosine / flat
+    shade = picture.shade_relief(gx * x + gy * y, 2.0, 3.0)
+    np.testing.assert_allclose(shade, expected, rtol=1e-9)
+    assert light[0] < 0.0 < light[1]
+
+
+def test_the_colour_scale_leaves_out_half_a_percent_at_each_end():
+    z = np.append(np.random.default_rng(1).permutation(np.arange(1001.0)), [np.nan, np.inf]) * 1e-3
+    assert picture.height_span(z) == pytest.approx((5e-3, 995e-3))
+    assert picture.height_span(np.full(4, 2e-3)) == pytest.approx((2e-3 - 0.5e-6, 2e-3 + 0.5e-6), rel=1e-12)
+    assert picture.height_span(z[-2:]) == (0.0, 1.0)
+
+
 def test_relief_is_a_slope_not_a_number_of_cells():
     x = np.tile(np.arange(20.0), (15, 1))
     np.testing.assert_allclose(
@@ -145,7 +165,15 @@ def test_tinted_cells_are_in_the_legend(tmp_path, heights, monkeypatch):
 @pytest.mark.parametrize("style", ["colour", "shaded"])
 def test_the_length_bar_is_as_long_as_it_says(tmp_path, heights, style):
     path = tmp_path / "map.png"
-    picture.draw_height_map(path, heights, GRID, style=style)
+    pages = []
+    save = Figure.savefig
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            Figure, "savefig", lambda figure, *args, **how: pages.append(figure) or save(figure, *args, **how)
+        )
+        picture.draw_height_map(path, heights, GRID, style=style)
+    assert len(pages[0].texts) == 5
+    assert all(0.0 < each < 1.0 for text in pages[0].texts for each in text.get_position())
     image = cv2.imread(str(path))
     # The map, 0.5 m wide, is the longer side: 1100 pixels. A quarter of it is 0.125 m: the bar is 100 mm, 220 pixels.
     legend = 2

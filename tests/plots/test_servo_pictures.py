@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+import scipy.stats
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
@@ -20,11 +22,13 @@ from gpuvision.servoing.delay_measurement import MeasuredDelay
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """Figures that are saved from now on."""
+def drawn(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Figure]]:
+    """Figures that are saved from now on; their texts must lie on the page."""
     figures: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **how: figures.append(figure))
-    return figures
+    yield figures
+    for text in (text for figure in figures for text in figure.texts):
+        assert all(0.0 <= each <= 1.0 for each in text.get_position()), f"{text.get_text()!r} is not on the page"
 
 
 def test_errors_of_position_and_angle_are_drawn_as_outlines(drawn: list[Figure], tmp_path: Path) -> None:
@@ -54,6 +58,14 @@ def test_errors_of_position_and_angle_are_drawn_as_outlines(drawn: list[Figure],
         assert len(outlines) == len(panel.patches) == coordinates
         assert not any(each.get_fill() for each in outlines)
         assert max(each.get_xy()[:, 1].max() for each in outlines) in (1.0, 2.0)
+        # The expected numbers of two placements, normally distributed with the predicted sigmas.
+        sigmas, bins = ([1.0, 1.0], 8.0) if unit == "µm" else ([0.1], 0.8)
+        width = bins / (len(outlines[0].get_xy()) // 2 - 1)
+        assert len(panel.lines) == len(sigmas)
+        for line, sigma in zip(panel.lines, sigmas, strict=True):
+            expected = 2.0 * width * scipy.stats.norm.pdf(line.get_xdata(), scale=sigma)
+            np.testing.assert_allclose(line.get_ydata(), expected)
+            assert np.ptp(line.get_xdata()) == pytest.approx(bins)
         ticks = panel.get_yticks()
         np.testing.assert_array_equal(ticks, np.round(ticks))
 
@@ -67,7 +79,20 @@ def test_repeatability_is_drawn_with_its_prediction(drawn: list[Figure], tmp_pat
     panels = {each.get_ylabel(): each for each in drawn[0].axes}
     points, mean = panels["error of x [µm]"].lines
     np.testing.assert_allclose(points.get_ydata(), [1.0, 3.0, 2.0])
+    np.testing.assert_allclose(points.get_xdata(), [0.0, 1.0, 2.0])
     assert mean.get_ydata()[0] == pytest.approx(2.0)
+    for number, (name, unit, factor) in enumerate((("x", "µm", 1e6), ("y", "µm", 1e6), ("theta", "mrad", 1e3))):
+        middle, spread = factor * error[:, number].mean(), factor * sigma[number]
+        (band,) = panels[f"error of {name} [{unit}]"].patches
+        edges = np.asarray(band.get_corners())[:, 1]
+        assert (edges.min(), edges.max()) == pytest.approx((middle - 3.0 * spread, middle + 3.0 * spread))
+        (predicted,) = drawn[0].axes[2 * number + 1].lines
+        (outline,) = drawn[0].axes[2 * number + 1].patches
+        places = np.asarray(predicted.get_ydata())
+        assert (places[0], places[-1]) == pytest.approx((middle - 4.0 * spread, middle + 4.0 * spread))
+        width = 8.0 * spread / (len(outline.get_xy()) // 2 - 1)
+        expected = 3.0 * width * scipy.stats.norm.pdf(places, middle, spread)
+        np.testing.assert_allclose(predicted.get_xdata(), expected)
     assert panels["error of theta [mrad]"].get_title() == "theta: sigma 0.100 mrad, predicted 0.100 mrad"
     assert panels["error of y [µm]"].get_legend().get_texts()[1].get_text().endswith("predicted sigma 1.000")
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import math
 import time as clock
+from fractions import Fraction
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +50,16 @@ def test_transition_is_the_matrix_exponential(lag: float | None, step: float) ->
         assert state[pick] == pytest.approx(expected[0], rel=1e-12, abs=1e-15)
         assert command[[axis, axis + 3], axis] == pytest.approx(expected[1], rel=1e-8, abs=1e-18)
         assert noise[pick] == pytest.approx(expected[2], rel=1e-7)
+
+
+@pytest.mark.parametrize("ratio", [1e-4, 2e-3, 0.0099, 0.0101, 0.3])
+def test_noise_of_a_short_step_keeps_its_digits(ratio: float) -> None:
+    """In rational numbers: x - 2 (1 - exp(-x)) + (1 - exp(-2 x)) / 2 by the series of the exponential function."""
+    x = Fraction(ratio)
+    exact = sum((-1) ** (n + 1) * (2 ** (n - 1) - 2) * x**n / math.factorial(n) for n in range(3, 16))
+    _, _, noise = MotionModel(lag=(0.02,) * 3, acceleration_noise=(2.0, 3.0, 5.0)).transition(0.02 * ratio)
+    # The series of three terms lacks x^6 / 24, less than 1.3e-7 of x^3 / 3 below 0.01.
+    assert noise[1, 1] == pytest.approx(3.0 * 0.02**3 * float(exact), rel=2e-7)
 
 
 def test_transition_without_lag_follows_the_command() -> None:
@@ -135,6 +147,22 @@ def test_verdicts() -> None:
     assert observer.add(measured(4.5e-3, np.zeros(3))) is Verdict.ACCEPTED
 
 
+def test_reset_forgets_the_measurements() -> None:
+    """The history has been full and has moved to the front of its arrays."""
+    observer, new = fresh(history=4), fresh(history=4)
+    for k in range(1, 30):
+        observer.add(measured(1e-3 * k, np.zeros(3)))
+    for each in (observer, new):
+        each.reset(0.5, [1e-3, 2e-3, 3e-3], 1e-10 * np.eye(3))
+        assert math.isinf(each.exposed)
+        assert each.predicted_pose(0.5) is None
+        assert each.add(measured(0.5, [1.001e-3, 2.002e-3, 3e-3])) is Verdict.ACCEPTED
+        assert each.exposed == 0.5
+    one, other = observer.estimate(0.51), new.estimate(0.51)
+    np.testing.assert_array_equal(one.pose, other.pose)
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
 def test_time_runs_forward() -> None:
     observer = fresh()
     observer.command(2e-3, np.ones(3))
@@ -200,6 +228,19 @@ def test_covariance_must_be_positive_definite(observer: Observer, other: float) 
     units = np.diag([1e-7, 1.0, 1e-3]) * 1e-5
     valid = units @ (np.eye(3) + 0.9 * (np.ones((3, 3)) - np.eye(3))) @ units
     assert observer.add(PoseMeasurement(0.0, 0.1, np.zeros(3), valid, 0)) is Verdict.ACCEPTED
+
+
+@pytest.mark.parametrize("observer", [PoseObserver(MotionModel()), LatestPose()])
+def test_each_correlation_of_a_covariance_counts(observer: Observer) -> None:
+    """The third coordinate is a sum of the other two, or of one of them: the matrix is singular to rounding."""
+    for third in ((1.0, 0.0), (0.0, 1.0), (0.6, 0.8), (0.6, -0.8)):
+        for share, verdict in ((1.0, Verdict.REFUSED), (0.999, Verdict.ACCEPTED)):
+            factor = np.eye(3)
+            factor[2] = [share * third[0], share * third[1], math.sqrt(1.0 - share**2)]
+            for units in (np.eye(3), np.diag([2.0, 1.0, 5.0])):
+                observer.reset(-1.0, np.zeros(3), np.zeros((3, 3)))
+                covariance = 1e-12 * units @ factor @ factor.T @ units
+                assert observer.add(PoseMeasurement(0.0, 0.1, np.zeros(3), covariance, 0)) is verdict
 
 
 def test_transitions_of_jittering_times_are_dropped_one_by_one() -> None:

@@ -73,6 +73,12 @@ def test_a_part_is_scanned_from_end_to_end(part_file: Path) -> None:
     # 20 mm of the plate at 0.25 mm a profile; profiles that only touch its ends do not count.
     assert len(task.transports) == 79
     np.testing.assert_allclose(task.transports[[0, -1]], [-9.75 * MM, 9.75 * MM], atol=1e-12)
+    # Fewer profiles lie in the middle, at the same places; of an even number one more lies before it.
+    for count in (78, 39, 40, 1):
+        fewer = task_of(part_file, profiles=count).transports
+        first = (79 - count) // 2
+        np.testing.assert_array_equal(fewer, task.transports[first : first + count])
+    np.testing.assert_array_equal(task_of(part_file, profiles=80).transports, task.transports)
 
 
 @pytest.mark.parametrize("bend", [0.4, -0.4])

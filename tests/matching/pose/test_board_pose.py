@@ -275,3 +275,10 @@ def test_refuses_parameters(more: dict[str, Any], message: str) -> None:
     given = {"ruler": RulerEdges(threshold=20.0), "lines": 10, "rulers_per_line": 10} | more
     with pytest.raises(ValueError, match=message):
         BoardPoseEstimator(**given)
+
+
+@pytest.mark.parametrize("more", [{"ruler": None}, {"solver": None}, {"ruler": SolvePose()}])
+def test_refuses_other_operations(more: dict[str, Any]) -> None:
+    given = {"ruler": RulerEdges(threshold=20.0), "lines": 10, "rulers_per_line": 10} | more
+    with pytest.raises(TypeError, match="takes a RulerEdges as ruler and a SolvePose as solver"):
+        BoardPoseEstimator(**given)

@@ -81,6 +81,13 @@ def test_what_was_asked_for_is_measured_and_shown(asked: dict[str, Any], tmp_pat
         "float32/1e6 on pocl: rate 4000, p50 0.0001",
     ):
         assert shown in ran.output
+    # Words stand at the left of their columns, numbers at the right; in 80 columns only the case is wrapped.
+    table = [line.strip() for line in ran.output.splitlines() if line.startswith((" case", " float32/1e  ", " 6 "))]
+    assert table == [
+        "case        device       time  peer     peer time     ratio    error  ceiling",
+        "float32/1e  pocl      12.3 ms  numpy      45.6 µs  3.14 ±5%  1.5e-09     50 %",
+        "6                   (11.7 ms)  (words)",
+    ]
     written = json.loads(file.read_text())
     assert (written["valid"], written["machine"]) == (True, {"processor": "abacus"})
     assert written["rows"][0]["case"] == "float32/1e6"
@@ -100,7 +107,10 @@ def test_the_trace_of_the_speed_probe_is_shown(asked: dict[str, Any]) -> None:
 
 def test_a_quick_run_is_short_and_on_the_default_device(asked: dict[str, Any]) -> None:
     CliRunner().invoke(application(), ["profile", "--quick"])
-    assert (asked["quick"], asked["total"], asked["devices"]) == (True, 180.0, [Device.best().label])
+    assert (asked["quick"], asked["seconds"], asked["total"]) == (True, 0.3, 180.0)
+    assert asked["devices"] == [Device.best().label]
+    CliRunner().invoke(application(), ["profile"])
+    assert (asked["quick"], asked["seconds"], asked["total"]) == (False, 2.0, 1200.0)
     CliRunner().invoke(application(), ["profile", "--minutes", "1.5", "--seconds", "1"])
     assert (asked["quick"], asked["total"], asked["seconds"]) == (False, 90.0, 1.0)
 

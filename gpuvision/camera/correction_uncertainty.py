@@ -86,7 +86,9 @@ def correction_covariance(fit: LensFit | CameraFit, points: npt.ArrayLike, measu
     known = np.flatnonzero((variance > 0.0) & np.isfinite(variance))
     fitted = _some_finite(np.asarray(measured, dtype=np.float64), model)
     together = np.concatenate([places.reshape(-1, 2), fitted])
-    columns = np.stack([_derivative(model, names[each], together) for each in known], axis=-1)
+    columns = np.zeros((*together.shape, len(known)))
+    for column, each in enumerate(known):
+        columns[..., column] = _derivative(model, names[each], together)
     derivative = _without_homography(columns, model.undistort(together), len(fitted)).reshape(*places.shape, -1)
     found = derivative @ covariance[np.ix_(known, known)] @ np.swapaxes(derivative, -1, -2)
     for each in np.flatnonzero(np.isinf(variance)):

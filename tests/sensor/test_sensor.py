@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 import tomllib
 from dataclasses import replace
 from importlib import resources
@@ -36,6 +37,8 @@ def table_of(name: str) -> dict[str, Any]:
 
 
 TABLES = {name: table_of(name) for name in SHIPPED}
+SIGMAS = ("focal_length_px", "principal_point_px", "axis_point", "sheet_offset", "axis_direction", "sheet_normal")
+SIGMAS += ("first_angle", "angle_scale")
 
 
 def sensor_of(table: dict[str, Any]) -> Sensor:
@@ -115,13 +118,33 @@ def test_values_reach_the_operations() -> None:
         ("corner_scene", "transport__sheet_offset", 0.0),
         ("corner_scene", "transport__horizon", 1e-4),
         ("corner_scene", "transport__scene_axes", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        ("corner_scene", "transport__scene_origin", [0.0, 0.0, 0.0]),
+        ("corner_scene", "transport__jitter", 0.0),
+        *(("corner_scene", f"transport__sigma__{key}", 0.0) for key in SIGMAS),
+        *(("psd_line", f"psd__noise__{key}", 0.0) for key in ("independent", "opposed", "spot", "dark_current")),
+        *(("psd_line", f"axes__{end}_origin", 0.0) for end in ("position", "sample")),
+        *(("psd_line", f"axes__{end}_pitch", 1.0) for end in ("position", "sample")),
+        ("psd_line", "recording__damaged", "drop"),
+        ("psd_line", "light__thickness", 0.0),
+        ("psd_line", "light__sub_sheets", 1),
+        ("psd_line", "light__nodes", [1.0, 1.0]),
+        ("psd_line", "transport__jitter", 0.0),
+        ("psd_line", "transport__g_axis", [1.0, 0.0, 0.0]),
+        ("psd_line", "transport__h_axis", [0.0, 0.0, 1.0]),
+        ("psd_line", "transport__direction", [0.0, 1.0, 0.0]),
+        ("psd_line", "transport__origin", [0.0, 0.0, 0.0]),
     ],
 )
 def test_a_key_that_is_left_out_has_its_default(name: str, key: str, value: Any) -> None:
-    without = changed(name, **{key: value})
-    table, _, last = key.rpartition("__")
-    del without[table][last]
-    assert sensor_of(without) == sensor_of(changed(name, **{key: value}))
+    stated = changed(name, transport__sigma__angle_scale=0.1) if "sigma" in key else changed(name)
+    place = stated
+    *way, last = key.split("__")
+    for each in way:
+        place = place.setdefault(each, {})
+    place[last] = value
+    expected = sensor_of(copy.deepcopy(stated))
+    del place[last]
+    assert sensor_of(stated) == expected
 
 
 @pytest.mark.parametrize(
@@ -151,6 +174,40 @@ def test_a_key_that_is_left_out_has_its_default(name: str, key: str, value: Any)
         ("camera_line", "light__full_well", [1e-3], [0.0]),
         ("camera_line", "light__read_noise", [0.0], [-1e-9]),
         ("corner_scene", "transport__horizon", [1e-9, 0.9], [0.0, 1.0]),
+        ("corner_scene", "transport__jitter", [0.0], [-1e-12]),
+        ("corner_scene", "transport__first_angle", [6.28, -6.28], [6.29, -6.29]),
+        ("corner_scene", "transport__angle_step", [], [3.15, -3.15]),
+        ("corner_scene", "transport__focal_length_px", [1.0], [0.0]),
+        ("corner_scene", "transport__encoder_bits", [2, 52], [1, 53]),
+        *(("corner_scene", f"transport__sigma__{key}", [0.0], [-1e-12]) for key in SIGMAS),
+        ("camera_line", "frame__columns", [2], [0]),
+        ("camera_line", "frame__rows", [2], [0]),
+        ("camera_line", "line__minimum_peak", [16.0], [-1e-9]),
+        ("camera_line", "line__minimum_width", [1], [0]),
+        ("camera_line", "line__maximum_width", [1], [0]),
+        ("camera_line", "line__saturation", [100.0], [0.0]),
+        ("camera_line", "line__ambiguity", [1e-9, 1.0], [0.0, 1.001]),
+        ("camera_line", "line__fir_length", [4, 8], [3, 9]),
+        ("camera_line", "line__read_noise", [0.0], [-1e-9]),
+        ("camera_line", "line__gain", [0.0], [-1e-9]),
+        ("camera_line", "line__speckle", [0.0], [-1e-9]),
+        ("camera_line", "recording__rate", [1e-9], [0.0]),
+        ("camera_line", "output__max_step", [1e-9], [0.0]),
+        ("psd_line", "psd__margin", [0.0], [-1e-12]),
+        ("psd_line", "psd__saturation", [1e-6], [0.0]),
+        ("psd_line", "psd__load_resistance", [0.0], [-1e-12]),
+        ("psd_line", "psd__interelectrode_resistance", [1e-3], [0.0]),
+        *(
+            ("psd_line", f"psd__noise__{key}", [0.0], [-1e-12])
+            for key in ("independent", "opposed", "spot", "dark_current", "background")
+        ),
+        ("psd_line", "psd__noise__bandwidth", [1e-3], [-1e-12]),
+        ("psd_line", "light__power", [1e-9], [0.0]),
+        ("psd_line", "light__thickness", [0.0], [-1e-12]),
+        ("psd_line", "light__sub_sheets", [1], [0]),
+        ("psd_line", "light__patch_size", [1e-9], [0.0]),
+        ("psd_line", "light__responsivity", [1e-9], [0.0]),
+        ("psd_line", "light__nodes", [[1.0, 1.0]], [[0.0, 1.0], [1.0, 0.0], [1.0, 1.5]]),
     ],
 )
 def test_numbers_of_a_file_are_accepted_up_to_their_limits(
@@ -159,8 +216,77 @@ def test_numbers_of_a_file_are_accepted_up_to_their_limits(
     for value in accepted:
         sensor_of(changed(name, **{key: value}))
     for value in refused:
-        with pytest.raises(DescriptionError, match=key.rpartition("__")[2]):
+        with pytest.raises(DescriptionError, match=re.escape(f"sensor.toml: {key.replace('__', '.')} is {value}")):
             sensor_of(changed(name, **{key: value}))
+
+
+def test_every_value_of_a_file_reaches_its_field() -> None:
+    """A different number for every key."""
+    line = {"method": "gauss3", "threshold": 17.0, "window": 5, "peak_selection": "last", "minimum_peak": 41.0}
+    line |= {"minimum_width": 2, "maximum_width": 9, "saturation": 250.0, "ambiguity": 0.3, "fir_length": 4}
+    line |= {"read_noise": 1.5, "gain": 0.05, "speckle": 0.7}
+    axes = {"position_origin": 47.0, "position_pitch": -1.5, "sample_origin": -230.0, "sample_pitch": 2.0}
+    recording = {"channel": "red", "key": "frames", "rate": 900.0, "background": "median", "damaged": "keep"}
+    light = {"lens": [0.1, 0.2, 0.3], "aperture": 4e-3, "power": 2.0, "thickness": 5e-5, "source": [0.0, 0.4]}
+    light |= {"width": [-0.1, 0.2], "profile": [[-0.1, 0.5], [0.2, 0.7]], "sub_sheets": 3, "blur": 0.9, "bins": 65}
+    light |= {"nodes": [2, 3], "patch_size": 1e-3, "responsivity": 0.5, "ambient": 1e-9, "modulated": "yes"}
+    light |= {"exposure": 2e-3, "full_well": 1e4, "read_noise": 11.0}
+    transport = {"kind": "straight", "step": 3e-4, "start": 0.1, "jitter": 1e-5, "g_axis": [0.0, 1.0, 0.0]}
+    transport |= {"h_axis": [1.0, 0.0, 0.0], "direction": [0.0, 0.6, 0.8], "origin": [0.1, -0.2, 0.3]}
+    transport |= {"covariance": [[1e-8, 0.0, 1e-9], [0.0, 2e-8, 0.0], [1e-9, 0.0, 3e-8]]}
+    output = {"cell": 2e-4, "max_gap": 5e-4, "max_step": 6e-4, "fold_tolerance": 1e-4, "folded": "top"}
+    output |= {"ambiguous": "keep", "x": [-1.0, 2.0], "y": [-3.0, 4.0], "z": [-5.0, 6.0]}
+    tables = {"line": line, "axes": axes, "recording": recording, "light": light, "output": output}
+    sensor = sensor_of(TABLES["camera_line"] | tables | {"transport": transport})
+    assert isinstance(sensor.readout, LineReadout)
+    assert {key: getattr(sensor.readout, key) for key in line} == line
+    assert {key: getattr(sensor.readout.axes, key) for key in axes} == axes
+    assert {key: getattr(sensor.recording, key) for key in recording} == recording
+    assert sensor.light is not None
+    assert {key: as_lists(getattr(sensor.light, key)) for key in light} == light | {"modulated": True}
+    del transport["kind"]
+    assert {key: as_lists(getattr(sensor.transport, key)) for key in transport} == transport
+    assert sensor.output.limits == ((-1.0, 2.0), (-3.0, 4.0), (-5.0, 6.0))
+    of_output = [key for key in output if key not in "xyz"]
+    assert [getattr(sensor.output, key) for key in of_output] == [output[key] for key in of_output]
+    # Columns 0 to 479 and rows 0 to 63, mirrored along u; v has a pitch of 2.
+    assert sensor.readout.triangulation is not None
+    assert sensor.readout.triangulation.region == ((-47.5, 47.0), (-230.0, 728.0))
+    assert sensor.noise_known
+
+
+def test_every_value_of_a_psd_and_of_a_rotating_sheet_reaches_its_field() -> None:
+    psd = {"strip_length": 7e-3, "ampere": 2e-12, "dark": [1e-9, 3e-9], "right_gain": 1.1, "minimum_total": 6e-8}
+    psd |= {"interelectrode_resistance": 1e5, "load_resistance": 100.0, "saturation": 3e-6, "margin": 1e-4}
+    psd |= {"linearity": [[-1e-3, 0.0], [1e-3, 1e-5]]}
+    noise = {"independent": 1e-10, "opposed": 2e-10, "spot": 3e-5, "bandwidth": 1e4, "dark_current": 5e-9}
+    noise |= {"background": 7e-9}
+    sensor = sensor_of(TABLES["psd_line"] | {"psd": psd | {"strips": 95, "noise": noise}})
+    assert isinstance(sensor.readout, PsdReadout)
+    assert {key: as_lists(getattr(sensor.readout, key)) for key in psd} == psd
+    assert sensor.readout.noise == PsdNoise(**noise)
+    assert sensor.frame == (95, 2)
+    assert sensor.noise_known
+    # The strip from end to end, and 95 strips.
+    assert sensor.readout.triangulation is not None
+    assert sensor.readout.triangulation.region == ((-3.5e-3, 3.5e-3), pytest.approx((-5.9375e-3, 5.8125e-3)))
+    assert not sensor_of(changed("psd_line", psd__noise=None)).noise_known
+
+    rotating = {"focal_length_px": 2000.0, "principal_point_px": [500.0, 900.0], "axis_point": [0.1, 0.2, 0.3]}
+    rotating |= {"axis_direction": [0.0, 0.6, 0.8], "sheet_normal": [1.0, 0.0, 0.0], "sheet_offset": 0.01}
+    rotating |= {"first_angle": -0.2, "jitter": 1e-4, "angle_step": 3e-3, "scene_origin": [1.0, 2.0, 3.0]}
+    rotating |= {"scene_axes": [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], "horizon": 1e-3}
+    sigma = {key: 0.001 * number for number, key in enumerate(SIGMAS, 1)}
+    sensor = sensor_of(TABLES["corner_scene"] | {"transport": rotating | {"kind": "rotating", "sigma": sigma}})
+    assert {key: as_lists(getattr(sensor.transport, key)) for key in rotating} == rotating
+    assert {key: getattr(sensor.rotating_sigma, key) for key in sigma} == sigma
+    assert sensor_of(TABLES["corner_scene"]).rotating_sigma is None
+    assert not sensor.noise_known
+
+
+def as_lists(value: Any) -> Any:
+    """Return a value of a field as a file has it."""
+    return [as_lists(each) for each in value] if isinstance(value, tuple) else value
 
 
 def test_background_of_a_psd_is_its_ambient_light() -> None:

@@ -113,7 +113,12 @@ def fit_pose(
         raise ValueError(f"{len(scene)} points, expected {_MIN_POINTS} at least that do not lie on one line")
     rays = camera.rays(measured)
     ideal = np.ascontiguousarray(rays[:, :2] / rays[:, 2:])
-    _, vector, translation = cv2.solvePnP(scene, ideal, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
+    if not np.isfinite(ideal).all():
+        raise ValueError("a measured point is unknown, or no ray through the lens leads to it")
+    try:
+        _, vector, translation = cv2.solvePnP(scene, ideal, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
+    except cv2.error as error:  # its equations have too small a rank
+        raise ValueError(f"{len(scene)} points are too close to one line to determine a pose") from error
     pose = Pose(cv2.Rodrigues(vector)[0].astype(np.float64), np.asarray(translation, dtype=np.float64).ravel())
     for _ in range(_MAX_STEPS):
         errors = measured - camera.project(scene, *pose)

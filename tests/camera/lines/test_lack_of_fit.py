@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import types
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from gpuvision.camera.lines import lack_of_fit
 from gpuvision.camera.lines.line_families import grid_lines
 from gpuvision.camera.lines.vanishing_points import LensFit, fit_lens
 from gpuvision.camera.patterns.dots import find_dots
@@ -82,6 +85,50 @@ def test_a_wide_angle_lens_of_two_coefficients_is_said_to_be_too_small(rng: np.r
     small = fit_lens(points, model="k1,k2")
     assert any("smooth pattern" in each and "model k1,k2;" in each for each in small.warnings)
     assert fit_lens(points).lens.k3 != 0.0
+
+
+def test_covariance_adds_the_field_and_two_jackknives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By lines and by blocks, less that by both; known and undetermined parameters stay as they are."""
+    rng = np.random.default_rng(3)
+    columns, modes, seen, residual, rest = (rng.normal(size=size) for size in ((5, 40), (4, 40), (3, 40), 40, 40))
+    white = np.diag([4.0, np.inf, 9.0, 0.0, 25.0])
+    white[0, 2] = white[2, 0] = 1.5
+    place = np.linspace(-1.0, 1.0, 40)
+    packed: Any = types.SimpleNamespace(x=2.0 * place, y=np.flip(place), corner=np.array([2.0, 1.0]))
+    packed.line = np.repeat(np.arange(8), 5)
+    degree = np.array([2, 2, 3, 3])
+    smooth: Any = types.SimpleNamespace(
+        columns=modes, seen=seen, residual=residual, rest=rest, variance=0.5, degree=degree
+    )
+    kept, sizes = [0, 2, 4], np.array([2.0, 3.0, 5.0])
+    scaled = columns[kept] * sizes[:, None]
+    by_degree = np.array([0.0, 0.0, 0.3, 0.7])
+    block = np.clip(((place + 1.0) * 2.0).astype(int), 0, 3)
+    block = 4 * np.flip(block) + block
+    parts = {"line": 20.0, "block": 30.0, "both": 7.0}
+    labels = {"line": packed.line, "block": block, "both": packed.line * 16 + block}
+
+    def jackknife(given: Any, normal: Any, errors: Any, clusters: Any) -> np.ndarray:
+        np.testing.assert_allclose(given, scaled)
+        np.testing.assert_allclose(normal, scaled @ scaled.T)
+        assert errors is rest
+        (name,) = (name for name, each in labels.items() if np.array_equal(each, clusters))
+        return parts[name] * np.eye(3)
+
+    def variances(*arguments: Any) -> np.ndarray:
+        for found, expected in zip(arguments, (degree, seen @ seen.T, seen @ residual, 0.5, 40), strict=True):
+            np.testing.assert_allclose(found, expected)
+        return by_degree
+
+    monkeypatch.setattr(lack_of_fit, "_lens_columns", lambda *_: columns)
+    monkeypatch.setattr(lack_of_fit, "cluster_jackknife", jackknife)
+    monkeypatch.setattr(lack_of_fit, "mode_variances", variances)
+    found = lack_of_fit.correlated_covariance(packed, types.SimpleNamespace(), smooth, white)
+    shifts = np.linalg.pinv(scaled.T) @ modes.T
+    field = shifts @ np.diag(by_degree[degree]) @ shifts.T
+    expected = white.copy()
+    expected[np.ix_(kept, kept)] = (field + 43.0 * np.eye(3)) * np.outer(sizes, sizes)
+    np.testing.assert_allclose(found, expected)
 
 
 @pytest.mark.slow

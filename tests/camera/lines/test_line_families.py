@@ -38,7 +38,7 @@ def test_diagonals(rows: int, columns: int) -> None:
 def test_missing_points_are_left_out() -> None:
     grid = numbered(4, 6)
     grid[1, 2:] = np.nan
-    grid[0, 0, 1] = np.inf
+    grid[0, 0, 1] = np.inf  # the row alone
     rows, columns = grid_lines(grid)
     assert [len(line) for line in rows] == [5, 6, 6]
     assert [len(line) for line in columns] == [3, 4, 3, 3, 3, 3]
@@ -56,7 +56,7 @@ def test_labels_make_group_lines(rng: np.random.Generator) -> None:
 def test_packed_lines_keep_what_is_finite(rng: np.random.Generator) -> None:
     lines = [rng.normal(500.0, 200.0, (count, 2)) for count in (5, 2, 4, 6)]
     lines[2][:2] = np.nan
-    lines[3][4, 0] = np.nan
+    lines[3][4, 1] = np.nan
     packed = pack([lines[:2], [], lines[2:]])
     np.testing.assert_array_equal(packed.counts, [5, 5])
     np.testing.assert_array_equal(packed.family, [0, 2])
@@ -66,6 +66,14 @@ def test_packed_lines_keep_what_is_finite(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-14)
     np.testing.assert_array_equal(np.concatenate(lines)[packed.used], expected)
     assert np.max(np.hypot(packed.x, packed.y)) <= 1.0
+    # A point with an unknown row alone is left out, too.
+    np.testing.assert_array_equal(packed.starts, [0, 5])
+    np.testing.assert_array_equal(packed.line, [0] * 5 + [1] * 5)
+    np.testing.assert_array_equal(packed.family_starts, [0, 1])
+    low, high = expected.min(axis=0), expected.max(axis=0)
+    np.testing.assert_allclose(packed.origin, 0.5 * (low + high))
+    assert packed.unit == pytest.approx(0.5 * np.linalg.norm(high - low))
+    np.testing.assert_allclose(packed.corner, 0.5 * (high - low) / packed.unit)
     np.testing.assert_allclose(packed.sums(packed.x), [packed.x[:5].sum(), packed.x[5:].sum()], atol=1e-15)
 
 

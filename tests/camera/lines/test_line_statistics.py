@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from gpuvision.camera.lines import line_statistics
+from gpuvision.camera.lines.line_families import grid_lines, pack
 from gpuvision.camera.lines.line_statistics import (
     Loss,
     count_independent_errors,
@@ -17,6 +19,9 @@ from gpuvision.camera.lines.line_statistics import (
     point_identifiers,
     robust_weights,
 )
+from gpuvision.camera.lines.straightness import Parameters
+from gpuvision.camera.lines.variable_projection import minimise
+from straight_lines import plane_grid
 
 
 def test_a_point_on_several_lines_has_one_identifier() -> None:
@@ -43,6 +48,39 @@ def test_p_values_are_those_of_scipy(repeated: int) -> None:
     assert p_value_of_gain(60.0, 50.0, 0, residuals, 35, None) == 1.0
     assert p_value_of_gain(60.0, 50.0, 2, residuals, 0, None) == 1.0
     assert p_value_of_gain(60.0, 50.0, 2, residuals, 1, None) < 1.0
+
+
+@pytest.mark.parametrize(("loss", "rounds"), [("huber", 1), ("tukey", 2)])
+def test_reweighting_ends_when_the_weights_stay(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator, loss: Loss, rounds: int
+) -> None:
+    """Exact lines have weights of 1 in the first round of each stage: Tukey's loss starts from Huber's minimum."""
+    packed = pack(grid_lines(plane_grid(rng, 20.0)))
+    calls = []
+
+    def counted(*arguments: Any, **more: Any) -> Any:
+        calls.append(more)
+        return minimise(*arguments, **more)
+
+    monkeypatch.setattr(line_statistics, "minimise", counted)
+    start = minimise(packed, Parameters(np.empty(0), np.zeros(2), None))
+    _, weight, scale = line_statistics.fit_reweighted(packed, start, loss, 0.01, keep_centre=True)
+    assert [each["keep_centre"] for each in calls] == [True] * rounds
+    np.testing.assert_allclose(weight, 1.0)
+    assert scale == 0.01
+    calls.clear()
+    # Errors with one outlier: weights by the final residuals.
+    packed.y[:] += rng.normal(0.0, 1e-3, len(packed.y))
+    packed.y[5] += 0.1
+    start = minimise(packed, Parameters(np.empty(0), np.zeros(2), None))
+    found, weight, scale = line_statistics.fit_reweighted(packed, start, loss, None, keep_centre=False)
+    assert rounds < len(calls) < 20 * rounds
+    distance = found.evaluation.distance
+    limit = {"huber": 1.345, "tukey": 4.685}[loss] * scale
+    huber, tukey = limit / np.maximum(np.abs(distance), limit), np.maximum(1.0 - (distance / limit) ** 2, 1e-4) ** 2
+    expected = huber if loss == "huber" else tukey
+    np.testing.assert_allclose(weight, expected, atol=0.01)
+    assert weight[5] < {"huber": 0.2, "tukey": 1e-7}[loss]
 
 
 @pytest.mark.parametrize("loss", ["huber", "tukey"])

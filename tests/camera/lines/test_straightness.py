@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from gpuvision.camera.lines import normal_equations, straightness
 from gpuvision.camera.lines.line_families import PackedLines, grid_lines, pack
@@ -147,6 +148,33 @@ def test_pencil_lines_are_the_best(packed: PackedLines, anywhere: Parameters) ->
     assert np.all(cost(0.0) < cost(-1e-4) * (1.0 + 1e-10))
 
 
+@pytest.mark.parametrize("weighted", [False, True])
+def test_lines_of_least_squares(packed: PackedLines, rng: np.random.Generator, weighted: bool) -> None:
+    """Free lines against the singular vectors of their points, pencils against SciPy's generalised eigenvectors."""
+    weight = rng.uniform(0.5, 2.0, len(packed.x)) if weighted else None
+    each = np.ones(len(packed.x)) if weight is None else weight
+    sums = straightness.moments(packed, packed.x, packed.y, weight)
+    points = rng.normal(size=(len(packed.counts), 3)) * [0.5, 2.0, 1.0]
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    free = straightness.free_lines(sums)
+    bound = straightness.pencil_lines(sums, straightness.pencil_basis(points))
+    for line, point in enumerate(points):
+        inside = packed.line == line
+        places = np.stack([packed.x, packed.y, np.ones_like(packed.x)], -1)[inside]
+        root = np.sqrt(each[inside])
+        middle = np.average(places[:, :2], axis=0, weights=each[inside])
+        normal = np.linalg.svd((places[:, :2] - middle) * root[:, None])[2][1]
+        expected = np.array([*normal, -normal @ middle])
+        found = np.array([part[line] for part in free])
+        np.testing.assert_allclose(found * np.sign(found[:2] @ normal), expected, atol=1e-12)
+        basis = scipy.linalg.null_space(point[None]).T
+        design = places @ basis.T * root[:, None]
+        mix = scipy.linalg.eigh(design.T @ design, basis[:, :2] @ basis[:, :2].T)[1][:, 0]
+        expected = mix @ basis / np.linalg.norm((mix @ basis)[:2])
+        found = np.array([part[line] for part in bound])
+        np.testing.assert_allclose(found * np.sign(found[:2] @ expected[:2]), expected, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("k", "square", "holds"),
     [
@@ -159,6 +187,8 @@ def test_pencil_lines_are_the_best(packed: PackedLines, anywhere: Parameters) ->
         ((-1.0, 1.0, -0.45), 1.0, False),
         ((-1.2, 1.2, -0.6, 0.15), 1.0, True),
         ((-1.6, 1.0, 0.0, 0.2), 1.0, False),
+        ((-1.1, 0.5, 0.0, 0.0), 1.0, False),  # the slope is least within: highest coefficients of 0 do not count
+        ((-0.8, 0.7, 0.0), 1.0, True),
     ],
 )
 def test_monotone(k: tuple[float, ...], square: float, holds: bool) -> None:
@@ -170,5 +200,8 @@ def test_monotone(k: tuple[float, ...], square: float, holds: bool) -> None:
 
 def test_reach_covers_every_point(packed: PackedLines) -> None:
     for centre in np.array([[0.0, 0.0], [0.7, -0.2], [-3.0, 1.0]]):
+        corners = [[a * packed.corner[0], b * packed.corner[1]] for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
+        exact = np.max(np.sum((np.array(corners) - centre) ** 2, axis=1))
+        assert farthest_corner_square(packed, centre) == pytest.approx(exact, rel=1e-12)
         farthest = np.max((packed.x - centre[0]) ** 2 + (packed.y - centre[1]) ** 2)
         assert farthest <= farthest_corner_square(packed, centre) * (1.0 + 1e-12)

@@ -259,6 +259,9 @@ def test_single_beam_is_a_moebius_map(rng: np.random.Generator) -> None:
     seen[:, 1] = 4e-4
     fits = fit_models(seen, sheet)
     assert [each.model for each in fits] == ["C3"]
+    # Readings of one beam scatter across it; several beams at one height are no single beam.
+    scattered = seen + rng.normal(0.0, SIGMA, (21, 1)) * (0.0, 1.0)
+    assert [each.model for each in fit_models(scattered, sheet)] == ["C3"]
     fitted = Triangulation.fit(seen, sheet, sigma=SIGMA)
     assert fitted.model == "C3"
     np.testing.assert_allclose(fitted.to_sensor(sheet)[:, 0], seen[:, 0], rtol=0, atol=5.0 * SIGMA)

@@ -28,6 +28,19 @@ def corners_of(kind: str, rng: np.random.Generator) -> np.ndarray:
 KINDS = ("none", "one", "sixteen", "seventeen", "soup", "same", "line", "clusters", "geometric", "sphere")
 
 
+def assert_children_in_order(tree: Bvh, node: int) -> None:
+    """Assert that the children of a node come first, in the order of their centres along its widest axis."""
+    low, high = tree.boxes[node, :3], tree.boxes[node, 3:]
+    full = low[0] <= high[0]
+    count = np.count_nonzero(full)
+    assert full[:count].all()
+    if count:
+        size = high.max(axis=1) - low.min(axis=1)
+        axis = tree.axes[node]
+        assert axis == np.argmax(size)
+        assert (np.diff(low[axis, :count] + high[axis, :count]) >= 0.0).all()
+
+
 @pytest.mark.parametrize("width", [WIDTH, GPU_WIDTH])
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_triangle_in_one_leaf_within_its_boxes(kind: str, width: int, rng: np.random.Generator) -> None:
@@ -41,6 +54,7 @@ def test_each_triangle_in_one_leaf_within_its_boxes(kind: str, width: int, rng: 
         node, depth, low, high = todo.pop()
         deepest = max(deepest, depth)
         boxes = tree.boxes[node].T
+        assert_children_in_order(tree, node)
         for child, box in zip(tree.children[node], boxes, strict=True):
             if box[0] > box[3]:
                 continue

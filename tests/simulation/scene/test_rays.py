@@ -83,6 +83,9 @@ def test_closest_as_every_triangle_says(
     assert hits.distance.dtype == dtype
     assert_closest(corners, rays, hits)
     assert len(rays) > 50
+    batch = ClosestHit(scene=Scene(corners), variant=variant)(rays[:30].reshape(2, 3, 5, 6), device=device)
+    for one, other in zip(batch, hits, strict=True):
+        np.testing.assert_array_equal(one, other[:30].reshape(2, 3, 5, *other.shape[1:]))
 
 
 @WAYS

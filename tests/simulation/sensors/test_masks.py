@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gpuvision.camera.lens import Lens
-from gpuvision.simulation.sensors.masks import Mask, optimise_mask
+from gpuvision.simulation.sensors.masks import Mask, _widest_cuts, optimise_mask
 from gpuvision.simulation.sensors.readings import GroundTruth, height_secant, sheet_point
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from lights import LENGTH, gaussian, psd, psd_view
@@ -202,6 +202,25 @@ def test_margin_keeps_away_from_valid_light() -> None:
     # 99.95 % of a Gaussian on either side correspond to 3.29 sigma; a bin is 50 um wide.
     assert np.all(windows[:, 0] <= u.min(axis=0) - 3e-4 - 3.29 * 4e-5 + 5e-5)
     assert np.all(windows[:, 1] >= u.max(axis=0) + 3e-4 + 3.29 * 4e-5 - 5e-5)
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.5, 0.75, 1.0, 2.25, 40.0])
+def test_widest_cuts_by_their_definition(margin: float, rng: np.random.Generator) -> None:
+    """The last edge and the first one that pass the light and keep the margin; all numbers are exact."""
+    edges = np.cumsum(np.r_[-3.0, rng.integers(1, 5, 20) * 0.25])
+    power = rng.integers(0, 9, (4, 3, 20)) * (rng.random((4, 3, 20)) < 0.5) * 1.0
+    power[..., 10] += 64.0
+    valid = rng.random((4, 3)) < 0.8
+    low, high = _widest_cuts(edges, Exposure(power, 0.0 * power), valid, 0.75, margin)
+    for place in np.ndindex(valid.shape):
+        light = power[place]
+        spare = 0.125 * light.sum()
+        one = max(k for k in range(21) if light[:k].sum() <= spare)
+        other = min(k for k in range(21) if light[k:].sum() <= spare)
+        if margin:
+            one = max((k for k in range(21) if edges[k] <= edges[one] - margin), default=0)
+            other = min((k for k in range(21) if edges[k] >= edges[other] + margin), default=20)
+        assert (low[place], high[place]) == ((one, other) if valid[place] else (20, 0))
 
 
 def test_a_margin_wider_than_the_strip_opens_all_of_it() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,15 +14,19 @@ from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.simulation.sensors.readings import (
     AMBIENT,
     UNIFORM,
+    AlignmentLimits,
     GroundTruth,
     add_ambient,
+    check_sample_axes,
     height_secant,
     height_slope,
     sheet_point,
     stack_profiles,
     total_exposure,
 )
+from gpuvision.simulation.sensors.sensor_view import Exposure
 from lights import LENGTH, PITCH, gaussian, psd_view
+from sensor_views import sensor_view
 
 LENSES = [None, Lens(k1=-4000.0), Lens(k1=2000.0, k2=1e7, centre=(1e-4, -2e-4))]
 
@@ -92,3 +97,29 @@ def test_light_of_profiles() -> None:
             stack_profiles(wrong)
     with pytest.raises(ValueError, match="different shapes"):
         total_exposure({"direct": spots[0], "multi-bounce": block["multi-bounce"]})
+
+
+def test_a_path_of_another_shape_is_named() -> None:
+    view = psd_view()
+    spot = gaussian(view, [0.0], 1e-6, 1e-4)
+    samples, bins = spot.power.shape[-2:]
+    for power in (spot.power[..., 1:], spot.power[None, 1:]):
+        expected = f"direct: light has shape {power.shape}, expected (..., {samples}, {bins})"
+        with pytest.raises(ValueError, match=re.escape(expected)):
+            add_ambient(view, {"direct": Exposure(power, 0.0 * power)}, 0.0)
+
+
+def test_samples_at_other_places_are_named() -> None:
+    """The readout's axes may run either way; beyond the tolerance both ranges are stated."""
+    view = sensor_view(v_edges=[-3.0, -1.0, 1.0, 3.0, 5.0])  # samples at -2, 0, 2 and 4
+    limits = AlignmentLimits(pitch_tolerance=0.25)
+    for origin, pitch in ((-2.0, 2.0), (4.0, -2.0), (-1.5, 2.0), (-2.5, 2.0), (4.5, -2.0), (3.5, -2.0)):
+        check_sample_axes(view, origin, pitch, limits)
+    for origin, pitch, low, high in (
+        (-1.25, 2.0, "-1.25", "4.75"),
+        (3.25, -2.0, "-2.75", "3.25"),
+        (-2.0, 2.5, "-2", "5.5"),
+    ):
+        message = f"the view's samples are at v = -2 ... 4, the readout's axes place them at {low} ... {high}; expected"
+        with pytest.raises(ValueError, match=re.escape(message)):
+            check_sample_axes(view, origin, pitch, limits)

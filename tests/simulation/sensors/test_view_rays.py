@@ -69,6 +69,7 @@ def test_where_nothing_is_seen_nothing_comes(device):
     one = sensor_view()
     lines = ViewRays(view=one, scene=Scene.of(floor(size=0.003)), materials=[GREY], device=device)
     seen = lines.visible_surface(0.0)
+    assert seen.triangle.shape == (one.samples, one.bins)  # one ray through each bin is the default
     missed = seen.triangle < 0
     assert missed.any()
     assert not missed.all()

@@ -99,8 +99,9 @@ def _neighbour_ends(runs: Runs, place: Float64, is_outermost: Flags, width: floa
     """
     other, back = (runs.next, runs.previous) if is_above else (runs.previous, runs.next)
     # Runs.straight belongs to the lower one of two levels.
-    straight = runs.straight if is_above else np.where((other >= 0)[:, None], runs.straight[other], False)
-    straight_back = np.where((back >= 0)[:, None], runs.straight[back] if is_above else runs.straight, False)
+    straight, straight_back = runs.straight, runs.straight[back]
+    if not is_above:
+        straight, straight_back = runs.straight[other], runs.straight
     own = place[runs.level]
     x = np.where((other >= 0)[:, None] & straight, runs.x[other], runs.x)
     t = np.where(other >= 0, place[runs.level[other]], 0.0)

@@ -12,9 +12,9 @@ from gpuvision.simulation.transport.line_runs import Pieces, Runs
 from gpuvision.simulation.transport.slab_edges import slanted_limits
 
 WIDTH = 1e-3
-SHEETS = np.array([0, 0, 0, 1, 1, 1, 1])
-PLACE = np.array([-1.5, 0.25, 2.0, -2.5, -1.0, 0.5, 1.75])
-FIRST, LAST = np.array([0, 3]), np.array([2, 6])
+SHEETS = np.array([0, 0, 1, 1, 1, 1])
+PLACE = np.array([-1.5, 0.25, -2.5, -1.0, 0.5, 1.75])
+FIRST, LAST = np.array([0, 2]), np.array([1, 5])
 
 
 def random_runs(rng: np.random.Generator) -> tuple[Pieces, Runs]:

@@ -35,6 +35,13 @@ def shifted(like: Any, shift: int) -> Any:
     return type(like)(*(None if each is None else _shifted(each, shift) for each in like))
 
 
+def shifted_copy(of: NDArray[Any], shift: int) -> NDArray[Any]:
+    """Return a copy that begins `shift` elements after an address that is a multiple of 64."""
+    copy = _shifted(of, shift)
+    copy[...] = of
+    return copy
+
+
 def _shifted(like: NDArray[Any], shift: int) -> NDArray[Any]:
     whole = np.zeros(like.size + 64 + shift, like.dtype)
     begin = -whole.ctypes.data % 64 // like.itemsize + shift

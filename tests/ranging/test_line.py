@@ -40,18 +40,29 @@ WINDOW = 6
 EVERY = list(itertools.product(TOP, ("columns", "rows"), VARIANTS))
 
 
-def line_frames(rng, dtype, shape, along="columns", sigma=1.7):
-    """A wandering Gaussian line over noise, some profiles dark, some with the line at the border."""
+def line_frames(rng, dtype, shape, along="columns", sigma=1.7, swing=0.45):
+    """A Gaussian line that wanders by +-`swing` of the length over noise, some profiles dark."""
     *batch, rows, columns = shape
     length, samples = (rows, columns) if along == "columns" else (columns, rows)
     k, i = np.arange(length)[:, None], np.arange(samples)
-    place = length * (0.5 + 0.45 * np.sin(0.05 * i)) + rng.uniform(-0.5, 0.5, (*batch, samples))[..., None, :]
+    place = length * (0.5 + swing * np.sin(0.05 * i)) + rng.uniform(-0.5, 0.5, (*batch, samples))[..., None, :]
     light = np.where(rng.random((*batch, samples)) < 0.06, 0.0, rng.uniform(0.3, 1.0, (*batch, samples)))
     frames = light[..., None, :] * np.exp(-((k - place) ** 2) / (2 * sigma**2))
     frames = TOP[dtype] * (frames + rng.uniform(0.0, 0.07, frames.shape))
     if along == "rows":
         frames = np.swapaxes(frames, -1, -2)
     return np.ascontiguousarray(frames.astype(dtype))
+
+
+def between_bright_frames(frames):
+    """Return a batch with a frame of the largest values before and after the frames: reads beyond them see light."""
+    bright = np.full_like(frames[:1], np.inf if frames.dtype.kind == "f" else np.iinfo(frames.dtype).max)
+    return np.concatenate([bright, frames, bright])
+
+
+def without_bright_frames(reading):
+    """Return the outputs of the frames between the bright ones."""
+    return type(reading)(*(None if each is None else each[1:-1] for each in reading))
 
 
 def assert_same(reading, expected, precision=np.float32, slack=1.0):
@@ -72,10 +83,13 @@ def test_centre_of_gravity(device, rng, method, dtype, along, variant):
     parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": WINDOW, **second}
     readout = LineReadout(variant=variant, **parameters)
     # The last one has a column more than one strip takes, or a row of many blocks and a rest.
-    for shape in ((2, 137, 201), (64, 64), (50, 1025)):
-        frames = line_frames(rng, dtype, shape, along)
+    for shape in ((2, 137, 201), (1, 64, 64), (1, 50, 1025)):
+        frames = line_frames(rng, dtype, shape, along, swing=0.5)
+        reading = without_bright_frames(readout(between_bright_frames(frames), device=device))
+        expected = read_lines(frames, **parameters)
+        assert np.any(expected["status"] & OUT_OF_RANGE)
         # Along a thousand samples the light far from the line, up to the threshold, weighs by its distance.
-        assert_same(readout(frames, device=device), read_lines(frames, **parameters), slack=4.0)
+        assert_same(reading, expected, slack=4.0)
 
 
 @pytest.mark.parametrize(
@@ -95,10 +109,11 @@ def test_fits(device, rng, method, dtype, along, variant):
     window = 7 if dtype == "uint16" else WINDOW
     second = {"ambiguity": 0.5} if method == "fir" else {}
     parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": window, **noise, **second}
-    frames = line_frames(rng, dtype, (40, 83) if along == "columns" else (83, 40), along)
+    frames = line_frames(rng, dtype, (1, 40, 83) if along == "columns" else (1, 83, 40), along)
     if dtype == "uint8":
-        frames = np.pad(frames, ((5, 5), (0, 0)))
-    reading = LineReadout(variant=variant, **parameters)(frames, device=device)
+        frames = np.pad(frames, ((0, 0), (5, 5), (0, 0)))
+    readout = LineReadout(variant=variant, **parameters)
+    reading = without_bright_frames(readout(between_bright_frames(frames), device=device))
     expected = read_lines(frames, **parameters)
     if method == "ml":
         # The stated bound is 1.5e-4 px; with this noise the fits agree better.
@@ -162,15 +177,54 @@ def test_peak_selection(device, rng, peak_selection, kernel):
     shape = (2, 90, 50) if along == "columns" else (2, 50, 90)
     frames = np.maximum(line_frames(rng, dtype, shape, along), line_frames(rng, dtype, shape, along, sigma=0.8))
     frames[..., 20, 30] = TOP[dtype] * 1.2  # hot
+    profiles = frames if along == "columns" else np.swapaxes(frames, 1, 2)
+    profiles[:, :3, 40:43] = profiles[:, -4:, 42:45] = TOP[dtype] * 1.1  # runs that begin or end with the profile
+    # Runs as wide as the limits and one sample wider or narrower, and peaks at the lowest level and below it.
+    profiles[:, :, 10:18] = 0
+    for number, width in enumerate((1, 2, 9, 10)):
+        profiles[:, 30 : 30 + width, 10 + number] = TOP[dtype] * 0.7
+    for number, level in enumerate((-1, 0, 1)):
+        profiles[:, 30:33, 14 + number] = LEVEL[dtype] * 2 + level
     second = ()
     if peak_selection == "nearest":
         previous = rng.uniform(-5, 95, (2, 50)).astype(np.float32)
         previous[0, ::7] = np.nan
-        second = (previous,)
+        second = (np.pad(previous, ((1, 1), (0, 0))),)
         parameters["previous"] = previous
     expected = read_lines(frames, **parameters)
     parameters.pop("previous", None)
-    assert_same(LineReadout(variant=variant, **parameters)(frames, *second, device=device), expected)
+    readout = LineReadout(variant=variant, **parameters)
+    reading = readout(between_bright_frames(frames), *second, device=device)
+    assert_same(without_bright_frames(reading), expected)
+
+
+def test_levels_at_their_limits(device):
+    """The threshold is exclusive; the smallest peak and the level of saturation are inclusive."""
+    levels = np.array([19, 20, 21, 59, 60, 61, 199, 200, 201])
+    frame = np.zeros((40, 64), np.uint8)
+    for column in range(64):
+        frame[15:18, column] = levels[column % 9] // 2, levels[column % 9], levels[column % 9] // 3
+    limits = {"threshold": 20, "saturation": 200}
+    for method, variant in itertools.product(("centroid", "windowed"), variants_of(device)):
+        for lowest, first_read in ((20, 21), (60, 60)):
+            parameters = {"method": method, "minimum_peak": lowest, "window": WINDOW, **limits}
+            reading = LineReadout(variant=variant, **parameters)(frame, device=device)
+            assert_same(reading, read_lines(frame, **parameters))
+            status = np.where(levels < first_read, LOW_SIGNAL, np.where(levels < 200, 0, SATURATED))
+            np.testing.assert_array_equal(reading.status, np.resize(status, 64))
+
+
+def test_a_second_peak_at_its_limits(device):
+    """A peak of half the light, just beyond the window, is a second one; less light or a place in the window is not."""
+    places = {"beyond": 4 + 1, "within": 4}
+    for along, (name, place), level in itertools.product(("columns", "rows"), places.items(), (84, 85, 86)):
+        for side in (-1, 1):
+            frame = np.zeros((94, 64), np.uint8)
+            frame[40], frame[40 + side * place] = 105, level
+            frame = frame if along == "columns" else np.ascontiguousarray(frame.T)
+            reading = LineReadout(threshold=5, window=4, ambiguity=0.8, along=along)(frame, device=device)
+            ambiguous = name == "beyond" and level >= 85
+            np.testing.assert_array_equal(reading.status, AMBIGUOUS if ambiguous else 0)
 
 
 def test_widths_at_the_limits_are_read(device):

@@ -45,14 +45,25 @@ def errors(fits: LineFits, normal: np.ndarray, middle: np.ndarray) -> np.ndarray
 @pytest.mark.parametrize("loss", ["tukey", "huber", "ransac", "least_squares"])
 def test_lies_at_the_minimum_of_its_loss(device: Device, loss: Any, variant: Any, rng: np.random.Generator) -> None:
     _, _, points = scene(rng, 5, 20, 0.3 if loss != "least_squares" else 0.0, size=100.0)
+    points = np.rint(1024.0 * points) / 1024.0
+    points[1, 0], points[2, :3] = np.nan, np.inf
     operation = FitLines(loss=loss, scale=NOISE, variant=variant, max_iterations=60)
     fits = operation(points, device=device)
     for number, each in enumerate(points):
+        known = each[np.isfinite(each).all(axis=-1)]
         angle = np.arctan2(-fits.normal[number, 0], fits.normal[number, 1])
         start = (angle + 1e-6, float(fits.distance[number]) + 1e-5)
-        found = robust.fit_line(each, np.ones(20), NOISE, loss, operation.tuning_constant, start)
+        found = robust.fit_line(known, np.ones(len(known)), NOISE, loss, operation.tuning_constant, start)
         assert angle == pytest.approx(found[0], abs=1e-7)
         assert fits.distance[number] == pytest.approx(found[1], abs=1e-5)
+    # The fit is relative to the first valid point, so that a shift, exact in these digits, changes no rounding of it.
+    shift = np.array([2.0**40, -(2.0**39)])
+    far = operation(points + shift, device=device)
+    np.testing.assert_array_equal(far.normal, fits.normal)
+    np.testing.assert_array_equal(far.covariance, fits.covariance)
+    np.testing.assert_array_equal(far.inliers, fits.inliers)
+    # Doubles near 2^40 have a spacing of 2^-12.
+    np.testing.assert_allclose(far.centre - shift, fits.centre, rtol=0, atol=2.0**-12)
 
 
 @pytest.mark.double

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import gpuvision as gv
-from canary import Guarded
+from canary import Guarded, shifted_copy
 from gpuvision.host import Device
 
 # A warp has 32 work-items (NVIDIA) or 32 to 64 (AMD, Intel); AMD's groups have at most 256.
@@ -35,16 +34,6 @@ def test_work_groups_are_whole_warps_of_at_most_256(operation: Any, shape: tuple
     assert all(total % local == 0 for total, local in zip(launch.global_size, launch.local_size, strict=True))
 
 
-def _off_by_one(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a copy that is aligned to an element, but not to two."""
-    whole = np.zeros(array.size + 1, array.dtype)
-    if whole.ctypes.data % (2 * array.itemsize):
-        whole = np.zeros(array.size + 2, array.dtype)[1:]
-    part = whole[1 : array.size + 1].reshape(array.shape)
-    part[...] = array
-    return part
-
-
 STREAMS: list[tuple[Any, Any, int]] = [
     (gv.PsdReadout(strip_length=6e-3, minimum_total=1.0, variant="work_item"), (2,), 1),
     (gv.Triangulation(homography=_IDENTITY, region=_UNIT, variant="work_item"), (), 2),
@@ -61,7 +50,7 @@ def test_items_with_four_samples_on_odd_counts_and_unaligned_arrays(
     given = [rng.uniform(0.1, 2.0, (count, *last)).astype(np.float32) for _ in range(inputs)]
     expected = operation(*given, device=device)
     guarded = Guarded(expected)
-    reading = operation(*map(_off_by_one, given), device=device, out=guarded.out)
+    reading = operation(*(shifted_copy(each, 1) for each in given), device=device, out=guarded.out)
     guarded.assert_intact()
     for one, other in zip(reading, expected, strict=True):
         assert (one is None) == (other is None)

@@ -102,7 +102,7 @@ static inline void sum_rows(global const ushort *restrict level, private const i
                 for (int k = 0; k < columns; k++) {
                     key = min(key, keys[k]);
 #ifdef WITH_SCORES
-                    scores[place * columns + from + k] = (float)(keys[k] / BLOCK) * scale;
+                    scores[place * columns + k] = (float)(keys[k] / BLOCK) * scale;
 #endif
                 }
             }

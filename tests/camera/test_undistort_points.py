@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -21,6 +23,8 @@ from gpuvision.camera.lens import Lens
 from gpuvision.camera.polynomial import PlanePolynomial
 from gpuvision.camera.undistort_points import UndistortedPoints, UndistortPoints
 from gpuvision.host import Device
+from gpuvision.host.program import build
+from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.reference import camera as reference
 from gpuvision.status import Status
 from tiers import variants_of
@@ -360,6 +364,136 @@ def test_neighbours_do_not_matter(device: Device, variant: Any, rng: np.random.G
     among = UndistortPoints(model=wide, variant=variant)(points, device=device)
     others = np.arange(160) % 5 != 0
     np.testing.assert_array_equal(among.points[others], alone.points[others])
+
+
+# ---- derivatives of the models -------------------------------------------------------------------------------
+
+# Errors of the derivatives cost the searches steps, or make them search again by another method: their results stay.
+DERIVATIVES = """
+#include "common/camera.h"
+#include "common/lens.h"
+#include "common/plane.h"
+
+// Of a point, a displacement and a gradient (6 numbers): 14 numbers by a camera or a polynomial, 5 by a lens.
+kernel void derive(global const real *given, global real *made, constant real *model, constant real *lens) {
+    const size_t n = get_global_id(0);
+    global const real *in = given + 6 * n;
+    real out[19];
+    for (int k = 0; k < 19; k++) out[k] = 0;
+    const real x = in[0], y = in[1], back_x = in[2], back_y = in[3];
+#ifdef PLANE
+    plane_slopes(x, y, model + PLANE_A, out, out + 1);
+    plane_slopes(x, y, model + PLANE_B, out + 2, out + 3);
+    out[4] = plane_newton(x, y, back_x, back_y, model, out + 5, out + 6, out + 7);
+#endif
+#ifdef CAMERA
+    out[8] = camera_slopes(x, y, model, out, out + 1, out + 2, out + 3);
+    out[4] = camera_newton(x, y, back_x, back_y, model, out + 5, out + 6, out + 7);
+    real along = in[4], across = in[5];
+    const real column = model[CAMERA_CENTRE_X] + x / model[CAMERA_PER_X];
+    const real row = model[CAMERA_CENTRE_Y] + y / model[CAMERA_PER_Y];
+    real found_x, found_y;
+    out[9] = camera_correction(column, row, model, &found_x, &found_y);
+    camera_pull_back(column, row, found_x, found_y, model, &along, &across);
+    out[10] = along;
+    out[11] = across;
+    out[12] = camera_approach(x, y, model, out + 13, &across);
+#endif
+#ifdef LENS
+    const real square = x * x + y * y;
+    out[14] = lens_newton(square, back_x, lens, out + 15, out + 16);
+    out[17] = in[4];
+    out[18] = in[5];
+    lens_pull_back(x + lens[LENS_CENTRE_X], y + lens[LENS_CENTRE_Y], lens, out + 17, out + 18);
+#endif
+    for (int k = 0; k < 19; k++) made[19 * n + k] = out[k];
+}
+"""
+STRETCHES = (-0.3, 0.2, -0.15, 0.1)
+BENDS = np.array([[0.03, -0.02, 0.05, 0.01, -0.04, 0.02, 0.03], [0.02, 0.04, -0.03, 0.05, 0.01, -0.02, 0.06]])
+
+
+def plane_of(x: Any, y: Any) -> tuple[Any, Any]:
+    """Return the bent point of the polynomials `BENDS`."""
+    powers = np.array([x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3])
+    return x + BENDS[0] @ powers, y + BENDS[1] @ powers
+
+
+def jacobian(function: Any, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the derivatives (n, 2, 2) of a mapping of points by complex steps."""
+    tiny = 1e-30
+    by_x, by_y = function(x + 1j * tiny, y + 0j), function(x + 0j, y + 1j * tiny)
+    rows = [[each[axis].imag / tiny for each in (by_x, by_y)] for axis in (0, 1)]
+    return np.moveaxis(np.array(rows, np.float64), -1, 0)
+
+
+@pytest.mark.double
+@pytest.mark.parametrize(("name", "order"), [("plane", 1), ("rational", 2), ("tangential", 3), ("all", 4)])
+def test_derivatives(device: Device, name: str, order: int, tmp_path: Path, rng: np.random.Generator) -> None:
+    count = 64
+    points = rng.uniform(-0.3, 0.3, (count, 2))
+    back, gradient = rng.uniform(-0.02, 0.02, (count, 2)), rng.uniform(-1.0, 1.0, (count, 2))
+    if name == "plane":
+        model, defines = np.concatenate([np.zeros(16), BENDS.ravel()]), {"PLANE": None}
+    else:
+        model = CAMERAS[name].packed(np.float64, "undistort")
+        steps = CAMERAS[name].undistort_defines(np.float64)
+        defines = {**CAMERAS[name].defines(), "CAMERA_STEPS": steps["CAMERA_STEPS"]}
+    lens = Lens(**{f"k{n}": k for n, k in enumerate(STRETCHES[:order], 1)}, centre=(0.4, -0.7))
+    defines |= {**lens.defines, "REAL_IS_DOUBLE": None}
+    (tmp_path / "derive.cl").write_text(DERIVATIVES)
+    program = build(device, tmp_path, "derive.cl", defines, include_folders=(KERNEL_FOLDER,))
+    tables = (model, lens.packed((0.0, 0.0), 1.0))
+    given_, made, *packed = (
+        cl.array.to_device(device.queue, np.ascontiguousarray(each, np.float64))
+        for each in (np.hstack([points, back, gradient]), np.zeros((count, 19)), *tables)
+    )
+    program.derive(device.queue, (count,), None, given_.data, made.data, *(each.data for each in packed))
+    found = made.get()
+    bent = plane_of if name == "plane" else partial(reference.distort, distortion=CAMERAS[name].distortion)
+    np.testing.assert_allclose(
+        found[:, :4], (jacobian(bent, *points.T) - (name == "plane") * np.eye(2)).reshape(-1, 4), rtol=0, atol=1e-14
+    )
+    # Newton: the step that the inverse Jacobian makes from the remaining distance.
+    ideal = points + back
+    slopes, left = jacobian(bent, *ideal.T), np.stack(bent(*ideal.T), axis=-1).astype(np.float64) - points
+    np.testing.assert_allclose(found[:, 5:7], -np.linalg.solve(slopes, left[..., None])[..., 0], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(found[:, 7], np.sum(left**2, axis=-1), rtol=1e-10)
+    assert found[:, 4].all()
+    if name != "plane":
+        np.testing.assert_allclose(found[:, 8], np.linalg.det(jacobian(bent, *points.T)), rtol=1e-13)
+        assert_gradients(CAMERAS[name], points, gradient, found[:, 9:12])
+        # The start and its steps reach the inverse of the lens without a search.
+        assert not found[:, 12].any()
+
+    # Lens: the derivative of the radius, and the gradient of the displaced point.
+    def stretched(x: Any, y: Any) -> tuple[Any, Any]:
+        square = x * x + y * y
+        stretch = 1.0 + sum(k * square**n for n, k in enumerate(STRETCHES[:order], 1))
+        return x * stretch, y * stretch
+
+    radius = np.hypot(*points.T)
+    measured = radius * (1.0 + back[:, 0])
+    slope = jacobian(stretched, measured, 0.0 * measured)[:, 0, 0]
+    residual = stretched(measured, 0.0)[0] / radius - 1.0
+    np.testing.assert_allclose(found[:, 16], residual, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(found[:, 15], -residual / slope, rtol=1e-11, atol=1e-15)
+    pulled = np.einsum("nij,ni->nj", jacobian(stretched, *points.T), gradient)
+    np.testing.assert_allclose(found[:, 17:19], pulled, rtol=1e-12, atol=1e-14)
+
+
+def assert_gradients(given_: Camera, points: np.ndarray, gradient: np.ndarray, found: np.ndarray) -> None:
+    """Compare gradients over measured points with differences of the oracle's ideal points."""
+    focal, centre = np.diag(given_.matrix)[:2], np.array(given_.matrix)[:2, 2]
+    step = 1e-4
+    moves = np.array([[step, 0.0], [-step, 0.0], [0.0, step], [0.0, -step]])
+    pixels = centre + focal * (points + moves[:, None])
+    ideal = reference.undistort_pixels(pixels.reshape(-1, 2), given_.matrix, given_.distortion)
+    right, left, below, above = (ideal.reshape(*pixels.shape) - centre) / focal
+    slopes = np.stack([right - left, below - above], axis=-1).astype(np.float64) / (2.0 * step)
+    assert not found[:, 0].any()
+    # The error of the differences is the square of the step times third derivatives.
+    np.testing.assert_allclose(found[:, 1:], np.einsum("nij,ni->nj", slopes, gradient), rtol=0, atol=1e-6)
 
 
 # ---- the plane -----------------------------------------------------------------------------------------------

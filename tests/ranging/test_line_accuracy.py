@@ -5,9 +5,18 @@ A column of 41 pixels with 20 electrons of background and 10 electrons of read n
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
+import pyopencl as cl
+import pyopencl.array
 import pytest
 
+from gpuvision.host import Device
+from gpuvision.host.program import build
+from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Triangulation
@@ -86,6 +95,231 @@ def test_bias_without_noise(device, sigma, windowed, gauss3, four_taps):
         assert np.max(np.abs(reading.position - places)) < 1.15 * bias + 1e-4
     fit = LineReadout(method="ml", window=16, read_noise=1.0)(frame, device=device)
     assert np.max(np.abs(fit.position - places)) < 1e-4
+
+
+# ---- steps of the likelihood fit -------------------------------------------------------------------------------
+
+# A wrong step costs the fit more steps, or the other fit repeats it: the positions stay.
+STEPS = """
+#include "common/real.h"
+typedef struct {
+    real read_variance, gain, noise_variance, lit_variance;
+} LineTable;
+#include "line/line_ml.h"
+
+#define NUMBERS 45
+static inline int put(real *to, Gaussian from) {
+    to[0] = from.position, to[1] = from.sigma, to[2] = from.amplitude, to[3] = from.background;
+    return 4;
+}
+
+kernel void fit_steps(global const CODE *profiles, global const real *starts, global real *made,
+                      constant LineTable *table, const CODE saturation) {
+    const size_t n = get_global_id(0);
+    CODE window[WINDOW], level = 0;
+    real samples[WINDOW], out[NUMBERS];
+    for (int k = 0; k < WINDOW; k++) {
+        window[k] = profiles[n * WINDOW + k];
+        samples[k] = window[k];
+        level = max(level, window[k]);
+    }
+    const Gaussian start = {starts[4 * n], starts[4 * n + 1], starts[4 * n + 2], starts[4 * n + 3]};
+    const SampleNoise noise = {table->read_variance, table->gain, saturation};
+    int to = 0;
+    for (int second = 0; second < 2; second++) {
+        Gaussian next = start;
+        const PointSums sums = point_sums(samples, &next, noise, second);
+        const PointStep step = point_step(&next, &sums, second);
+        to += put(out + to, next);
+        out[to++] = step.move;
+        out[to++] = step.change;
+    }
+    Normal normal = normal_equations(window, start, saturation, table->read_variance, table);
+    for (int k = 0; k < 10; k++) out[to++] = normal.matrix[k];
+    for (int k = 0; k < 4; k++) out[to++] = normal.right[k];
+    Normal copy = normal;
+    out[to++] = position_variance(&copy);
+    Gaussian moved = start;
+    out[to++] = take_step(&moved, &normal);
+    to += put(out + to, moved);
+    for (int by_variance = 0; by_variance < 2; by_variance++) {
+        to += put(out + to, first_guess(samples, level, by_variance));
+    }
+    Gaussian fitted = start;
+    out[to++] = fit_points(samples, &fitted, -1, noise);
+    to += put(out + to, fitted);
+    for (int k = 0; k < NUMBERS; k++) made[n * NUMBERS + k] = out[k];
+}
+"""
+FIT_RADIUS, FIT_NOISE, FIT_GAIN = 12, 4.0, 0.3  # half window [px], variance of a dark sample, variance per grey level
+
+
+def fitted_steps(
+    device: Device, folder: Path, profiles: np.ndarray, starts: np.ndarray, saturation: int
+) -> dict[str, np.ndarray]:
+    """Return the numbers of the kernel `STEPS` by name, for profiles (n, 25) and starts (n, 4)."""
+    (folder / "fit_steps.cl").write_text(STEPS)
+    codes = {f"CODE{lanes}": f"uchar{lanes}" for lanes in (4, 8, 16)}
+    sizes = {"CODE_BITS": 8, "RADIUS": FIT_RADIUS, "REACH": FIT_RADIUS}
+    defines = {"CODE": "uchar", **codes, **sizes, "METHOD_ML": None, "NOISE": None, "REAL_IS_DOUBLE": None}
+    program = build(device, folder, "fit_steps.cl", defines, include_folders=(KERNEL_FOLDER,))
+    made = np.zeros((len(profiles), 45))
+    table = np.array([FIT_NOISE, FIT_GAIN, FIT_NOISE + 1.0 / 12.0, 0.0])
+    arrays = [cl.array.to_device(device.queue, each) for each in (profiles, starts, made, table)]
+    data = (each.data for each in arrays)
+    cl.Kernel(program, "fit_steps")(device.queue, (len(profiles),), None, *data, np.uint8(saturation))
+    names = {
+        "fisher": 6, "newton": 6, "matrix": 10, "right": 4, "variance": 1, "moved": 1, "step": 4, "peak": 4, "light": 4,
+        "settled": 1, "fitted": 4,
+    }  # fmt: skip
+    ends = np.cumsum(list(names.values()))
+    assert ends[-1] <= 47
+    return dict(zip(names, np.split(arrays[2].get()[:, : ends[-1]], ends[:-1], axis=1), strict=True))
+
+
+def sampled_gaussian(unknowns: np.ndarray) -> np.ndarray:
+    """Return the light at the middles of the pixels of position, log(sigma), amplitude and background."""
+    place, log_sigma, amplitude, background = unknowns
+    z = (np.arange(-FIT_RADIUS, FIT_RADIUS + 1) - place) / np.exp(log_sigma)
+    return np.asarray(background + amplitude * np.exp(-0.5 * z * z))
+
+
+def integrated_gaussian(unknowns: np.ndarray) -> np.ndarray:
+    """Return the light of the pixels of position, log(sigma), log(amplitude) and background."""
+    place, log_sigma, log_amplitude, background = unknowns
+    k = np.arange(-FIT_RADIUS, FIT_RADIUS + 1)
+    return pixel_gaussian(k, place, np.exp(log_sigma), np.exp(log_amplitude), background)
+
+
+def slopes_of(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step: float) -> np.ndarray:
+    """Return the derivatives of a function by each unknown, by central differences."""
+    moves = step * np.eye(len(at))
+    return np.stack([(function(at + move) - function(at - move)) / (2.0 * step) for move in moves], axis=-1)
+
+
+def gradient_of(unknowns: np.ndarray, y: np.ndarray, saturation: int) -> np.ndarray:
+    """Return the sum of the weighted residuals times the slopes of the model, which is 0 at the fit."""
+    place, log_sigma, amplitude, background = unknowns
+    z = (np.arange(-FIT_RADIUS, FIT_RADIUS + 1) - place) / np.exp(log_sigma)
+    g = np.exp(-0.5 * z * z)
+    slopes = [amplitude * g * z / np.exp(log_sigma), amplitude * g * z * z, g, np.ones_like(g)]
+    model = background + amplitude * g
+    weight = np.where(y >= saturation, 0.0, 1.0 / (FIT_NOISE + FIT_GAIN * np.maximum(model, 0.0)))
+    return np.asarray(np.array(slopes) @ (weight * (y - model)))
+
+
+@pytest.mark.double
+def test_steps_of_the_likelihood_fit(device, rng, tmp_path):
+    """Each step against numerical derivatives: by Fisher scoring, by Newton's method, and of the integrated model."""
+    count, saturation = 40, 140
+    truth = np.stack(
+        [rng.uniform(low, high, count) for low, high in ((-0.9, 0.9), (1.75, 4.0), (60, 150), (8, 20))], -1
+    )
+    starts = truth * rng.uniform(0.93, 1.07, truth.shape) + [0.15, 0.0, 3.0, -1.0]
+    k = np.arange(-FIT_RADIUS, FIT_RADIUS + 1)
+    light = np.array([pixel_gaussian(k, *each) for each in truth])
+    profiles = np.rint(light + rng.normal(0.0, 3.0, light.shape)).astype(np.uint8)
+    assert np.any(profiles >= saturation)
+    found = fitted_steps(device, tmp_path, profiles, starts, saturation)
+    for number, (start, codes) in enumerate(zip(starts, profiles, strict=True)):
+        y = codes.astype(np.float64)
+        at = np.array([start[0], math.log(start[1]), *start[2:]])
+        model, slopes = sampled_gaussian(at), slopes_of(sampled_gaussian, at, 1e-5)
+        weight = np.where(y >= saturation, 0.0, 1.0 / (FIT_NOISE + FIT_GAIN * model))
+        gradient = slopes.T @ (weight * (y - model))
+        matrices = {
+            "fisher": slopes.T @ (weight[:, None] * slopes),
+            "newton": -slopes_of(lambda each, y=y: gradient_of(each, y, saturation), at, 1e-5),
+        }
+        for name, matrix in matrices.items():
+            step = np.linalg.solve(matrix, gradient)
+            factor = 1.0 + step[1] * (1.0 + 0.5 * step[1])
+            change = abs(step[0] / start[1]) + abs(step[1]) + abs(step[2] / start[2])
+            next_ = [
+                start[0] + step[0],
+                start[1] * factor,
+                start[2] + step[2],
+                start[3] + step[3],
+                abs(step[0]),
+                change,
+            ]
+            # Differences over 1e-5 have errors of about 1e-9; the series of the exponential of about 1e-10.
+            np.testing.assert_allclose(found[name][number], next_, rtol=1e-6, atol=1e-6)
+        at = np.array([start[0], math.log(start[1]), math.log(start[2]), start[3]])
+        model = integrated_gaussian(at)
+        # The unknown of the background is in units of the amplitude.
+        slopes = slopes_of(integrated_gaussian, at, 1e-5) * [1.0, 1.0, 1.0, start[2]]
+        weight = np.where(y >= saturation, 0.0, 1.0 / (FIT_NOISE + FIT_GAIN * model))
+        matrix, right = slopes.T @ (weight[:, None] * slopes), slopes.T @ (weight * (y - model))
+        # The error function of the kernel has errors of 1.5e-7.
+        size = np.sqrt(np.diag(matrix))
+        lower = np.tril_indices(4)
+        np.testing.assert_allclose(
+            found["matrix"][number] / np.outer(size, size)[lower],
+            (matrix / np.outer(size, size))[lower],
+            rtol=0,
+            atol=1e-5,
+        )
+        np.testing.assert_allclose(
+            found["right"][number] / size, right / size, rtol=0, atol=1e-5 * np.abs(y - model).max()
+        )
+        damped = matrix + 1e-4 * np.diag(np.diag(matrix))
+        assert found["variance"][number, 0] == pytest.approx(np.linalg.inv(damped)[0, 0], rel=1e-4)
+        step = np.linalg.solve(damped, right)
+        assert np.all(np.abs(step[:3]) < 0.5)
+        next_ = [
+            start[0] + step[0],
+            start[1] * np.exp(step[1]),
+            start[2] * (1.0 + step[2]),
+            start[3] + start[2] * step[3],
+        ]
+        np.testing.assert_allclose(found["step"][number], next_, rtol=1e-4, atol=1e-4)
+        moved = max(abs(step[0]), abs(step[1]) * next_[1])
+        assert found["moved"][number, 0] == pytest.approx(moved, rel=1e-3, abs=1e-5)
+        # The fit is where the gradient is 0; in the end its sigma is that of the integrated model.
+        position, sigma, amplitude, background = found["fitted"][number]
+        sampled = math.hypot(sigma, math.sqrt(1.0 / 12.0))
+        fit = np.array([position, math.log(sampled), amplitude * sigma / sampled, background])
+        rest = np.linalg.solve(
+            slopes_of(lambda each, y=y: gradient_of(each, y, saturation), fit, 1e-5), gradient_of(fit, y, saturation)
+        )
+        assert abs(rest[0]) < 5e-5
+    np.testing.assert_array_equal(found["settled"], -1.0)
+
+
+@pytest.mark.double
+def test_starts_of_the_likelihood_fit(device, rng, tmp_path):
+    """Start values by the constants of a Gaussian above a quarter of its peak, derived here; limits of the fast fit."""
+    truth = np.array([(0.3, 2.0, 150.0, 20.0), (-0.6, 3.0, 120.0, 10.0), (0.1, 0.5, 200.0, 30.0)])
+    k = np.arange(-FIT_RADIUS, FIT_RADIUS + 1)
+    profiles = np.rint([pixel_gaussian(k, *each) for each in truth]).astype(np.uint8)
+    found = fitted_steps(device, tmp_path, profiles, truth, 255)
+    c = math.sqrt(2.0 * math.log(4.0))
+    light = math.sqrt(2.0 * math.pi) * math.erf(c / math.sqrt(2.0)) - c / 2.0
+    share = 1.0 - c**3 / (6.0 * light)
+    for number, codes in enumerate(profiles):
+        y = codes.astype(np.float64)
+        background = (y[0] + y[-1]) / 2.0
+        height = y.max() - background
+        v = np.maximum(y - background - height / 4.0, 0.0)
+        place = v @ k / v.sum()
+        by_variance = max(math.sqrt((v @ (k * k) / v.sum() - place**2) / share), 0.3)
+        by_peak = max(v.sum() / (height * light), 0.3)
+        of_light = v.sum() / (by_variance * light)
+        np.testing.assert_allclose(found["peak"][number], [place, by_peak, height, background], rtol=1e-4, atol=1e-12)
+        np.testing.assert_allclose(
+            found["light"][number], [place, by_variance, of_light, background], rtol=1e-4, atol=1e-12
+        )
+    # The fast fit takes sigmas from 1.626 to 12 px, and positions up to 1.5 px from the peak, of lines that are bright.
+    line = np.array((1.4, 1.8, 100.0, 10.0))
+    profile = np.rint(pixel_gaussian(k, *line)).astype(np.uint8)
+    starts = {
+        (1.4, 1.8, 100.0, 10.0): -1, (1.4, 1.63, 100.0, 10.0): -1, (1.4, 1.62, 100.0, 10.0): 0,
+        (1.49, 1.8, 100.0, 10.0): -1, (1.51, 1.8, 100.0, 10.0): 0, (-1.51, 1.8, 100.0, 10.0): 0,
+        (1.4, 12.1, 100.0, 10.0): 0, (1.4, 1.8, -1.0, 10.0): 0,
+    }  # fmt: skip
+    found = fitted_steps(device, tmp_path, np.tile(profile, (len(starts), 1)), np.array(list(starts)), 255)
+    np.testing.assert_array_equal(found["settled"][:, 0], list(starts.values()))
 
 
 # ---- predicted standard deviations -----------------------------------------------------------------------------

@@ -70,7 +70,8 @@ def test_reweighting_ends_when_the_weights_stay(
     assert scale == 0.01
     calls.clear()
     # Errors with one outlier: weights by the final residuals.
-    packed.y[:] += rng.normal(0.0, 1e-3, len(packed.y))
+    for coordinate in (packed.x, packed.y):
+        coordinate[:] += rng.normal(0.0, 1e-3, len(coordinate))
     packed.y[5] += 0.1
     start = minimise(packed, Parameters(np.empty(0), np.zeros(2), None))
     found, weight, scale = line_statistics.fit_reweighted(packed, start, loss, None, keep_centre=False)

@@ -16,7 +16,18 @@ from gerbonara.utils import MM
 from matplotlib.path import Path as Outline
 
 from gpuvision.matching.artwork.artwork import Artwork, Pad, read_artwork
-from gpuvision.matching.artwork.shapes import SAGITTA, Layer, Shape, area, capsule, disk, is_covered
+from gpuvision.matching.artwork.edges import _joined
+from gpuvision.matching.artwork.shapes import (
+    SAGITTA,
+    DrawnObject,
+    Layer,
+    Shape,
+    _BoxIndex,
+    area,
+    capsule,
+    disk,
+    is_covered,
+)
 
 LAYERS = {
     r"copper\.gbr": "top copper",
@@ -377,6 +388,50 @@ def test_what_lies_along_a_line_is_what_lies_at_its_points(rng: np.random.Genera
             )
             covered[inside] = each.dark
         np.testing.assert_array_equal(is_covered(Layer(shapes).crossings(start, end), places), covered)
+
+
+def test_boxes_are_found_where_they_overlap(rng: np.random.Generator) -> None:
+    """Small boxes, narrow ones and one across all, against a comparison of all pairs; few others are found."""
+    low = rng.uniform((-3e-3, 20e-3), (50e-3, 40e-3), (900, 2))
+    high = low + rng.uniform(0.0, 1.0, (900, 2)) * rng.choice([0.2e-3, 4e-3], (900, 2))
+    low[5], high[5] = (-3e-3, 20e-3), (54e-3, 44e-3)
+    index = _BoxIndex(low, high)
+    found = 0
+    for start in rng.uniform((-5e-3, 18e-3), (52e-3, 42e-3), (60, 2)):
+        end = start + rng.uniform(0.0, 3e-3, 2)
+        near = index.near(start, end)
+        overlaps = np.flatnonzero(np.all((low <= end) & (high >= start), axis=1))
+        assert set(overlaps) <= set(near)
+        np.testing.assert_array_equal(near, np.unique(near))
+        found += len(near)
+    assert found < 0.2 * 60 * 900
+
+
+@pytest.mark.parametrize("angle", [0.0, 90.0, 30.0, -60.0, 180.0])
+def test_strokes_of_one_line_are_one_trace_in_either_direction(angle: float) -> None:
+    """Pieces from 0 to 2, 3 to 2 and 3 to 4 mm join; a gap, another width and another line do not."""
+    c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+
+    def stroke(start: float, end: float, width: float = 0.2, beside: float = 0.0) -> DrawnObject:
+        ends = 1e-3 * np.array([[start, beside], [end, beside]]) @ np.array([[c, s], [-s, c]]) + 7e-3
+        return DrawnObject("line", (Shape(capsule(*ends, 5e-4 * width)),), ends, 1e-3 * width)
+
+    strokes = [
+        stroke(3, 2),
+        stroke(0, 2),
+        stroke(3, 4),
+        stroke(5, 6),
+        stroke(8, 5.5),
+        stroke(1, 2, 0.3),
+        stroke(1, 2, beside=1),
+    ]
+    back = np.array([[c, -s], [s, c]])
+    found = []
+    for start, end, width in _joined(strokes):
+        ends = 1e3 * (np.stack([start, end]) - 7e-3) @ back
+        found.append((*np.sort(ends[:, 0]), ends[0, 1], ends[1, 1], 1e3 * width))
+    expected = [(0, 4, 0, 0, 0.2), (5, 8, 0, 0, 0.2), (1, 2, 0, 0, 0.3), (1, 2, 1, 1, 0.2)]
+    np.testing.assert_allclose(sorted(np.round(found, 6).tolist()), sorted(expected), atol=1e-6)
 
 
 def star(rng: np.random.Generator) -> np.ndarray:

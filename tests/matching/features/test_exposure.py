@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -100,3 +101,13 @@ def test_edges_of_rendered_images_have_the_predicted_precision(device: Device, r
     measured = float(np.std(errors))
     assert measured == pytest.approx(float(imaging.sigma(True)) / PIXEL, rel=0.1)
     assert abs(np.mean(errors)) < 4 * measured / math.sqrt(np.size(errors)) + 0.002
+
+
+@pytest.mark.parametrize("name", ["sigma_px", "irradiance", "speed"])
+def test_ranges_of_an_exposure(name: str) -> None:
+    """The standard deviation and the irradiance are above 0; without a speed there is no motion blur."""
+    given: dict[str, Any] = {"sigma_px": 0.06, "irradiance": 2.0, "speed": 0.0}
+    for value in (-5e-324, math.nan) if name == "speed" else (0.0, -5e-324, math.nan):
+        options = given | {name: value}
+        with pytest.raises(ValueError, match=name):
+            smallest_exposure(SENSOR, options.pop("sigma_px"), pixel=PIXEL, **options)

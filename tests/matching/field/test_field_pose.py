@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -394,3 +395,33 @@ def test_wrong_inputs_are_refused(device: Device) -> None:
     for count in (1, 2):
         launch = replace(refine, count=count).launch(device, (4, 2), np.dtype(np.float32))
         assert launch.passes_once == (count == 1)
+
+
+@pytest.mark.parametrize("separation", [None, (0.25, 0.4)])
+def test_best_poses_of_a_grid_suppress_those_near_them(separation: Any, rng: np.random.Generator) -> None:
+    """The same by plain loops: least costs first, without poses within both the distance and the angle of a better."""
+    far, turned = (0.3, math.radians(20.0)) if separation is None else separation
+    field_map: Any = SimpleNamespace(scale=0.15, cell=0.1, first_position=(-1.5, 0.7))
+    angles = np.array([-3.0, -2.7, -0.1, 0.15, 1.0, 3.1])
+    least = rng.uniform(0.0, 1.0, (6, 7, 2)).astype(np.float32)
+    least[2, 3, 1], least[0, 0, 0] = np.nan, np.inf
+    column = rng.integers(0, 20, least.shape)
+    search: Any = SimpleNamespace(map=field_map, angles=angles)
+    costs: Any = SimpleNamespace(least=least, column=column)
+    for count in (1, 8, 200):
+        found = FieldPoseSearch.best(search, costs, count, separation=separation)
+        places = [
+            (float(least[k]), -1.5 + 0.1 * column[k], 0.7 + 0.1 * k[1], angles[k[0]])
+            for k in np.ndindex(least.shape)
+            if math.isfinite(least[k])
+        ]
+        expected: list[Any] = []
+        for cost, x, y, angle in sorted(places):
+            if len(expected) < count and not any(
+                math.hypot(x - u, y - v) < far and abs(math.remainder(angle - w, 2.0 * math.pi)) < turned
+                for _, u, v, w in expected
+            ):
+                expected.append((cost, x, y, angle))
+        np.testing.assert_allclose(found[0], [each[1:] for each in expected], atol=1e-12)
+        np.testing.assert_array_equal(found[1], np.float32([each[0] for each in expected]))
+    assert 8 < len(expected) < len(places)

@@ -169,3 +169,7 @@ def test_wrong_inputs_are_refused(device: Device) -> None:
     with pytest.raises(TypeError, match="float32"):
         op.launch(device, (8, 8), np.dtype(np.uint8))
     assert SURFACE == 49
+
+
+def test_the_axes_of_the_map_are_those_of_the_board_by_default() -> None:
+    np.testing.assert_array_equal(MeasureDeposits.to_board, np.eye(2))

@@ -21,6 +21,7 @@ from gpuvision.cli.main import application
 from gpuvision.formats.machine_file import read_machine
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
+from gpuvision.matching.artwork.board_reflectance import BoardReflectance
 from gpuvision.matching.features.feature_set import edge_clearance
 from gpuvision.matching.pose.motion import rotation
 from gpuvision.servoing.frames import Transform, compose_poses, invert_pose, move_covariance
@@ -75,6 +76,13 @@ def test_parts_of_the_predicted_covariance_add_up(artwork: Artwork, machine: Mac
     # The selection also counts the chance of a wrong edge, which lowers weights by some percent.
     np.testing.assert_allclose(total, expected / np.outer(unit, unit), atol=0.1)
     np.testing.assert_allclose(plan.camera_pose, (TARGET[0] - 1e-3, TARGET[1] - 0.5e-3, 0.0), atol=1e-12)
+    # Half of the step of copper under the mask counts as an edge; the noise is that of the brighter side.
+    board, sensor, white = BoardReflectance(), machine.camera.sensor, machine.camera.white_electrons
+    sides = np.array([board.copper_masked, board.laminate_masked]) * white
+    assert plan.threshold == pytest.approx(0.5 * np.ptp(sides) * sensor.gain)
+    total, temporal = (float(sensor.noise(sides.max(), machine.camera.exposure, spatial=k)) for k in (True, False))
+    assert plan.noise == pytest.approx(total * sensor.gain)
+    assert plan.fixed_pattern == pytest.approx((total**2 - temporal**2) / total**2)
 
 
 def test_parts_land_where_and_when_the_prediction_says(artwork: Artwork, machine: Machine, device: Device) -> None:

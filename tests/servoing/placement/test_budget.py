@@ -9,9 +9,11 @@ import pytest
 
 from gpuvision.formats.machine_file import read_machine
 from gpuvision.servoing.axis import Axis
+from gpuvision.servoing.frames import Transform
 from gpuvision.servoing.margins import observer_matrix
 from gpuvision.servoing.placement.budget import model_tolerance, noise_gain, predict_budget
 from gpuvision.servoing.placement.control import Control, Settling
+from gpuvision.servoing.placement.machine import ThermalDrift
 from gpuvision.servoing.placement.placing import REMAINDER
 from gpuvision.servoing.placement.plan import PlacementPlan
 
@@ -46,6 +48,53 @@ def test_noise_of_a_kalman_filter_follows_the_covariance_that_it_gets() -> None:
     predicted = (q + np.sqrt(q**2 + 4.0 * q * r)) / 2.0
     gain = predicted / (predicted + r)
     np.testing.assert_allclose(np.diag(found), gain / (2.0 - gain) * np.diag(NOISE), rtol=1e-6)
+
+
+def test_sources_of_the_error_add_up_on_a_turned_board() -> None:
+    """Calibration and drift turn with the camera; the fixed pattern is not averaged over the frames."""
+    rng = np.random.default_rng(2)
+    vision, sampling, etch_bias, calibration = (
+        scale * each @ each.T
+        for scale, each in zip((1e-12, 3e-12, 5e-12, 7e-12), rng.normal(size=(4, 3, 3)), strict=True)
+    )
+    angle = 0.7
+    plan = dataclasses.replace(
+        _plan(),
+        camera_pose=np.array([0.1, 0.2, angle]),
+        vision=vision,
+        fixed_pattern=0.3,
+        sampling=sampling,
+        etch_bias=etch_bias,
+    )
+    machine = dataclasses.replace(
+        PRESET,
+        pipette_in_camera=Transform.rigid("pipette", "camera", (1e-3, 2e-3, 0.1), calibration),
+        drift=ThermalDrift(expansion=(1e-6, -2e-6), temperature_sigma=3.0),
+        axes=(Axis(encoder=1e-7), Axis(encoder=2e-7), Axis(encoder=3e-5)),
+        control=Control(gain=0.2),
+    )
+    budget = predict_budget(machine, plan)
+    c, s = math.cos(angle), math.sin(angle)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    moved = turn @ (3.0 * np.array([1e-6, -2e-6, 0.0]))
+    tolerance = machine.tolerance
+    rest = 0.2 * np.array([tolerance.position, tolerance.position, tolerance.angle])
+    steps = np.array([1e-7, 2e-7, 3e-5])
+    # Evenly distributed errors: within plus and minus the rest, and within a step of the encoder.
+    expected = {
+        "calibration": turn @ calibration @ turn.T,
+        "etch bias": etch_bias,
+        "drift": np.outer(moved, moved),
+        "vision": (0.7 * noise_gain(machine.delay.frames, 0.2) + 0.3) * vision,
+        "sampling": sampling,
+        "servo": np.diag(rest**2 / 3.0 + steps**2 / 12.0),
+    }
+    assert list(budget.sources) == list(expected)
+    for name, covariance in expected.items():
+        scale = np.abs(covariance).max()
+        np.testing.assert_allclose(budget.sources[name], covariance, rtol=1e-9, atol=1e-9 * scale, err_msg=name)
+    np.testing.assert_allclose(budget.total, sum(expected.values()), rtol=1e-9, atol=1e-20)
+    np.testing.assert_allclose(budget.sigmas["total"] ** 2, np.diag(budget.total))
 
 
 def test_a_kalman_filter_is_stable_up_to_the_tolerated_errors_of_its_model() -> None:

@@ -8,6 +8,7 @@ import pytest
 from gpuvision import RenderBoard
 from gpuvision.formats.cmos_sensor_file import read_cmos_sensor
 from gpuvision.host import Device, to_numpy
+from gpuvision.matching.artwork.shapes import area
 from gpuvision.servoing.frames import Transform, compose_poses, invert_pose
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
 from gpuvision.workflows.locating_part import locate_part, part_artwork
@@ -62,6 +63,9 @@ def test_drawing_from_above_is_mirrored() -> None:
     assert len(seen.edges.start) == len(above.edges.start) > 20
     for one, other in zip(seen.copper, above.copper, strict=True):
         assert {tuple(each) for each in one.outline} == {tuple(each) for each in other.outline}
+    # All outlines are counter-clockwise, also the mirrored ones and those that are drawn clockwise.
+    for artwork in (seen, above, part_artwork([each[::-1] for each in LEADS])):
+        assert all(area(each.outline) > 0.0 for each in artwork.copper)
     # Edges of the two point out of the leads.
     centres = np.array([each.outline.mean(axis=0) for each in above.copper])[above.edges.pad]
     middle = (above.edges.start + above.edges.end) / 2

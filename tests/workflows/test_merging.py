@@ -9,6 +9,7 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from gpuvision.ranging.merge_heights import DISAGREES, FIRST, SECOND, UNCONFIRME
 from gpuvision.ranging.regrid import Grid
 from gpuvision.status import Status
 from gpuvision.workflows import merging
-from gpuvision.workflows.merging import MERGE_FILES, SIGMA_FILE, merge_scans, read_height_map
+from gpuvision.workflows.merging import MERGE_FILES, SIGMA_FILE, HeightMapMerge, merge_scans, read_height_map
 
 CELL = 1e-4
 BOTH = FIRST | SECOND
@@ -234,3 +235,37 @@ def test_an_npz_is_read_once(scans: tuple[Path, Path], monkeypatch: pytest.Monke
     monkeypatch.setattr(np, "load", lambda path, **options: read.append(path) or load(path, **options))
     assert read_height_map(scans[0])[0].sigma is not None
     assert read == [scans[0] / "range_image.npz"]
+
+
+def test_advice_and_summary_state_the_numbers_of_the_merge() -> None:
+    """Ten common cells, two of which disagree; the second map lies 20 um lower, with a deviation of 1.4826 * 4 um."""
+    source = np.zeros((4, 10), np.uint8)
+    source[0], source[1, :7], source[2, :3] = FIRST | SECOND, FIRST, SECOND
+    source[0, :2] |= DISAGREES
+    source[3, :4] = UNCONFIRMED
+    grid = Grid(left=0.0, top=0.0, cell_x=1e-3, cell_y=1e-3, columns=10, rows=4)
+    heights: Any = SimpleNamespace(source=source)
+    merge = HeightMapMerge(
+        names=("a", "b"),
+        heights=heights,
+        grid=grid,
+        differences=np.array([-30.0, -24.0, -24.0, -23.0, -20.0, -20.0, -16.0, -16.0, -17.0, 90.0]) * 1e-6,
+        settings={"require_both": True},
+        without_sigma=(0.05, 0.051),
+    )
+    left_out, offset, disagreement = merge.advice()
+    assert left_out.startswith("b: 5 % of the heights have no standard deviation")
+    assert offset.startswith("the second map lies -20 um from the first one (median; robust deviation 5.93 um)")
+    assert disagreement.startswith("the maps disagree in 20 % of their common cells")
+    expected = (
+        "10 x 4 cells: 25.0 % from both, 17.5 % from the first alone, 7.5 % from the second alone, 50.0 % without"
+    )
+    assert merge.summary().startswith(expected)
+    assert (
+        "the maps disagree in 5.0 %; seen by one sensor and unconfirmed: 25.0 %, and 10.0 % dropped" in merge.summary()
+    )
+    # Half a deviation is no offset, a tenth of the cells no disagreement.
+    even = np.array([-1.0, 1.0] * 5) * 1e-6 * 1.4826
+    source[0, 1] = FIRST | SECOND
+    assert len(dataclasses.replace(merge, differences=even + 0.9e-6, without_sigma=(0.0, 0.05)).advice()) == 0
+    assert dataclasses.replace(merge, differences=np.zeros(0)).advice()[-1].startswith("the two maps have no common")

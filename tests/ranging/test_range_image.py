@@ -41,7 +41,7 @@ HEAD = RotatingSheet(
     sheet_offset=0.004,
     first_angle=-0.5,
     angle_step=0.2,
-    scene_axes=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
+    scene_axes=((2 / 3, -1 / 3, 2 / 3), (2 / 3, 2 / 3, -1 / 3), (-1 / 3, 2 / 3, 2 / 3)),
     scene_origin=(0.1, 0.7, 1.0),
 )
 

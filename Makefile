@@ -8,7 +8,7 @@ CACHES := XDG_CACHE_HOME="$(CURDIR)/build/cache" MPLCONFIGDIR="$(CURDIR)/build/c
 # otherwise.
 PYTEST = PYTHONDONTWRITEBYTECODE= .venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
 
-.PHONY: demo test test-full test-rusticl nightly fuzz mutants offline sanitize lint docs clean
+.PHONY: demo test test-full test-rusticl nightly fuzz mutants offline offline-ci sanitize lint docs clean
 
 demo: .venv/ready
 	.venv/bin/gpuvision demo
@@ -49,9 +49,13 @@ mutants: .venv/ready-tests
 # Compile the kernels for GPUs that need not be present (Debian packages clang-16 and libclc-16). OFFLINE_ARGS: targets
 # and options of `gpuvision profile`. Compiled kernels are cached: a second run compiles only the changed ones.
 OFFLINE_ARGS ?= --offline sm_70 --offline sm_90 --offline gfx90a --offline gfx1100
-offline: .venv/ready
-	.venv/bin/python -m pip --quiet --disable-pip-version-check install --editable ".[offline]"
+offline: .venv/ready-offline
 	$(CACHES) .venv/bin/gpuvision profile $(OFFLINE_ARGS)
+
+# A kernel of each file for AMD, all builds for NVIDIA: 100 s of processor time if nothing is cached.
+offline-ci: .venv/ready-offline
+	$(CACHES) .venv/bin/gpuvision profile --offline sm_90
+	$(CACHES) .venv/bin/gpuvision profile --offline gfx90a --one-build
 
 # Run all kernels in the simulator oclgrind (Debian package oclgrind): accesses beyond an array, data races. See
 # tests/sanitize.py. KERNELS: some kernel files, such as KERNELS="psd line".
@@ -79,12 +83,8 @@ docs: .venv/ready-docs
 	bash setup.sh
 	touch $@
 
-.venv/ready-tests: .venv/ready
-	bash setup.sh tests
-	touch $@
-
-.venv/ready-docs: .venv/ready
-	bash setup.sh docs
+.venv/ready-tests .venv/ready-docs .venv/ready-offline: .venv/ready-%: .venv/ready
+	bash setup.sh $*
 	touch $@
 
 clean:

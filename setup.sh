@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Set up .venv in this clone: `setup.sh` for the command, `setup.sh tests` for the tests and the lint as well,
-# `setup.sh docs` for the documentation as well.
+# `setup.sh docs` for the documentation as well, `setup.sh offline` for the compilation of kernels for GPUs as well.
 # It changes only .venv; as root it also installs missing Debian packages.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
@@ -77,6 +77,6 @@ case "${1:-}" in
     ensure_device
     ;;
   tests) install ".[test,cpu,profile]" ;; # both CPU runtimes are tested where both can run; benchmarks too
-  docs) install ".[docs]" ;;
-  *) fail "expected no argument, 'tests' or 'docs', got '$1'" ;;
+  docs | offline) install ".[$1]" ;;
+  *) fail "expected no argument, 'tests', 'docs' or 'offline', got '$1'" ;;
 esac

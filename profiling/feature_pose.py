@@ -93,6 +93,12 @@ def _camera(expected, board, pose):
     pose[2] = expected[2] - board[2]
 
 
+@functools.cache
+def _estimators() -> dict[str, Any]:
+    """Return the expert's Numba functions for `RULERS` rulers by name, compiled once for frames of all sizes."""
+    return {name: _estimator(measure) for name, measure in ruler_peers.expert_forms(RULERS).items()}
+
+
 def _estimator(measure: Any) -> Any:
     """Return a Numba function that computes the pose of the camera in one call; `measure` measures the rulers."""
 
@@ -170,8 +176,7 @@ def _case(device: Device, size: int) -> Case:
 
     forms: dict[str, Callable[[], object]] = {}
     poses: dict[str, NDArray[Any]] = {}
-    for name, measure in ruler_peers.expert_forms(RULERS).items():
-        estimate = _estimator(measure)
+    for name, estimate in _estimators().items():
         forms[name] = functools.partial(estimate, frame, views, PREDICTED, point, normal, taps, numbers, starts, work)
         forms[name]()
         poses[f"numba {name}"] = found.copy()

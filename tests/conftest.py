@@ -3,8 +3,9 @@
 The option ``--tier`` selects the tests. ``fast`` runs all tests without the mark ``slow`` on the best device, and a
 smoke set on every other device: one test for each kernel. Of tests with several parameters it runs a covering design,
 of both variants of a kernel a few tests for each file, and of hypothesis tests fewer examples, see `tiers`.
-``full`` runs all tests on the best device; on every other device it runs no slow tests, and a covering design of
-products of three or more parameters. ``nightly`` runs all tests on every device, with more hypothesis examples.
+``full`` runs all tests on the best device, and a covering design of products of kernel tests; on every other device it
+runs no slow tests, and smaller designs. ``nightly`` runs all tests and all cases on every device, also those with the
+mark ``nightly``, with more hypothesis examples.
 ``GPUVISION_DEVICE`` selects the best device, see `Device.best`.
 
 The option ``--one-case`` reduces the fast and the full tier to the best device, and to one case of each test function

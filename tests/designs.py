@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+
+Combination = tuple[tuple[str, str], ...]
+"""Names and texts of the values of some parameters."""
 
 
-def covering(cases: Sequence[Mapping[str, object]], strength: int) -> list[int]:
+def covering(
+    cases: Sequence[Mapping[str, object]], strength: int, *, held: AbstractSet[Combination] = frozenset()
+) -> list[int]:
     """Return the indices of cases that hold every combination of values of `strength` parameters in `cases`.
 
     Parameters
@@ -15,6 +21,8 @@ def covering(cases: Sequence[Mapping[str, object]], strength: int) -> list[int]:
         Values of the parameters, by name. Values are equal where their texts (`repr`) are.
     strength : int
         1: every value of each parameter; 2: every pair of values of two parameters.
+    held : set of tuple, optional
+        Combinations that other cases hold, see `combinations`: this design need not hold them.
 
     Returns
     -------
@@ -33,17 +41,20 @@ def covering(cases: Sequence[Mapping[str, object]], strength: int) -> list[int]:
     [0, 3, 5, 6]
     >>> covering(product, 1)
     [0, 7]
+    >>> covering(product, 1, held={(("a", repr("x")),), (("b", repr("x")),), (("c", repr("x")),)})
+    [7]
     """
-    held = [set(_combinations(case, strength)) for case in cases]
-    missing = set().union(*held)
+    of_case = [set(combinations(case, strength)) for case in cases]
+    missing = set().union(*of_case) - held
     chosen = []
     while missing:
-        best = max(range(len(cases)), key=lambda k: len(held[k] & missing))  # the first of equals
+        best = max(range(len(cases)), key=lambda k: len(of_case[k] & missing))  # the first of equals
         chosen.append(best)
-        missing -= held[best]
+        missing -= of_case[best]
     return sorted(chosen)
 
 
-def _combinations(case: Mapping[str, object], strength: int) -> Iterator[tuple[tuple[str, str], ...]]:
+def combinations(case: Mapping[str, object], strength: int) -> Iterator[Combination]:
+    """Yield the combinations of values of `strength` parameters in a case, as names and texts."""
     values = [(name, repr(value)) for name, value in sorted(case.items())]
     return itertools.combinations(values, strength)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import designs
-from designs import covering
+from designs import combinations, covering
 
 PRODUCT = [dict(zip("abcd", case, strict=True)) for case in itertools.product(range(9), "xy", (1.5, None, ()), "pq")]
 
@@ -42,5 +42,17 @@ def test_each_value_of_two_parameters() -> None:
     assert len(covering(cases, 1)) == 4
 
 
+@pytest.mark.parametrize("strength", [1, 2])
+def test_combinations_of_other_cases_are_not_held_again(strength: int) -> None:
+    """The cases that remain are few, and hold together with the other cases what all cases hold."""
+    others = PRODUCT[:5]
+    held = {each for case in others for each in combinations(case, strength)}
+    chosen = covering(PRODUCT, strength, held=held)
+    together = [*others, *(PRODUCT[k] for k in chosen)]
+    assert held_by(together, strength) == held_by(PRODUCT, strength)
+    assert len(chosen) < len(covering(PRODUCT, strength))
+    assert covering(others, strength, held=held) == []
+
+
 def test_docstring() -> None:
-    assert doctest.testmod(designs) == (0, 3)
+    assert doctest.testmod(designs) == (0, 4)

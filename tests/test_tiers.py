@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import os
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from tiers import (
     is_refused,
     one_case_each,
     select_fast,
+    select_full,
     split_refused,
     without_other_variants,
 )
@@ -57,7 +59,7 @@ def test_the_fast_tier_has_each_killing_test(request: pytest.FixtureRequest, nam
 def test_the_fast_tier_holds_each_value_of_each_parameter(request: pytest.FixtureRequest) -> None:
     best = best_devices()
     items = [item for item in collected_items(request.session) if device_of(item) in (None, *best)]
-    fast = [item for item in items if item.get_closest_marker("slow") is None]
+    fast = [item for item in items if not any(item.get_closest_marker(mark) for mark in ("slow", "nightly"))]
     expected = _values(list(without_other_variants(fast)))
     assert _values(select_fast(items, best).chosen) == expected
 
@@ -69,6 +71,78 @@ def _values(items: list[pytest.Item]) -> set[tuple[object, ...]]:
         if hasattr(item, "callspec")
         for name, value in item.callspec.params.items()
     }
+
+
+class Case(SimpleNamespace):
+    """Stand-in of a test: equal only to itself, and hashable."""
+
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+
+LISTS: dict[str, list[Any]] = {"variant": ["vector", "work_item"], "kernel": [(a, b) for a in "xyz" for b in (1, 2)]}
+LISTS["dtype"] = [np.uint8, np.float32, np.float64]
+ENTRIES = ("variant", "first", "second", "dtype")
+
+
+def _kernel_cases(
+    function: str, device: Any, *, mark: str = "", lists: dict[str, list[Any]] = LISTS, stem: str = "test_psd"
+) -> list[Any]:
+    """Return the product of values as cases of a test of a kernel."""
+    path = ROOT / "tests" / "ranging" / f"{stem}.py"
+    return [
+        Case(
+            path=path,
+            parent=path,
+            name="",
+            originalname=function,
+            callspec=SimpleNamespace(params={"device": device, **dict(zip(lists, values, strict=True))}),
+            iter_markers=lambda name: [SimpleNamespace(args=[each]) for each in lists],
+            get_closest_marker=lambda name: name if name == mark else None,
+        )
+        for values in itertools.product(*lists.values())
+    ]
+
+
+def _held(items: list[Any], strength: int) -> set[Any]:
+    """Return the combinations of values in cases; entries of the parameter ``kernel`` are parameters."""
+    held = set()
+    for item in items:
+        params = item.callspec.params
+        values = (params["variant"], *params["kernel"], params["dtype"])
+        held.update(itertools.combinations(zip(ENTRIES, values, strict=True), strength))
+    return held
+
+
+def test_the_full_tier_holds_each_pair_of_values() -> None:
+    """On the best device in each kernel test; on another one in one test of the file, and each value in each test."""
+    best, other = Case(label="best"), Case(label="other")
+    cases = {(name, each.label): _kernel_cases(name, each) for name in ("a", "b") for each in (best, other)}
+    chosen = select_full(list(itertools.chain(*cases.values())), [best]).chosen  # type: ignore[list-item]
+    kept = {key: [item for item in items if item in chosen] for key, items in cases.items()}
+    every = cases["a", "best"]
+    for name in ("a", "b"):
+        assert _held(kept[name, "best"], 2) == _held(every, 2)
+        assert _held(kept[name, "other"], 1) == _held(every, 1)
+        assert 9 <= len(kept[name, "best"]) <= 14
+    assert _held(kept["a", "other"], 2) == _held(every, 2)
+    assert len(kept["b", "other"]) == 3
+
+
+def test_the_full_tier_holds_chosen_examples_and_other_tests() -> None:
+    """On the best device all cases of one list, and of tests that are not about a kernel."""
+    best = Case(label="best")
+    listed = _kernel_cases("a", best, lists={"kernel": LISTS["kernel"]})
+    items = [*listed, *_kernel_cases("b", best, stem="test_focus")]
+    assert select_full(items, [best]).chosen == items  # type: ignore[list-item]
+
+
+def test_only_the_nightly_tier_has_nightly_tests() -> None:
+    best = Case(label="best", prefers_vectors=True)
+    items = _kernel_cases("a", best, mark="nightly")
+    for select in (select_fast, select_full):
+        selection = select(items, [best])  # type: ignore[list-item]
+        assert (selection.chosen, selection.left) == ([], items)
 
 
 @pytest.mark.parametrize(
@@ -197,13 +271,6 @@ def test_a_run_in_which_pocl_refuses_doubles_fails(tmp_path: Path, workers: int)
     run = run_cases(tmp_path, Device.best(), "'pocl'", workers=workers)
     assert run.returncode not in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
     assert "refuses test_cases.py::test_case[" in run.stdout + run.stderr, run.stdout
-
-
-class Case(SimpleNamespace):
-    """Stand-in of a test: equal only to itself, and hashable."""
-
-    __eq__ = object.__eq__
-    __hash__ = object.__hash__
 
 
 def test_one_case_of_each_function_of_a_kernel(tmp_path: Path) -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
-from designs import covering
+from designs import Combination, combinations, covering
 from gpuvision.host import Device
 from gpuvision.host.errors import GpuVisionError
 from gpuvision.host.launch import Variant
@@ -69,15 +69,18 @@ def best_devices() -> tuple[Device, ...]:
 def select_full(items: Sequence[pytest.Item], best: Collection[Device]) -> Selection:
     """Return the full tier of some tests; `best` has the best device.
 
-    The best device runs all tests. Every other device runs no slow tests: these measure accuracy, which the comparison
-    of the devices with the references covers. Of the tests of kernels it runs designs that hold each pair of values, of
-    tests that use the kernels of other files smaller designs.
+    The best device runs all tests; of kernel tests with several ``parametrize`` marks it runs a design that holds each
+    pair of values. Every other device runs no slow tests: these measure accuracy, which the comparison of the devices
+    with the references covers. It runs each value of each kernel test, and each pair of values in one kernel test of
+    the file; of tests that use the kernels of other files it runs designs as the fast tier does.
     """
     others = [item for item in items if device_of(item) not in (None, *best)]
     short = [item for item in others if item.get_closest_marker("slow") is None]
-    kept = set(_designed([item for item in short if _is_of_kernel(item)], pairs=True))
+    kernels = [item for item in items if device_of(item) in best and _is_of_kernel(item) and _has_product(item)]
+    kept = {*_pairs(kernels), *_pairs_of_files([item for item in short if _is_of_kernel(item)])}
     kept.update(_designed([item for item in short if not _is_of_kernel(item)]))
-    left = [item for item in others if item not in kept]
+    designed = {*others, *kernels}
+    left = [item for item in items if (item in designed and item not in kept) or _is_nightly(item)]
     omitted = set(left)
     return Selection([item for item in items if item not in omitted], left, set())
 
@@ -88,7 +91,7 @@ def select_fast(items: Sequence[pytest.Item], best: Collection[Device]) -> Selec
     It leaves out slow tests, cases of the kernel variant that the device does not use by default beyond the first
     functions of a file, cases beyond a covering design and, on all devices but the best, tests beyond the smoke set.
     """
-    fast = [item for item in items if item.get_closest_marker("slow") is None]
+    fast = [item for item in items if item.get_closest_marker("slow") is None and not _is_nightly(item)]
     designed = set(_designed(list(without_other_variants(fast))))
     selection = Selection([], [], set())
     seen = set()
@@ -211,19 +214,16 @@ def _has_usual_variant(item: pytest.Item) -> bool:
     return device is None or variant != ("work_item" if device.prefers_vectors else "vector")
 
 
-def _designed(items: Sequence[pytest.Item], *, pairs: bool = False) -> Iterator[pytest.Item]:
+def _designed(items: Sequence[pytest.Item]) -> Iterator[pytest.Item]:
     """Yield a covering design of the cases of each test.
 
     Most of a kernel test's time is compilation, once for each kernel variant, dtype and option. Of a test with two
     parameters the design holds each value, of a test with more each pair of values; the device is not a parameter.
     Parameters that one mark lists together count as one: always in tests without a device, whose lists are chosen
-    examples, and in kernel tests if the design is smaller then. With `pairs`, and in ``tests/host``, which compiles
-    little, it holds each pair of values in all cases.
+    examples, and in kernel tests if the design is smaller then. In ``tests/host``, which compiles little, it holds each
+    pair of values in all cases.
     """
-    functions: dict[Any, list[pytest.Item]] = {}
-    for item in items:
-        functions.setdefault((item.parent, function_of(item), device_of(item)), []).append(item)
-    for (_, _, device), cases in functions.items():
+    for (_, _, device), cases in _by_function(items):
         single = [{name: value for name, value in _parameters_of(item).items() if name != "device"} for item in cases]
         joined = _joined(cases) if single[0] else single
         parameters = joined if device is None else single
@@ -231,10 +231,67 @@ def _designed(items: Sequence[pytest.Item], *, pairs: bool = False) -> Iterator[
             yield from cases
             continue
         design = covering(parameters, 2)
-        if not (pairs or _is_of_host(cases[0])):
+        if not _is_of_host(cases[0]):
             others = (joined,) if device is None else (single, joined)
             design = min((design, *(covering(each, 1) for each in others if _varying(each) == 2)), key=len)
         yield from (cases[k] for k in design)
+
+
+def _pairs(items: Sequence[pytest.Item]) -> Iterator[pytest.Item]:
+    """Yield a design for each test function and device that holds each pair of values; see `_entries`."""
+    for _, cases in _by_function(items):
+        entries = _entries(cases)
+        design = covering(entries, 2) if len(entries[0]) > 1 else range(len(cases))
+        yield from (cases[k] for k in design)
+
+
+def _pairs_of_files(items: Sequence[pytest.Item]) -> Iterator[pytest.Item]:
+    """Yield designs that hold each value in each test function, and each pair of values in one function of the file.
+
+    Test functions of a file use the same names of parameters, and the same build options.
+    """
+    held: dict[Any, set[Combination]] = {}
+    for (parent, _, device), cases in _by_function(items):
+        entries = _entries(cases)
+        if len(entries[0]) < 2:
+            yield from cases
+            continue
+        of_file = held.setdefault((parent, device), set())
+        design = set(covering(entries, 1))
+        of_file.update(*(combinations(entries[k], 2) for k in design))
+        design.update(covering(entries, 2, held=of_file))
+        of_file.update(*(combinations(entries[k], 2) for k in design))
+        yield from (cases[k] for k in sorted(design))
+
+
+def _by_function(items: Sequence[pytest.Item]) -> Iterable[tuple[tuple[Any, str, Device | None], list[pytest.Item]]]:
+    """Return the cases of each test function on each device."""
+    functions: dict[tuple[Any, str, Device | None], list[pytest.Item]] = {}
+    for item in items:
+        functions.setdefault((item.parent, function_of(item), device_of(item)), []).append(item)
+    return functions.items()
+
+
+def _entries(cases: Sequence[pytest.Item]) -> list[dict[str, Any]]:
+    """Return the varying parameters of each case; entries of tuples of one length are parameters."""
+    columns: dict[str, list[Any]] = {}
+    for name in _parameters_of(cases[0]):
+        values = [_parameters_of(item)[name] for item in cases]
+        if all(isinstance(value, tuple) and len(value) == len(values[0]) for value in values):
+            columns.update({f"{name}.{k}": list(entries) for k, entries in enumerate(zip(*values, strict=True))})
+        else:
+            columns[name] = values
+    varying = {name: values for name, values in columns.items() if len(set(map(repr, values))) > 1}
+    return [{name: values[k] for name, values in varying.items()} for k in range(len(cases))]
+
+
+def _is_nightly(item: pytest.Item) -> bool:
+    return item.get_closest_marker("nightly") is not None
+
+
+def _has_product(item: pytest.Item) -> bool:
+    """Return whether several ``parametrize`` marks, besides the device, multiply the cases of a test."""
+    return len(list(item.iter_markers("parametrize"))) > 1
 
 
 def _varying(cases: Sequence[Mapping[str, Any]]) -> int:

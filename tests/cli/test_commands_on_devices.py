@@ -24,7 +24,8 @@ from gpuvision.host import Device
 from scanning import currents
 
 MAIN = "from gpuvision.cli.main import main; main()"
-# Lines before the command that shorten a job: the demonstration to four profiles, the profile to one short call.
+# Lines before the command that shorten a job: the demonstration to four profiles, the profile to one short call, the
+# tuning to one size.
 SHORTER = {
     "demo": """
 import functools, gpuvision.workflows.demo as demo
@@ -34,6 +35,10 @@ demo.make_scan_task = functools.partial(demo.make_scan_task, profiles=4)
 import itertools, gpuvision.profiling.psd as psd
 all_cases = psd.cases
 psd.cases = lambda device: itertools.islice(all_cases(device), 1, 2)
+""",
+    "tune": """
+import gpuvision.cli.tune as tune
+tune._CLASSES = range(5, 6)
 """,
 }
 LAYER_WORDS = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]
@@ -125,7 +130,7 @@ JOBS: dict[str, Callable[[Path], Words]] = {
     "demo": lambda _: ["--out", "out"],
     "devices": lambda _: [],
     "profile": lambda _: ["psd", "--seconds", 0.01],
-    "curves": lambda _: ["pose", "--seconds", 0.01],
+    "curves": lambda _: ["psd", "--seconds", 0.01],
     "tune": lambda _: ["merge_heights", "--dry-run"],
 }
 # Jobs whose result is refused, in one line, because a driver computes it wrongly; see `driver_faults`.

@@ -32,9 +32,9 @@ def _python_of(page: str) -> list[tuple[int, str]]:
     return [(text.count("\n", 0, each.start(3)) + 1, each[3]) for each in found if each[2].strip() == "python"]
 
 
-# A page with the operations of another page, for which other kernels are compiled, and a page whose calibration the
-# tests of workflows run.
-SLOW = {"docs/tutorials/first_pose.md", "docs/guides/calibrate_sensor.md"}
+# A page with the operations of another page, for which other kernels are compiled, and pages whose calibration and
+# plan of a scan the tests of workflows run.
+SLOW = {"docs/tutorials/first_pose.md", "docs/guides/calibrate_sensor.md", "docs/guides/plan_scan.md"}
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -126,19 +127,24 @@ def test_results_with_tables_in_global_memory(
     assert_the_same(example, device, moved, little_memory)
 
 
+@functools.cache
+def example_of_each_kernel(device: Device) -> dict[str, Example]:
+    """Return the first example of each kernel function; to make all examples takes a second."""
+    found: dict[str, Example] = {}
+    for example in all_examples():
+        if example.has_double == device.has_double:
+            launch = example.operation.launch(device, example.shape, np.dtype(example.dtype))
+            found.setdefault(launch.kernel, example)
+    return found
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS_WITH_TABLES)
 def test_every_kernel_with_constant_tables(
     device: Device, kernel: str, moved: list[str], little_memory: Callable[[], None]
 ) -> None:
     """Also constants of the kernel file, and functions that take tables, compile with tables in global memory."""
-    for example in all_examples():
-        if example.has_double == device.has_double:
-            launch = example.operation.launch(device, example.shape, np.dtype(example.dtype))
-            if launch.kernel == kernel:
-                assert_the_same(example, device, moved, little_memory)
-                return
-    pytest.fail(f"no example of {kernel}")
+    assert_the_same(example_of_each_kernel(device)[kernel], device, moved, little_memory)
 
 
 def test_constants_of_kernel_files_stay_constant() -> None:

@@ -426,7 +426,7 @@ def test_pads_that_cover_each_other_end_the_search_for_edges(tmp_path: Path, mon
         read_artwork(folder, layers=LAYERS)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_crowded_board_is_refused_in_time(tmp_path: Path) -> None:
     """The largest allowed number of copies, all upon each other."""
     outcomes, peak = run(_READ_BOARD, board(tmp_path, "%SRX200Y200I0.01J0.01*%\nD11*\nX0Y0D03*\n%SR*%\n"))

@@ -49,7 +49,7 @@ def render(lit: LitScene, samples: int) -> Picture:
     return np.array([picture(samples, seed) for seed in range(SEEDS)])
 
 
-@pytest.fixture(scope="module", params=[90.0, 60.0], ids=["corner", "groove"])
+@pytest.fixture(scope="module", params=[90.0, pytest.param(60.0, marks=pytest.mark.nightly)], ids=["corner", "groove"])
 def glowing(request):
     """Return the angle in degrees, Mitsuba's images, and gpuvision's image."""
     lit = groove(np.radians(request.param))
@@ -87,6 +87,8 @@ def busy():
     return lit, render(lit, 512)
 
 
+# The tests of occluded irradiance compare it with rays.
+@pytest.mark.nightly
 def test_a_board_gets_the_light_of_what_it_sees(busy):
     lit, pictures = busy
     expected, whole = expect(lit, occluding=True)
@@ -100,6 +102,7 @@ def test_a_board_gets_the_light_of_what_it_sees(busy):
     assert found.bias_sigma < 4e-3
 
 
+@pytest.mark.nightly
 def test_a_board_through_which_light_goes_is_another_one(busy):
     lit, pictures = busy
     expected, whole = expect(lit, occluding=False)

@@ -32,6 +32,7 @@ from gpuvision.host.errors import ReadError
 from gpuvision.host.files import atomic_write
 from gpuvision.host.image_files import read_image
 from gpuvision.host.reading import check_archive, reading
+from gpuvision.host.text import printable
 from gpuvision.host.tiff_files import check_tiff_page
 from gpuvision.ranging.regrid import Grid
 
@@ -175,7 +176,7 @@ def read_tiff(path: str | os.PathLike[str]) -> HeightFile:
         description = json.loads(page.description)
         quantity = description.get("quantity", "height")
         if quantity != "height":
-            raise ReadError(f"{path}: its values are the {quantity}, expected heights")
+            raise ReadError(f"{path}: its values are the {printable(str(quantity))}, expected heights")
         if z.ndim != 2 or z.dtype.kind not in "iuf":
             raise ReadError(f"{path}: an image of shape {z.shape} and type {z.dtype}, expected heights (rows, columns)")
         return HeightFile(z, _grid_of(description, z.shape))

@@ -158,6 +158,9 @@ def test_a_tiff_of_another_quantity_is_refused(tmp_path, rng):
     write_tiff(tmp_path / "sigma.tiff", rng.normal(size=GRID.shape), GRID, quantity="random sigma of height")
     with pytest.raises(ValueError, match=r"sigma\.tiff: its values are the random sigma of height, expected heights"):
         read_heights(tmp_path / "sigma.tiff")
+    write_tiff(tmp_path / "escape.tiff", rng.normal(size=GRID.shape), GRID, quantity="\x1b[2Jsigma\x7f")
+    with pytest.raises(ValueError, match=r"escape\.tiff: its values are the sigma\?, expected heights"):
+        read_tiff(tmp_path / "escape.tiff")
     tifffile.imwrite(tmp_path / "colour.tiff", np.zeros((3, 4, 3), np.uint8), photometric="rgb", description="{}")
     with pytest.raises(ValueError, match=r"colour\.tiff: an image of shape \(3, 4, 3\)"):
         read_tiff(tmp_path / "colour.tiff")

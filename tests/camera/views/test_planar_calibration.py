@@ -259,6 +259,15 @@ def test_one_view_with_a_known_focal_length(kind, tilt, draws):
         assert error @ np.linalg.solve(fit.covariance, error) < 45.0
 
 
+def test_one_view_of_an_untilted_sensor_with_a_known_focal_length(rng):
+    """No closed form gives a start: it comes from the search for the scale, which then has the known one only."""
+    made = scene(rng, "grid", 0, corner_px=10.0, views=1, weakest=5.0)
+    fit = fit_camera(made.views(rng, 0.05), made.size, model="k1,k2", focal_length=made.truth[0])
+    error = (found(fit) - made.truth)[1:5]
+    assert fit.sigma_px == pytest.approx(0.05, rel=5.0 / math.sqrt(2.0 * (2 * len(made.targets[0]) - 10)))
+    assert error @ np.linalg.solve(fit.covariance[:4, :4], error) < 40.0  # chi-squared of 4 at 1e-7
+
+
 def test_a_known_centre_fixes_the_tilt_without_distortion(rng):
     made = scene(rng, "grid", 20, corner_px=0.0)
     views = made.views(rng, 0.1)

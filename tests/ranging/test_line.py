@@ -116,7 +116,7 @@ def test_fits(device, rng, method, dtype, along, variant):
     reading = without_bright_frames(readout(between_bright_frames(frames), device=device))
     expected = read_lines(frames, **parameters)
     if method == "ml":
-        # The stated bound is 1.5e-4 px; with this noise the fits agree better.
+        # With these draws; other draws have larger errors in up to 1 % of the lines, see the next test.
         np.testing.assert_array_equal(reading.status & ~np.uint8(AMBIGUOUS), expected["status"])
         settled = (reading.status & AMBIGUOUS) == 0
         assert settled.mean() > 0.95
@@ -124,6 +124,25 @@ def test_fits(device, rng, method, dtype, along, variant):
     else:
         # The rounding errors of a logarithm or quotient are larger where the peak is flat.
         assert_same(reading, expected, slack=20.0)
+
+
+@pytest.mark.slow
+def test_few_fits_end_early(device, rng):
+    """The iteration of some weak lines ends before the error that is usual; the docstring states both."""
+    parameters = {"method": "ml", "threshold": LEVEL["uint8"], "window": WINDOW, "read_noise": 5.1, "gain": 0.3}
+    readout = LineReadout(**parameters)
+    errors = []
+    for _ in range(6):
+        frames = np.pad(line_frames(rng, "uint8", (1, 40, 83)), ((0, 0), (5, 5), (0, 0)))
+        reading = readout(frames, device=device)
+        settled = (reading.status & AMBIGUOUS) == 0
+        error = np.abs(reading.position - read_lines(frames, **parameters)["position"])[settled]
+        errors.append(error[np.isfinite(error)])
+    error = np.concatenate(errors)
+    assert len(error) > 400
+    # 21 of 4182 errors were above 1.5e-4 px; the largest was 6.4e-4 px.
+    assert np.mean(error > 1.5e-4) < 0.02
+    assert np.max(error) < 1e-3
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

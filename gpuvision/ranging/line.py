@@ -180,10 +180,11 @@ class LineReadout(VisionOperation[LineReading]):
     Error: integer samples are summed exactly. The rounding errors of float32 sums are kept in a second number
     (compensated summation). The rounding error of the position is a few ulp.
 
-    The position of ``"ml"`` is within 1.5e-4 px of the maximum of the likelihood in 99 % of the lines that noise scatters
-    by less than 0.1 px. In some lines the iteration ends earlier: the largest of 4182 errors was 6.4e-4 px (lines of
-    sigma 1.7 px, noise of 5 grey levels, random errors of 0.03 to 0.1 px). Lines with a sigma from 1.6 px to the smaller of 12 px and `window` are fitted as Gaussians sampled at the
-    pixels, several times as fast as the integrals over pixels of other lines.
+    The position of ``"ml"`` is within 1.5e-4 px of the maximum of the likelihood in 99 % of the lines that noise
+    scatters by less than 0.1 px. In some lines the iteration ends earlier: the largest of 4182 errors was 6.4e-4 px
+    (lines of sigma 1.7 px, noise of 5 grey levels, random errors of 0.03 to 0.1 px). Lines with a sigma from 1.6 px
+    to the smaller of 12 px and `window` are fitted as Gaussians sampled at the pixels, several times as fast as the
+    integrals over pixels of other lines.
 
     Noise: the variance of a sample is ``read_noise**2 + gain * level``, plus 1/12 for integer frames (quantisation).
     ``sigma`` is its effect on the estimator, to first order:

@@ -30,6 +30,8 @@ class ManualClock:
         return self.now
 
     def sleep(self, seconds: float) -> None:
+        if seconds < 0.0:  # as `time.sleep`
+            raise ValueError("sleep length must be non-negative")
         self.now += round(seconds * 1e9)
 
 

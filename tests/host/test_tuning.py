@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gpuvision.camera.undistort_points import UndistortPoints
-from gpuvision.host import Device, Launch, LaunchBuilder, Operation, Tunable, clear_cache, tuned_settings
+from gpuvision.host import Device, Launch, LaunchBuilder, Operation, Tunable, clear_cache, tuned_settings, tuning
 from gpuvision.host.tuned_settings import (
     DEFAULTS,
     TunedEntry,
@@ -24,7 +24,7 @@ from gpuvision.host.tuned_settings import (
     size_class,
     trial_of,
 )
-from gpuvision.host.tuning import TuningResult, tune
+from gpuvision.host.tuning import TuningResult, _candidates, _Trial, tune
 from gpuvision.profiling import tuning_inputs
 from gpuvision.ranging.merge_heights import MergeHeights
 from gpuvision.ranging.psd import PsdReadout
@@ -131,6 +131,40 @@ def test_a_tolerance_allows_small_differences_only(scale: Scale, device: Device)
     result = tune(Tolerant(), ramp, tune_devices(device), 3, stopwatch=stopwatch(fast))
     assert result.best == TunedSettings(group=128)
     assert {each.group for each in result.rejected} == {16, 32}
+
+
+def test_a_missing_write_shows_although_the_memory_holds_the_right_values(scale: Scale, device: Device) -> None:
+    """The kernel does not write the field in groups of 32."""
+    values = ramp(100)
+    trial = _Trial(scale, tune_devices(device), values, TunedSettings(group=32))
+    trial.bound.outputs.wrong.set(values[0])
+    assert (
+        trial.difference({"doubled": 2.0 * values[0], "wrong": values[0]}, Tunable()) == "another result: field wrong"
+    )
+    found = trial.result()
+    np.testing.assert_array_equal(found["doubled"], 2.0 * values[0])
+    assert not np.any(found["wrong"] == values[0])
+
+
+class Short(Scale):
+    """Scale that reads and writes its memory once: 12 bytes for each element."""
+
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        return replace(super().launch(device, shape, dtype), passes_once=True)
+
+
+def test_inline_calls_are_offered_up_to_the_limit(
+    scale: Scale, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not device.has_inline_queues:
+        pytest.skip(f"{device.label} has no inline queues")
+    trial = _Trial(Short(), tune_devices(device), ramp(100), DEFAULTS)
+    for limit, choices in ((1200, {None, not trial.bound.inline}), (1199, {None})):
+        monkeypatch.setattr(tuning, "MAX_INLINE_BYTES", limit)
+        offered = [*_candidates(Tunable(groups=(16, 64)), trial)]
+        assert {each.inline for each in offered} == choices
+        assert {each.group for each in offered} == {None, 16, 64}
+        assert len(offered) == 3 * len(choices)
 
 
 class Refusing(Scale):

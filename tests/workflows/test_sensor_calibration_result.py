@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from gpuvision.workflows.sensor_calibration_result import SensorCalibration, sensor_calibration_files
+from gpuvision.workflows.sensor_calibration_result import SensorCalibration, _picture, sensor_calibration_files
 
 
 class BendTest(NamedTuple):
@@ -136,3 +137,32 @@ def test_pixels_and_files() -> None:
     np.testing.assert_array_equal(found.some_pixels(), every[::16])
     names = [each.name for each in sensor_calibration_files(Path("out/sensor.toml"))]
     assert names == ["sensor.toml", "sensor.json", "sensor.png"]
+
+
+def test_picture() -> None:
+    """The image has a target and the most readings; without a target the most readings; else it is a target view."""
+    grids = [np.full((2, 3, 2), value) for value in (1.0, 2.0, 3.0)]
+    targets = [SimpleNamespace(image=Path("in") / f"{n}.png", grid=grid) for n, grid in enumerate(grids)]
+    camera: Any = SimpleNamespace(detected_targets=targets, summary=lambda: "camera")
+    found = replace(
+        calibration(coordinates=(np.ones(4), np.zeros(4))),
+        calibration=camera,
+        lines=(line("a.png", 5, 17.0), None, line("c.png", 6, 17.0)),
+        other_lines=(line("b.png", 11, 18.0),),
+    )
+    picture = _picture(found)
+    assert picture.title == f"camera\n{found.summary()}"
+    assert picture.image == Path("in") / "c.png"
+    np.testing.assert_array_equal(picture.grid, grids[2])
+    np.testing.assert_array_equal(picture.line, found.readings[1].points)
+    assert [len(each) for each in picture.lines] == [5, 6, 11]
+    sheet = found.geometry.sheet
+    assert picture.coordinates is sheet.coordinates
+    assert picture.residuals is sheet.residuals
+    assert picture.sigma_px == 0.06
+    for threshold, image, grid in ((18.0, "b.png", np.zeros((0, 0, 2))), (np.nan, "0.png", grids[0])):
+        others = (line("d.png", 7, threshold), line("b.png", 11, threshold))
+        picture = _picture(replace(found, lines=(None, None, None), other_lines=others))
+        assert picture.image == Path("in") / image
+        np.testing.assert_array_equal(picture.grid, grid)
+        np.testing.assert_array_equal(picture.line, others[1].points)

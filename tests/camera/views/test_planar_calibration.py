@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from gpuvision.camera.patterns.pattern import PatternGrid
-from gpuvision.camera.views.planar_calibration import fit_camera
+from gpuvision.camera.views.diagnosis import DEFAULT_LIMITS
+from gpuvision.camera.views.parameters import FIT_PARAMETERS
+from gpuvision.camera.views.planar_calibration import _prepare, _starting_states, fit_camera
 from gpuvision.camera.views.target_views import make_view
 from tilted_camera import (
     KINDS,
@@ -266,6 +268,56 @@ def test_one_view_of_an_untilted_sensor_with_a_known_focal_length(rng):
     error = (found(fit) - made.truth)[1:5]
     assert fit.sigma_px == pytest.approx(0.05, rel=5.0 / math.sqrt(2.0 * (2 * len(made.targets[0]) - 10)))
     assert error @ np.linalg.solve(fit.covariance[:4, :4], error) < 40.0  # chi-squared of 4 at 1e-7
+
+
+@pytest.mark.parametrize("fixed", [{}, {"centre": (639.5, 511.5)}])
+def test_the_start_is_exact_where_the_homographies_are(fixed, rng):
+    """Exact points, no tilt, and a lens about the middle of the image: the closed form leaves nothing to adjust."""
+    made = scene(rng, "grid", 0, corner_px=8.0, views=4)
+    middle = 0.5 * (np.array(made.size) - 1.0)
+    made.matrix[:2, 2] = middle
+    views = []
+    for target, rotation, translation in zip(made.targets, made.rotations, made.translations, strict=True):
+        vector = cv2.Rodrigues(rotation)[0]
+        views.append((target, cv2.projectPoints(target, vector, translation, made.matrix, made.distortion)[0][:, 0]))
+    task = _prepare(views, made.size, None, fixed.get("centre"), "squared", None, False, DEFAULT_LIMITS)
+    for model, free in (("k1,k2", ("k1", "k2")), ("tilt", ("k1", "k2")), ("k1", ("k1",)), ("none", ())):
+        start = next(_starting_states(task, task.free_parameters(model)))
+        values = dict(zip(FIT_PARAMETERS, start.values, strict=True))
+        coefficients = dict(zip(("k1", "k2"), made.distortion, strict=False))
+        expected = {"f": made.matrix[0, 0], "aspect": 1.0, "v_column": middle[0], "v_row": middle[1]}
+        expected |= {"c_column": middle[0], "c_row": middle[1]} | {name: coefficients[name] for name in free}
+        for name, value in values.items():
+            assert value == pytest.approx(expected.get(name, 0.0), rel=1e-4, abs=1e-9), (model, name)
+        np.testing.assert_allclose(start.rotations, made.rotations, atol=1e-6)
+        np.testing.assert_allclose(start.translations, made.translations, rtol=1e-5, atol=1e-7)
+
+
+def test_the_search_covers_three_tilts_in_eight_directions(rng):
+    """About the centre, in units of half the diagonal of the image; the distance of v from it is f' sin(alpha)."""
+    made = scene(rng, "grid", 0, corner_px=5.0, views=1)
+    middle, radius = 0.5 * (np.array(made.size) - 1.0), 0.5 * math.hypot(*made.size)
+    given = {None: [0.6, 1.2, 2.5, 5.0, 10.0], 2000.0: [2000.0 / radius]}
+    for focal_length, scales in given.items():
+        task = _prepare(made.views(rng, 0.0), made.size, focal_length, None, "squared", None, False, DEFAULT_LIMITS)
+        for model, count in (("k1", 1), ("tilt", 17)):
+            starts = [*_starting_states(task, task.free_parameters(model))]
+            searched = np.array([each.values for each in starts[-count * len(scales) :]])
+            assert len(starts) - len(searched) <= (model == "tilt" and focal_length is not None)
+            offsets = (searched[:, 2:4] - middle) / radius
+            f = searched[:, 0] / radius
+            length = np.hypot(f, np.hypot(*offsets.T))
+            np.testing.assert_allclose(np.sort(length), np.sort(np.repeat(scales, count)), rtol=1e-12)
+            alphas = np.arctan2(np.hypot(*offsets.T), f)
+            assert {round(float(each), 9) for each in alphas} == ({0.0, 0.35, 0.7} if count > 1 else {0.0})
+            tilted = alphas > 0.1
+            steps = np.arctan2(offsets[tilted, 1], offsets[tilted, 0]) / (math.pi / 4.0)
+            np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)
+            seen = {
+                (*np.round((a, s), 6), int(n) % 8)
+                for a, s, n in zip(alphas[tilted], length[tilted], np.rint(steps), strict=True)
+            }
+            assert len(seen) == (count - 1) * len(scales)
 
 
 def test_a_known_centre_fixes_the_tilt_without_distortion(rng):

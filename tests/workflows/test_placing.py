@@ -10,7 +10,8 @@ from collections.abc import Callable
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ from gpuvision.servoing.placement.plan import placement_imaging, plan_placement
 from gpuvision.servoing.placement.vision import BoardPoseSensor, Frame, SimulatedCamera
 from gpuvision.servoing.plant import SimulatedPlant
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
-from gpuvision.workflows import placement_cell
+from gpuvision.workflows import placement_cell, placing
 from gpuvision.workflows.placement_cell import measure_repeatability
 from gpuvision.workflows.placing import PlacementResult, simulate_placements
 
@@ -66,6 +67,182 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def artwork(folder: Path, machine: Machine) -> Artwork:
     return read_artwork(folder, layers=LAYERS, clearance=edge_clearance(placement_imaging(machine)))
+
+
+def numbered_result(monkeypatch: pytest.MonkeyPatch, landing: object = "registration") -> PlacementResult:
+    """Return a result of three runs, the second one aborted, whose numbers all differ."""
+    monkeypatch.setattr(
+        placing, "settled_frames", lambda motion, band, *, released: len(motion) + 1 if released else None
+    )
+    # One frame for each micrometre of the first error, less calibration and drift.
+    monkeypatch.setattr(
+        placing, "predicted_settling", lambda machine, error, band: round(1e6 * float(error[0])) if band[2] > 0 else -1
+    )
+    monkeypatch.setattr(
+        placing, "model_tolerance", lambda machine, plan: SimpleNamespace(plant_gain=1.7, longer_delay=8e-3)
+    )
+    sources = {"calibration": 1e-6 * np.arange(9.0).reshape(3, 3), "drift": np.full((3, 3), 2e-6)}
+    rest = np.array([[5e-6, -4e-6, 3e-6], [np.nan] * 3, [-7e-6, 6e-6, 1e-6]])
+    motion = tuple(
+        sources["calibration"][n] + sources["drift"][n] + np.arange(3.0 * count)[::-1].reshape(count, 3) * 1e-6
+        for n, count in enumerate((4, 9, 6))
+    )
+    machine: Any = SimpleNamespace(
+        tolerance=SimpleNamespace(position=20e-6, angle=5e-3),
+        landing=20e-3,
+        rate=500.0,
+        period=2e-3,
+        loop_gain=0.3,
+        delay=SimpleNamespace(parts={"exposure": 1e-3, "transfer": 3e-3}, total=4e-3, frames=2.5),
+        gains=SimpleNamespace(integral=np.inf, derivative=0.01),
+        control=SimpleNamespace(observer="latest", controller="pd"),
+        settling=SimpleNamespace(rule="vibration", frequency=(145.0, 150.0), damping=0.03),
+        error_after=lambda frames: np.full((frames, 3), 0.25),
+    )
+    vision, etch = np.diag([4.0, 9.0, 16.0]) * 1e-12, np.diag([1.0, 2.0, 3.0]) * 1e-12
+    budget: Any = SimpleNamespace(
+        total=np.diag([26.0, 51.0, 84.0]) * 1e-12,
+        sources={"vision": vision, "etch bias": etch},
+        sigmas={"vision": np.array([3e-6, 6e-6, 9e-6]), "sampling": np.array([4e-6, 8e-6, 12e-6])},
+    )
+    plan: Any = SimpleNamespace(
+        landing=landing,
+        target=np.array([0.01, 0.02, 0.3]),
+        vision=np.diag([2.0, 3.0, 4.0]) * 1e-12,
+        features=SimpleNamespace(
+            length=np.zeros(7),
+            fiducials=SimpleNamespace(radius=np.zeros(2)),
+            imaging=SimpleNamespace(shift=33e-6),
+        ),
+    )
+    runs = ((True, 12, 9, ""), (False, 40, 30, "no pose"), (True, 15, 10, ""))
+    placements: Any = tuple(
+        SimpleNamespace(
+            released=released, frames=frames, predicted_frames=least, reason=reason, start_error=np.arange(3.0) + least
+        )
+        for released, frames, least, reason in runs
+    )
+    parts = {**sources, "vision and servo": rest - sources["calibration"] - sources["drift"]}
+    reach = np.array([0.4, np.nan, 0.6])
+    return PlacementResult(plan, machine, budget, placements, rest, motion, parts, reach)
+
+
+def test_numbers_of_a_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bands, frames and sums by hand; 20 ms of registration are 10 frames of 2 ms."""
+    result = numbered_result(monkeypatch)
+    np.testing.assert_allclose(result.settling_band, [0.2 * 20e-6 + 15e-6, 0.2 * 20e-6 + 30e-6, 0.2 * 5e-3 + 45e-6])
+    assert result.settled == [5, None, 7]
+    assert result.predicted_settling == [10 + 11, 10 + 26, 10 + 17]
+    np.testing.assert_allclose(result.simulated_sigmas, [5e-6, 7e-6, 9e-6])
+    assert result.response.tolist() == [[1.0] * 3] * 10 + [[0.25] * 3]  # one frame at least
+    alone = numbered_result(monkeypatch, None)
+    assert alone.predicted_settling == [11, 26, 17]
+    assert alone.response.tolist() == [[0.25] * 3] * 9
+    assert result.summary().splitlines() == [
+        "2 of 3 parts placed, in 13.5 frames (the release waits for 10.5)",
+        "coarse registration of the first frame: 20.0 ms",
+        "observer latest, controller pd, release by vibration",
+        "true error settled in 6.0 frames, predicted 24.0; not settled before the release: 1",
+        "error, root mean square: x 6.08 µm, y 5.10 µm, theta 0.002 mrad",
+        "error, predicted: x 5.00 µm, y 7.00 µm, theta 0.009 mrad",
+        "aborted: no pose",
+    ]
+    assert "coarse" not in alone.summary()
+    nowhere = result._replace(
+        placements=(result.placements[1],) * 3, error=np.full((3, 3), np.nan), reach=np.full(3, np.nan)
+    )
+    assert nowhere.summary().splitlines() == [
+        "0 of 3 parts placed",
+        "coarse registration of the first frame: 20.0 ms",
+        "aborted: no pose",
+    ]
+    monkeypatch.setattr(placing, "settled_frames", lambda *_, released: None)
+    assert "the true error did not settle before the release" in result.summary().splitlines()
+
+
+def test_report_of_a_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = numbered_result(monkeypatch)
+
+    def pose(x: float, y: float, theta: float) -> Any:
+        return pytest.approx({"x_m": x, "y_m": y, "theta_rad": theta})
+
+    report = result.report()
+    runs = report.pop("placements")
+    assert report.pop("settling_band") == pose(19e-6, 34e-6, 1.045e-3)
+    assert report.pop("measured_rms") == {
+        "total": pose(np.sqrt(37.0) * 1e-6, np.sqrt(26.0) * 1e-6, np.sqrt(5.0) * 1e-6),
+        "calibration": pose(np.sqrt(18.0) * 1e-6, 5e-6, np.sqrt(34.0) * 1e-6),
+        "drift": pose(2e-6, 2e-6, 2e-6),
+        "vision and servo": pose(*np.sqrt([(9 + 225) / 2, (49 + 9) / 2, (1 + 81) / 2]) * 1e-6),
+    }
+    assert report == {
+        "gpuvision": version("gpuvision"),
+        "target": {"x_m": 0.01, "y_m": 0.02, "theta_rad": 0.3},
+        "rate_Hz": 500.0,
+        "features": 9,
+        "search_range_m": 33e-6,
+        "landing_s": 20e-3,
+        "period_s": 2e-3,
+        "parts_s": {"exposure": 1e-3, "transfer": 3e-3},
+        "total_delay_s": 4e-3,
+        "delay_frames": 2.5,
+        "observer": "latest",
+        "controller": "pd",
+        "gain_per_frame": 0.3,
+        "integral_s": None,
+        "derivative_s": 0.01,
+        "vision_gain": pose(2.0, 3.0, 4.0),
+        "tolerated_plant_gain": 1.7,
+        "tolerated_delay_s": 8e-3,
+        "settling": "vibration",
+        "vibration_Hz": (145.0, 150.0),
+        "vibration_damping": 0.03,
+        "predicted_sigma": {"vision": pose(3e-6, 6e-6, 9e-6), "sampling": pose(4e-6, 8e-6, 12e-6)},
+        "predicted_sigma_simulated": pose(5e-6, 7e-6, 9e-6),
+    }
+    assert runs == [
+        {
+            "released": True,
+            "reason": "",
+            "start_error": pose(9.0, 10.0, 11.0),
+            "frames": 12,
+            "predicted_frames": 10,
+            "settled_frames": 5,
+            "predicted_settled_frames": 21,
+            "error": pose(5e-6, -4e-6, 3e-6),
+            "reach_of_tolerance": 0.4,
+        },
+        {
+            "released": False,
+            "reason": "no pose",
+            "start_error": pose(30.0, 31.0, 32.0),
+            "frames": 40,
+            "predicted_frames": 31,
+            "settled_frames": None,
+            "predicted_settled_frames": 36,
+            "error": None,
+            "reach_of_tolerance": None,
+        },
+        {
+            "released": True,
+            "reason": "",
+            "start_error": pose(10.0, 11.0, 12.0),
+            "frames": 15,
+            "predicted_frames": 11,
+            "settled_frames": 7,
+            "predicted_settled_frames": 27,
+            "error": pose(-7e-6, 6e-6, 1e-6),
+            "reach_of_tolerance": 0.6,
+        },
+    ]
+    gains: Any = result.machine.gains
+    gains.integral = 0.7
+    plain = result._replace(plan=numbered_result(monkeypatch, None).plan).report()
+    assert (plain["integral_s"], plain["landing_s"], plain["tolerated_plant_gain"]) == (0.7, None, 1.7)
+    monkeypatch.setattr(placing, "model_tolerance", lambda *_: None)
+    plain = result._replace(error=np.full((3, 3), np.nan)).report()
+    assert (plain["tolerated_plant_gain"], plain["tolerated_delay_s"]) == (None, None)
+    assert set(plain["measured_rms"].values()) == {None}
 
 
 def test_parts_of_the_predicted_covariance_add_up(artwork: Artwork, machine: Machine) -> None:

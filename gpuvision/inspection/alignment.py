@@ -214,7 +214,7 @@ def _correlate(
     allowed = np.hypot(rows * grid.cell_y, columns * grid.cell_x) <= shift + min(grid.cell_x, grid.cell_y) / 2
     allowed &= (np.abs(rows) < heights.shape[0]) & (np.abs(columns) < heights.shape[1])
     # A map takes up to 34 MB: of all rotations only the map with the highest peak is kept.
-    score, best, place = -math.inf, np.empty(0), initial
+    score, best, place = -math.inf, centred, initial
     for each in turns:
         placement = _turned(initial, middle, float(each))
         pattern = _pattern(grid, apertures, placement)

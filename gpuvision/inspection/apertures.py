@@ -210,6 +210,6 @@ def _pad_below(point: Float64, pads: Sequence[Pad]) -> Pad | None:
     for pad in pads:
         if pad.part and bool(np.all(np.abs(point - pad.centre) <= np.hypot(*pad.size) / 2)):
             inside: npt.NDArray[np.bool_] = Outline(pad.outline, closed=False).contains_points([point])
-            if inside[0]:
+            if inside.all():
                 return pad
     return None

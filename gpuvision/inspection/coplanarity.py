@@ -214,7 +214,7 @@ def _compare_tops(
     regions: Sequence[Aperture], tops: Float64, centre: tuple[float, float] | None, noise: float
 ) -> Coplanarity:
     """Compare tops and their sigmas (n, 2) with the seating plane and with the least-squares plane."""
-    place = np.array([each.centroid for each in regions]).reshape(-1, 2)
+    place = np.array([each.centroid for each in regions])
     known = np.flatnonzero(np.isfinite(tops[:, 0]))
     if len(known) < 3:
         raise ValueError(f"{len(known)} of {len(regions)} leads have a measured top; expected three or more")

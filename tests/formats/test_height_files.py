@@ -67,6 +67,23 @@ def test_a_surface_of_a_gocator(write, section):
     assert sigma is None
 
 
+def test_a_surface_of_a_gocator_whose_axes_run_the_other_way(write):
+    """The first column of the map is that of the least x, the first row that of the largest y."""
+    text = SURFACE.format(section="Part").replace("NaN,0.130", "NaN,0.130,")
+    lines = [line.split(",") for line in text.splitlines()]
+    first = next(number for number, cells in enumerate(lines) if cells[0] == "Y")
+    last = next(number for number, cells in enumerate(lines) if number > first and cells[0] == "End")
+    plain, plain_grid = read_gocator(write("\n".join(map(",".join, lines))))
+    assert last - first == 1 + len(plain)
+    reversed_x = [[cells[0], *cells[:0:-1]] if first <= n < last else cells for n, cells in enumerate(lines)]
+    reversed_y = [*lines[: first + 1], *lines[first + 1 : last][::-1], *lines[last:]]
+    both = [*reversed_x[: first + 1], *reversed_x[first + 1 : last][::-1], *reversed_x[last:]]
+    for turned in (reversed_x, reversed_y, both):
+        z, grid = read_gocator(write("\n".join(map(",".join, turned))))
+        np.testing.assert_array_equal(z, plain)
+        assert grid == plain_grid
+
+
 def test_profiles_of_a_gocator_without_their_intensity(write):
     z, grid = read_gocator(write(PROFILE))
     np.testing.assert_allclose(z, np.array([[0.4, 0.5, 0.6], [0.1, np.nan, 0.3]]) * 1e-3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import re
 import struct
 import zipfile
 
@@ -58,6 +59,15 @@ def test_an_x3p_states_positions_and_checksums(tmp_path, z):
     assert "<CalibrationDate>1970-01-01T00:00:00+00:00</CalibrationDate>" in text
     assert "<Comment>The date of calibration is not known</Comment>" in text
     assert checksum == hashlib.md5(text.encode()).hexdigest().upper()
+
+
+@pytest.mark.parametrize(("dtype", "stored", "letter"), [(np.float32, "<f4", "F"), (np.float64, "<f8", "D")])
+def test_numbers_of_an_x3p_have_the_type_of_the_heights(tmp_path, z, dtype, stored, letter):
+    write_x3p(tmp_path / "map.x3p", z.astype(dtype), GRID)
+    with zipfile.ZipFile(tmp_path / "map.x3p") as archive:
+        text, points = archive.read("main.xml").decode(), archive.read("bindata/data.bin")
+    np.testing.assert_array_equal(np.frombuffer(points, stored).reshape(GRID.shape), z[::-1].astype(dtype))
+    assert re.findall("<CZ>.*<DataType>(.)</DataType>", text) == [letter]
 
 
 def test_a_sur_of_holes_and_zeros_can_be_read(tmp_path):

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,11 +20,26 @@ from gpuvision.cli import main as cli
 from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device, StepDevices, device_choice
 from gpuvision.matching.field.distance_map import Arc, Field
-from gpuvision.matching.field.evidence import detected_fraction, distances_to_lines, expected_crossings, robot_to_field
+from gpuvision.matching.field.evidence import (
+    Evidence,
+    detected_fraction,
+    distances_to_lines,
+    expected_crossings,
+    robot_to_field,
+)
 from gpuvision.matching.field.line_detection import FloorScan
 from gpuvision.status import Status
 from gpuvision.workflows import locating_robot
-from gpuvision.workflows.locating_robot import default_line_width, floor_points, locate_robot, scan_floor
+from gpuvision.workflows.locating_robot import (
+    RobotLimits,
+    _doubt,
+    _order,
+    _usable,
+    default_line_width,
+    floor_points,
+    locate_robot,
+    scan_floor,
+)
 
 SCALE, SHAPE, WIDE = 0.03, (400, 440), 0.125
 Image = np.ndarray[Any, np.dtype[np.uint8]]
@@ -101,6 +116,60 @@ NO_FIELDS: dict[str, Callable[[np.random.Generator], Image]] = {
 def is_correct(found: np.ndarray, pose: tuple[float, float, float]) -> bool:
     """Return whether a pose or its twin is within 10 cm of the true pose."""
     return bool(min(np.hypot(found[0] - s * pose[0], found[1] - s * pose[1]) for s in (1, -1)) < 0.1)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "doubt"),
+    [
+        (Evidence(-7.0, 0.9, 20, 0.9, 0.9), ""),
+        (Evidence(math.log(1e-3) + 1e-9, 0.9, 20, 0.9, 0.9), "31 points fit the field no better than random points"),
+        (Evidence(math.log(1e-3), 0.75, 20, 0.75, 0.0), ""),  # a third is missing
+        (Evidence(-7.0, 0.75, 20, 0.74, 0.24), "74% of the expected lines are seen, and 75% of the points are on"),
+        (Evidence(-7.0, 0.75, 20, 0.74, 0.25), ""),  # thinned out
+        (Evidence(-7.0, 0.9, 20, 0.55, 0.25), ""),
+        (Evidence(-7.0, 0.9, 20, 0.54, 0.25), "54% of the expected lines are seen, and 90% of"),
+        (Evidence(-7.0, 0.54, 20, 0.8, 0.9), "80% of the expected lines are seen, and 54% of"),
+        (Evidence(-7.0, 0.55, 20, 0.62, 0.9), ""),
+        (Evidence(-7.0, 0.56, 20, 0.6, 0.9), "60% of the expected lines are seen, and 56% of"),  # 0.4 / 0.56 > 0.7
+        (Evidence(-7.0, 0.6, 20, -0.1, -0.2), "at the best pose 0% of the expected lines are seen, and 60% of"),
+        (Evidence(-7.0, 0.1, 0, math.nan, math.nan), ""),  # scan lines are not known
+        (None, "no pose on the field fits the points"),
+    ],
+)
+def test_doubts_about_the_best_pose(evidence: Evidence | None, doubt: str) -> None:
+    found = _doubt(evidence, 31, RobotLimits())
+    assert doubt in found
+    assert bool(doubt) == bool(found)
+
+
+def test_candidates_are_ordered_by_what_is_missing() -> None:
+    """In steps of a tenth, then as they were; twins that are left out are no longer named."""
+
+    class Candidate(NamedTuple):
+        name: str
+        symmetric_twin: int | None
+
+    names: Any = tuple(Candidate(*each) for each in (("a", 3), ("b", None), ("c", 0), ("d", 1), ("e", 2)))
+    seen = (0.7, 0.98, 0.72, 1.3, 0.4)
+    weights = [Evidence(-9.0, 1.0, 10, each, each) for each in seen]
+    found, kept = _order(names, weights, 4)
+    # Missing are 0.3, 0.02, 0.28, -0.3 and 0.6: the steps 0.3, 0, 0.3, 0 and 0.6.
+    assert [(each[0], each.symmetric_twin) for each in found] == [("b", None), ("d", 0), ("a", 1), ("c", 2)]
+    assert [each.seen for each in kept] == [0.98, 1.3, 0.7, 0.72]
+    few, _ = _order(names, weights, 2)
+    assert [(each[0], each.symmetric_twin) for each in few] == [("b", None), ("d", 0)]
+    assert _order(names[2:3], weights[:1], 3)[0][0].symmetric_twin == 0
+
+
+def test_points_are_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(locating_robot, "_MAX_POINTS", 10)
+    for count, step in ((1, 1), (10, 1), (11, 2), (20, 2), (21, 3)):
+        points = np.arange(2.0 * count).reshape(count, 2).astype(np.float32)
+        both = np.concatenate([np.full((2, 2), np.nan, np.float32), points, [[np.inf, 0.0]]]).astype(np.float32)
+        found = _usable(both)
+        np.testing.assert_array_equal(found, points[::step])
+        assert found.flags.c_contiguous
+    assert _usable(np.full((3, 2), np.nan, np.float32)).shape == (0, 2)
 
 
 @pytest.mark.parametrize(

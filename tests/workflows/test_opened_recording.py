@@ -17,7 +17,7 @@ from gpuvision.host.image_files import read_frame
 from gpuvision.host.sources import ArraySource
 from gpuvision.ranging.line import LineReadout
 from gpuvision.sensor.sensor import Background, Recording, Sensor
-from gpuvision.workflows.opened_recording import open_for_scan
+from gpuvision.workflows.opened_recording import open_for_scan, sensor_with_threshold
 from gpuvision.workflows.scanning import scan
 from scanning import Ran, check_refused, line_frames
 
@@ -88,6 +88,18 @@ def test_the_threshold_lies_between_noise_and_line() -> None:
     assert 6 * NOISE <= threshold <= 0.3 * 100.0
     previous = open_for_scan(daylight("median"), sensor("previous")).sensor
     assert previous.readout.threshold >= threshold
+
+
+@pytest.mark.parametrize("background", ["median", "previous", "none"])
+def test_the_first_frame_of_a_group_gives_the_threshold(background: Background) -> None:
+    """The second frame of each group is much noisier; only pairs with a dark frame use it."""
+    frames = daylight("median")
+    groups = np.stack([frames, noisy(frames + np.random.default_rng(4).normal(0.0, 30.0, frames.shape))], axis=1)
+    found: Any = sensor_with_threshold(sensor(background), groups).readout
+    alone: Any = sensor_with_threshold(sensor(background), groups[:, :1]).readout
+    noisier: Any = sensor_with_threshold(sensor(background), groups[:, 1:]).readout
+    assert found.threshold == alone.threshold < noisier.threshold
+    assert found.minimum_peak == max(40.0, found.threshold)
 
 
 def test_a_source_that_gives_its_frames_once_is_refused() -> None:

@@ -320,6 +320,48 @@ def test_a_rate_that_only_a_coarser_readout_keeps_up_with(
         plan_scan(frames, sensor, tolerance=1.12 * ml.error, rate=10.0, device=device)
 
 
+@pytest.mark.parametrize(
+    ("fits", "message"),
+    [
+        (("windowed",), "at this rate windowed 8 keeps up with a predicted error of 5000000 um: ask for 5.5e+06 um"),
+        (("fir",), "at this rate fir 4 keeps up with a predicted error of 9000000 um: ask for 9.9e+06 um or more"),
+        (("ml",), "is too slow, as all 2 faster ones: the queue is full"),
+    ],
+)
+def test_a_plan_that_is_too_slow_names_the_most_accurate_faster_readout(
+    fits: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Readouts that are slower or as slow are not tried: fir of 1 s and windowed of 2 s are faster than 3 s."""
+    tried: list[str] = []
+    frames = np.zeros((3, 64, 480), np.uint8)
+    device: Any = object()
+
+    def planned(source: Any, operation: LineReadout, **options: Any) -> str:
+        assert (source.length, options.pop("sample") is frames) == (7, True)
+        assert options == {"rate": 20.0, "latency": 0.1, "margin": ScanPlanLimits().rate_margin, "device": device}
+        tried.append(operation.method)
+        if operation.method in fits:
+            return "a plan"
+        raise planning_scan.StreamError("the queue is full")
+
+    monkeypatch.setattr(planning_scan, "plan_stream", planned)
+    monkeypatch.setattr(planning_scan, "range_readout", lambda sensor: sensor.readout)
+    sample = planning_scan._Sample(frames, np.arange(3), 7)
+    trials = (*TRIALS, trial("centroid", 3.0, 1.0), trial("centroid", 0.5, 2.0, lost=0.5))
+    request: Any = (trials, Sensor.load("camera_line"), sample, device, 20.0, 0.1, ScanPlanLimits())
+    with pytest.raises(PlanError, match=re.escape(message)) as refused:
+        planning_scan._plan_stream(TRIALS[2], *request)
+    assert str(refused.value).startswith("gauss3 ")
+    assert tried == ["gauss3", "windowed", "fir"][: 2 if "windowed" in fits else 3]
+    if "fir" in fits:
+        assert planning_scan._plan_stream(TRIALS[0], *request) == "a plan"
+        return
+    with pytest.raises(
+        PlanError, match=r"fir 4 meets the tolerance and is too slow, and no usable readout is faster: "
+    ):
+        planning_scan._plan_stream(TRIALS[0], *request)
+
+
 def test_a_dark_recording_is_refused(device: Device) -> None:
     with pytest.raises(ValueError, match="no line in 5 frames"):
         plan_scan(np.zeros((5, 64, 480), np.uint8), noisy_camera(), tolerance=1.0, device=device)

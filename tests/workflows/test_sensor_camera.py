@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gpuvision.workflows.sensor_camera import KnownCamera
+from gpuvision.workflows import sensor_camera
+from gpuvision.workflows.sensor_camera import KnownCamera, known_camera
 
 RESIDUALS = (np.array([[3.0, 4.0], [0.0, 0.0]]), np.array([[0.0, 1.0], [-1.0, 0.0], [2.0, -2.0]]))
 
@@ -54,3 +55,13 @@ def test_summary_and_report() -> None:
 def test_a_camera_without_covariance_is_exact() -> None:
     (warning,) = _known(names=(), covariance=np.zeros((0, 0))).warnings
     assert warning.startswith("camera.toml has no table [covariance]: the camera counts as exact")
+
+
+def test_images_of_another_size_name_the_first_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sensor_camera, "read_calibrated_camera", lambda _: SimpleNamespace(size=(640, 480)))
+    images = tuple(SimpleNamespace(image=Path(f"folder/{name}.png")) for name in "abc")
+    views: Any = SimpleNamespace(detected=images, size=(320, 240))
+    with pytest.raises(
+        ValueError, match=r"a\.png.*320 x 240.*640 x 480.*take images of the whole sensor, or calibrate"
+    ):
+        known_camera(views, Path("camera.toml"))

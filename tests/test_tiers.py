@@ -86,10 +86,16 @@ ENTRIES = ("variant", "first", "second", "dtype")
 
 
 def _kernel_cases(
-    function: str, device: Any, *, mark: str = "", lists: dict[str, list[Any]] = LISTS, stem: str = "test_psd"
+    function: str,
+    device: Any,
+    *,
+    mark: str = "",
+    lists: dict[str, list[Any]] = LISTS,
+    stem: str = "test_psd",
+    folder: str = "ranging",
 ) -> list[Any]:
     """Return the product of values as cases of a test of a kernel."""
-    path = ROOT / "tests" / "ranging" / f"{stem}.py"
+    path = ROOT / "tests" / folder / f"{stem}.py"
     return [
         Case(
             path=path,
@@ -135,6 +141,12 @@ def test_the_full_tier_holds_chosen_examples_and_other_tests() -> None:
     listed = _kernel_cases("a", best, lists={"kernel": LISTS["kernel"]})
     items = [*listed, *_kernel_cases("b", best, stem="test_focus")]
     assert select_full(items, [best]).chosen == items  # type: ignore[list-item]
+
+
+def test_the_full_tier_runs_the_profiler_on_the_best_device() -> None:
+    best, other = Case(label="best"), Case(label="other")
+    items = [*_kernel_cases("a", best, folder="profiling"), *_kernel_cases("a", other, folder="profiling")]
+    assert {item.callspec.params["device"] for item in select_full(items, [best]).chosen} == {best}  # type: ignore[list-item]
 
 
 def test_only_the_nightly_tier_has_nightly_tests() -> None:

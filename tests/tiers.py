@@ -72,10 +72,11 @@ def select_full(items: Sequence[pytest.Item], best: Collection[Device]) -> Selec
     The best device runs all tests; of kernel tests with several ``parametrize`` marks it runs a design that holds each
     pair of values. Every other device runs no slow tests: these measure accuracy, which the comparison of the devices
     with the references covers. It runs each value of each kernel test, and each pair of values in one kernel test of
-    the file; of tests that use the kernels of other files it runs designs as the fast tier does.
+    the file; of tests that use the kernels of other files it runs designs as the fast tier does. It runs no tests of
+    the profiler, which measures all devices in the same way.
     """
     others = [item for item in items if device_of(item) not in (None, *best)]
-    short = [item for item in others if item.get_closest_marker("slow") is None]
+    short = [item for item in others if item.get_closest_marker("slow") is None and not _is_of_profiler(item)]
     kernels = [item for item in items if device_of(item) in best and _is_of_kernel(item) and _has_product(item)]
     kept = {*_pairs(kernels), *_pairs_of_files([item for item in short if _is_of_kernel(item)])}
     kept.update(_designed([item for item in short if not _is_of_kernel(item)]))
@@ -332,6 +333,10 @@ def _is_of_kernel(item: pytest.Item) -> bool:
 
 def _is_of_host(item: pytest.Item) -> bool:
     return item.path.parent.name == "host"
+
+
+def _is_of_profiler(item: pytest.Item) -> bool:
+    return item.path.parent.name == "profiling"
 
 
 def function_of(item: pytest.Item) -> str:

@@ -138,8 +138,15 @@ def example_of_each_kernel(device: Device) -> dict[str, Example]:
     return found
 
 
+# PoCL compiles each of the others twice, for 2 to 8 s.
+SHORT = {"psd_readout", "line_readout", "triangulate", "undistort", "reflectance", "mirror_facets", "edge_levels"}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("kernel", KERNELS_WITH_TABLES)
+@pytest.mark.parametrize(
+    "kernel",
+    [pytest.param(each, marks=[pytest.mark.nightly] * (each not in SHORT)) for each in KERNELS_WITH_TABLES],
+)
 def test_every_kernel_with_constant_tables(
     device: Device, kernel: str, moved: list[str], little_memory: Callable[[], None]
 ) -> None:

@@ -109,7 +109,7 @@ def test_sigmas_are_the_spread_under_noise(rng):
     _check_sigmas(rng, 12, given=False)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("given", [True, False])
 def test_sigmas_are_the_spread_under_noise_of_many_draws(rng, given):
     _check_sigmas(rng, 60, given)
@@ -156,7 +156,7 @@ def test_sigmas_of_correlated_noise(rng):
     _check_correlated(rng, 6)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sigmas_of_correlated_noise_of_many_draws(rng):
     _check_correlated(rng, 60)
 

@@ -58,7 +58,7 @@ def test_sigmas_are_those_of_a_numerical_jacobian() -> None:
     assert found.area == pytest.approx(0.5 * 20 * area, rel=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sigmas_cover_the_phase_for_every_period(rng: np.random.Generator) -> None:
     deposit = Cap(210e-6, 130e-6)
     apertures = [circle(str(number), place, 200e-6) for number, place in enumerate(SPOTS, 1)]

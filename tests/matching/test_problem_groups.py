@@ -44,10 +44,15 @@ CASES: dict[str, Callable[[Device, np.random.Generator], Case]] = {
     "lines": lambda device, rng: lines(device, rng, scale=0.05),
     "lines, free scale": lines,
 }
-SLOW = {"pose", "pose, free scale", "lines, free scale"}  # a pose takes 10 s to build in groups of 8
+# A pose takes 10 s to build in groups of 8.
+MARKS = {
+    "pose": [pytest.mark.slow],
+    "pose, free scale": [pytest.mark.nightly],
+    "lines, free scale": [pytest.mark.nightly],
+}
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, [])) for name in CASES])
 def test_results_do_not_depend_on_the_group(
     device: Device, name: str, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -62,7 +67,7 @@ def test_results_do_not_depend_on_the_group(
         np.testing.assert_array_equal(found, ours, err_msg=field)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, [])) for name in CASES])
 def test_a_device_with_few_registers_runs_smaller_groups(
     device: Device, name: str, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -74,8 +74,15 @@ def errors_of(operation, device):
     return {(each.data, *each.parameters.items()): each.errors for each in settings}
 
 
+# Their settings compile many kernels.
+NIGHTLY = {"blob", "line", "ruler", "undistort_image", "undistort_points"}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("operation", curve.OPERATIONS)
+@pytest.mark.parametrize(
+    "operation",
+    [pytest.param(each, marks=[pytest.mark.nightly] * (each in NIGHTLY)) for each in curve.OPERATIONS],
+)
 def test_settings_are_distinct_and_measure_most_samples(operation, device):
     settings = list(importlib.import_module(f"gpuvision.profiling.curves.{operation}").settings(device))
     if operation == "occluded_irradiance" and not device.has_double:

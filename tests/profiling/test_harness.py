@@ -206,8 +206,15 @@ def test_a_quick_run_names_a_case_that_its_module_does_not_have(fake, device):
     assert [failure.reason for failure in run.failures] == [reason]
 
 
+# Numba compiles their peers for more than 10 s.
+NIGHTLY = {"blob", "line", "ruler"}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("operation", sorted(harness.QUICK_CASES))
+@pytest.mark.parametrize(
+    "operation",
+    [pytest.param(each, marks=[pytest.mark.nightly] * (each in NIGHTLY)) for each in sorted(harness.QUICK_CASES)],
+)
 def test_the_modules_have_the_cases_of_a_quick_run(operation, device):
     (found,) = harness._cases(operation, device, quick=True)
     assert found.name == harness.QUICK_CASES[operation]

@@ -122,7 +122,7 @@ def test_an_empty_loop_takes_the_frames(device: Device) -> None:
     assert np.median(times.computing) < 200.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_candidates_of_the_vision_give_the_true_pose(device: Device) -> None:
     """The cases themselves compare the poses of all candidates with the truth."""
     cases = list(feature_pose.cases(device))

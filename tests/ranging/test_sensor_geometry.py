@@ -67,7 +67,7 @@ def test_points_and_distances_are_within_their_sigma(truth: LaserSensor, found: 
     assert np.median(distances) < 120e-6
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("tilt_degrees", "bend"), [(10.0, (0.0, 0.0, 0.0)), (25.0, BENT), (40.0, BENT)])
 def test_predicted_sigmas_hold_over_seeds(tilt_degrees: float, bend: tuple[float, float, float]) -> None:
     truth = sensor(tilt_degrees, bend)
@@ -87,7 +87,7 @@ def scale_errors(truth: LaserSensor, found: SensorGeometry) -> Float64:
     return np.asarray([slopes[2, 1], 0.5 * (slopes[1, 0] + step)]) / found.scale_sigma(pixels)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_scales_are_within_their_sigma_over_seeds(truth: LaserSensor) -> None:
     ratio = np.array([scale_errors(truth, calibrated(truth, np.random.default_rng((21, seed)))) for seed in range(30)])
     assert np.mean(np.abs(ratio) < 3.0) >= 0.95

@@ -73,7 +73,7 @@ def test_uncertainty_covers_the_error_of_a_whole_delay() -> None:
     _check_sigma_of_a_whole_delay(10)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_uncertainty_covers_the_error_of_a_whole_delay_in_100_recordings() -> None:
     _check_sigma_of_a_whole_delay(100)
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from conftest import Draws
 from fakes import list_gpu
 from floors import GREEN, WHITE, floor_image
 from gpuvision.camera.ground_plane import MountedCamera
@@ -176,7 +177,7 @@ def test_points_are_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     "kind",
     [pytest.param(each, marks=[] if each in ("lines", "mottled") else pytest.mark.slow) for each in sorted(NO_FIELDS)],
 )
-def test_what_is_no_field_is_refused(kind: str, rng: np.random.Generator, draws: Callable[[int, int], int]) -> None:
+def test_what_is_no_field_is_refused(kind: str, rng: np.random.Generator, draws: Draws) -> None:
     field = read_field("robocup_msl")
     for _ in range(draws(2, 6)):
         found = locate_robot(scan_floor(NO_FIELDS[kind](rng), scale=SCALE, line_width=WIDE), field)
@@ -187,20 +188,21 @@ def test_what_is_no_field_is_refused(kind: str, rng: np.random.Generator, draws:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(NO_FIELDS))
-def test_of_many_that_are_no_field_all_are_refused(kind: str, rng: np.random.Generator) -> None:
+def test_of_many_that_are_no_field_all_are_refused(kind: str, rng: np.random.Generator, draws: Draws) -> None:
     """All images without lines are refused; views of few tiles or random lines may fit the field."""
+    count = draws(10, 10, 35)
     field = read_field("robocup_msl")
-    scans = (scan_floor(NO_FIELDS[kind](rng), scale=SCALE, line_width=WIDE) for _ in range(35))
+    scans = (scan_floor(NO_FIELDS[kind](rng), scale=SCALE, line_width=WIDE) for _ in range(count))
     refused = sum(bool(locate_robot(scan, field).reason) for scan in scans)
-    assert refused >= (32 if kind in ("lines", "tiles") else 35)
+    assert refused >= (0.9 if kind in ("lines", "tiles") else 1.0) * count
 
 
 @pytest.mark.slow
-def test_of_many_fields_nearly_all_are_found(rng: np.random.Generator) -> None:
+def test_of_many_fields_nearly_all_are_found(rng: np.random.Generator, draws: Draws) -> None:
     """With up to 80 objects on the floor; if the image shows few lines, another place may match."""
     field = read_field("robocup_msl")
     found = []
-    for number in range(150):
+    for number in range(draws(50, 50, 150)):
         pose = anywhere(rng)
         image = spotted(seen_from(field, pose, rng), number % 3 * 40, rng)
         located = locate_robot(scan_floor(image, scale=SCALE, line_width=WIDE), field)
@@ -345,7 +347,7 @@ def replaced(scan: FloorScan, share: float, rng: np.random.Generator) -> FloorSc
     return scan._replace(points=points)
 
 
-def test_clutter_instead_of_lines_is_no_other_field(rng: np.random.Generator, draws: Callable[[int, int], int]) -> None:
+def test_clutter_instead_of_lines_is_no_other_field(rng: np.random.Generator, draws: Draws) -> None:
     """Of fields with 30 % of the points replaced by clutter more than half were refused, with the right pose."""
     field = read_field("robocup_msl")
     for pose in ((-6.0, 2.0, 0.7), (3.0, -1.5, -2.0), (0.5, 4.0, 1.2))[: draws(2, 3)]:

@@ -104,7 +104,7 @@ def test_fit_by_a_solver(points: np.ndarray) -> None:
     assert theirs.iterations > ours.iterations
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_simplex_ends_where_ours_does(points: np.ndarray) -> None:
     families = grid_lines(points)
     ours = fit_lens(families, model="k1", lines="vanishing")

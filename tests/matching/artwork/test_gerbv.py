@@ -397,8 +397,10 @@ def drilled(holes: Holes) -> tuple[Shape, ...]:
 BOARDS = (
     "upverter",
     "eagle",
-    "fritzing",
-    *(f"kicad-x2-tests/{each}" for each in ("x2ap", "nox2ap", "x2noap", "nox2noap")),
+    pytest.param("fritzing", marks=pytest.mark.nightly),
+    *(f"kicad-x2-tests/{each}" for each in ("x2ap", "nox2noap")),
+    # The same board with one of two features of the format, of which the two above have both or none.
+    *(pytest.param(f"kicad-x2-tests/{each}", marks=pytest.mark.nightly) for each in ("nox2ap", "x2noap")),
 )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fnmatch
-import json
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -105,11 +104,11 @@ def write_report(path: Path | None, report: object, outputs: Outputs) -> None:
 
     Infinities and NaN become null: JSON has no such numbers.
     """
-    from gpuvision.formats.json import json_tree
+    from gpuvision.formats.json import json_tree, report_text
 
     if path is None:
         return
-    text = json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n"
+    text = report_text(json_tree(report))
     if prints_report(path):
         typer.echo(text, nl=False)
     else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,6 +30,7 @@ def demo(
     """
     from trimesh.exchange.ply import export_ply
 
+    from gpuvision.formats.json import json_tree, report_text
     from gpuvision.host import Device
     from gpuvision.host.files import atomic_write, write_text_atomic
     from gpuvision.host.outputs import Outputs
@@ -56,7 +56,7 @@ def demo(
         masked = simulate(task, light_folder, seed=seed, mask="best", device=chosen)
         masked.write(inside / masked_folder)
         results[masked_folder] = {"predicted": masked.report()}
-        write_text_atomic(inside / "report.json", json.dumps(results, indent=1) + "\n")
+        write_text_atomic(inside / "report.json", report_text(json_tree(results)))
     echo(f"{name} with a mask computed for the part: {masked.summary()}")
     camera = out / "camera_line"
     echo(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -72,7 +71,7 @@ def place(
     machine. The report has the error at the release and its prediction, and the number of frames in which the true
     error settles, with its value by theory. The machine file chooses observer, controller and release rule.
     """
-    from gpuvision.formats.json import json_tree
+    from gpuvision.formats.json import json_tree, report_text
     from gpuvision.formats.machine_file import named_files, read_machine
     from gpuvision.host import Device
     from gpuvision.host.files import write_text_atomic
@@ -112,7 +111,7 @@ def place(
     report = result.report() | {"repeatability": resting.report()}
     write_report(as_json, report, outputs)
     with outputs.folder(out) as inside:
-        write_text_atomic(inside / "report.json", json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n")
+        write_text_atomic(inside / "report.json", report_text(json_tree(report)))
         view, region = result.machine.camera.view(result.plan.camera_pose), result.plan.features.region
         draw_features(
             inside / "features.png", artwork, result.plan.features, region, view=view, target=result.plan.target[:2]

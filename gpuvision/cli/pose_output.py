@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 import typer
 
 from gpuvision.cli.arguments import echo, named_path, prints_report, quantities, write_report
+from gpuvision.formats.json import report_text
 
 if TYPE_CHECKING:
     from gpuvision.host.outputs import Outputs
@@ -97,7 +97,7 @@ def report_pose(
     shown = ""
     if out is not None:
         with outputs.folder(out) as inside:
-            write_text_atomic(inside / "pose.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
+            write_text_atomic(inside / "pose.json", report_text(report))
             draw(inside / "located.png")
         shown = f"look at {out / 'located.png'} and {out / 'pose.json'}"
     if located.reason:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -13,3 +14,14 @@ def json_tree(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [json_tree(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def report_text(report: Any) -> str:
+    """Return the text of a report file: JSON with one space for each level of a tree, and a line feed at the end.
+
+    Raises
+    ------
+    ValueError
+        A number is infinite or NaN; see `json_tree`.
+    """
+    return json.dumps(report, indent=1, allow_nan=False) + "\n"

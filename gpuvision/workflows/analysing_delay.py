@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.formats.json import json_tree
+from gpuvision.formats.json import json_tree, report_text
 from gpuvision.formats.loop_recording import LoopRecording
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
@@ -245,7 +244,7 @@ class DelayAnalysis:
             draw_delay(inside / DELAY_FILES[0], self.picture())
             if self.measured is not None and self.recording is not None:
                 draw_measured_delay(inside / MEASURED_PICTURE, *self.recording, self.measured)
-            write_text_atomic(inside / DELAY_FILES[1], json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
+            write_text_atomic(inside / DELAY_FILES[1], report_text(self.report()))
 
 
 def analyse_delay(

@@ -7,7 +7,6 @@ distortion and sensor tilt from three views of a grid, or from one view and a kn
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -29,7 +28,7 @@ from gpuvision.camera.views.camera_fit import CameraFit
 from gpuvision.camera.views.planar_calibration import fit_camera
 from gpuvision.camera.views.target_views import make_view
 from gpuvision.formats.camera_file import covariance_table, write_lens
-from gpuvision.formats.json import json_tree
+from gpuvision.formats.json import json_tree, report_text
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.image_files import read_image
@@ -258,7 +257,7 @@ def write_calibration(calibration: Calibration, path: Path, *, overwrite: bool =
         raise ValueError("the lines are straight without a lens; no correction is needed, nothing was written")
     # The covariance of parameters that the data do not fix is infinite; json_tree replaces it, since JSON has no
     # infinity.
-    report = json.dumps(json_tree(calibration.report()), indent=1) + "\n"
+    report = report_text(json_tree(calibration.report()))
     documentation: dict[str, dict[str, Any]] = {
         "image": {"size": list(calibration.image_size)},
         "uncertainty": {name: error for name, (_, error) in calibration.parameters.items()},

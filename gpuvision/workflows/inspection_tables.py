@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gpuvision.formats.json import report_text
 from gpuvision.host.files import write_text_atomic
 
 
@@ -24,4 +24,4 @@ def write_tables(folder: Path, name: str, rows: Sequence[Mapping[str, Any]], rep
         }
         writer.writerow(known)
     write_text_atomic(folder / name, text.getvalue())
-    write_text_atomic(folder / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
+    write_text_atomic(folder / "report.json", report_text(report))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -14,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.formats.height_files import read_heights, scanned_map
+from gpuvision.formats.json import report_text
 from gpuvision.formats.range_image import read_npz, write_npz, write_png16, write_tiff
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.errors import ReadError
@@ -209,7 +209,7 @@ class HeightMapMerge:
             draw_height_map(
                 inside / "sources.png", shown, grid, style="shaded", title="Sources of the heights", tints=tints
             )
-            write_text_atomic(inside / "report.json", json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
+            write_text_atomic(inside / "report.json", report_text(self.report()))
 
 
 def height_map_file(path: str | Path) -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.formats.json import report_text
 from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
 from gpuvision.formats.surface_files import SURFACE_WRITERS, SurfaceFormat, surface_problem
 from gpuvision.host import Device, to_numpy
@@ -302,7 +302,7 @@ class Scan:
             draw_scan(inside / "scan.png", points.z, points.status, samples=samples, span=span)
             report = self.report()
             report["seconds"]["write"] = time.perf_counter() - start
-            write_text_atomic(inside / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
+            write_text_atomic(inside / "report.json", report_text(report))
 
     def _title(self) -> str:
         return self.sensor.name or "Height map"

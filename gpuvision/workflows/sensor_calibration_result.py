@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.calibration import Calibration
-from gpuvision.formats.json import json_tree
+from gpuvision.formats.json import json_tree, report_text
 from gpuvision.formats.sensor_file import sensor_text
 from gpuvision.host.channels import Channel
 from gpuvision.host.files import write_text_atomic
@@ -194,7 +193,7 @@ def write_sensor_calibration(
         cell=calibration.cell,
         pixels=calibration.some_pixels(),
     )
-    report = json.dumps(json_tree(calibration.report()), indent=1) + "\n"
+    report = report_text(json_tree(calibration.report()))
     outputs = Outputs("calibrate", inputs=[*images, *inputs], overwrite=overwrite)
     with outputs.folder(path.parent) as inside:
         sensor_file, report_file, picture = sensor_calibration_files(inside / path.name)

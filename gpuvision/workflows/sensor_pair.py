@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gpuvision.formats.json import json_tree
+from gpuvision.formats.json import json_tree, report_text
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
 from gpuvision.plots.simulation import PictureScale, draw_causes, draw_errors
@@ -141,4 +140,4 @@ class SensorPair:
                 "ranking": [each._asdict() for each in rank_candidates(self.errors, self.limit)],
                 "errors": {name: each.summary(self.limit) for name, each in self.errors.items()},
             }
-            write_text_atomic(inside / "report.json", json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n")
+            write_text_atomic(inside / "report.json", report_text(json_tree(report)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from importlib.metadata import version
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.formats.json import report_text
 from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
 from gpuvision.host import Device
 from gpuvision.host.files import write_text_atomic
@@ -201,7 +201,7 @@ class Simulation:
             draw_causes(inside / "causes.png", attribution, title, scale, backward=self.moves_backward)
             if self.mask is not None:
                 self.mask.mask.save(inside / _MASK_FILE)
-            write_text_atomic(inside / "report.json", json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
+            write_text_atomic(inside / "report.json", report_text(self.report()))
 
     def _arrays(self) -> tuple[dict[str, Array], dict[str, str]]:
         attribution = self.attribution

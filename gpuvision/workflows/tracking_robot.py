@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections import Counter
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.formats.json import report_text
 from gpuvision.host import Device, Source
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import write_text_atomic
@@ -149,7 +149,7 @@ class RobotTrack:
         writer.writeheader()
         writer.writerows(self.rows())
         write_text_atomic(folder / "track.csv", text.getvalue())
-        write_text_atomic(folder / "track.json", json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
+        write_text_atomic(folder / "track.json", report_text(self.report()))
         draw_robot_track(folder / "track.png", self.field, self.states)
 
 

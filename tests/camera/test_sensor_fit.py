@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gpuvision.camera.photon_transfer import FrameStatistics, frame_statistics
-from gpuvision.camera.sensor_fit import Estimate, SensorFit, _reduced_chi_square, fit_sensor
+from gpuvision.camera.sensor_fit import Estimate, SensorFit, _Fit, _reduced_chi_square, fit_sensor
 
 PLANTED = {"gain": 0.25, "quantum_efficiency": 0.6, "dark_noise": 12.0, "prnu": 0.02, "dsnu": 15.0, "dark_current": 4e4}
 LEVEL, FULL_WELL = 30.0, 14e3
@@ -220,3 +220,38 @@ def test_variances_of_the_statistics(rng: np.random.Generator) -> None:
     assert predicted.spatial_variance[0] == pytest.approx(means.var(axis=1, ddof=1).var(), rel=0.05)
     chi_square = temporal * rng.chisquare(99.0, 20_000) / 99.0
     assert predicted.temporal_variance[0] == pytest.approx(chi_square.var(), rel=0.05)
+
+
+def test_differences_between_pixels_are_weighted_means() -> None:
+    """Spatial variances of all dark stacks by their variances; of the flat stacks relative to the squared mean."""
+    pixels = 400.0
+
+    def statistics(mean: list[float], temporal: list[float], spatial: list[float], frames: list[float]) -> Any:
+        count = np.array(frames)
+        arrays = (mean, temporal, spatial, (count - 1.0) * (pixels - 1.0), count, np.full(3, pixels))
+        return FrameStatistics(*map(np.array, arrays))
+
+    lit = statistics([230.0, 430.0, 630.0], [54.0, 104.0, 154.0], [30.0, 95.0, 190.0], [5.0, 9.0, 4.0])
+    unlit = statistics([30.0, 30.5, 31.0], [4.0, 4.5, 5.0], [14.0, 13.0, 15.0], [8.0, 3.0, 6.0])
+    gain = 0.25
+    dsnu, prnu = _Fit(lit, unlit, None, None, 0.0)._differences(gain)
+
+    def variances(given: FrameStatistics) -> np.ndarray:
+        rest = given.temporal / given.frames
+        return np.asarray((4.0 * given.spatial * rest + 2.0 * rest**2) / (pixels - 1.0))
+
+    dark, dark_total = np.average(unlit.spatial, weights=1.0 / variances(unlit), returned=True)
+    mean = lit.mean - unlit.mean
+    relative = (lit.spatial - dark) / mean**2
+    weights = mean**4 / variances(lit)
+    ratio, total = np.average(relative, weights=weights, returned=True)
+    both = 4.0 * dark * ratio / pixels * np.average(1.0 / mean, weights=weights) ** 2
+    for found, squared, variance, unit in (
+        (dsnu, dark, 1.0 / dark_total, gain),
+        (prnu, ratio, 1.0 / total + both, 1.0),
+    ):
+        value = math.sqrt(squared)
+        assert found.value == pytest.approx(value / unit, rel=1e-12)
+        # The error of the root, and the chance of 400 pixels of one sensor.
+        expected = math.hypot(math.sqrt(variance) / (2.0 * value), value / math.sqrt(2.0 * 399.0)) / unit
+        assert found.sigma == pytest.approx(expected, rel=1e-12)

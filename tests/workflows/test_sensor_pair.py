@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -50,6 +50,44 @@ def test_pictures_of_two_sensors_have_one_scale(tmp_path: Path, monkeypatch: pyt
     assert figures[0].axes[0].images[0].get_clim() == pytest.approx((-1.0, 1.0))
     assert figures[0].axes[1].get_ylabel().startswith("height read minus true height [mm]")
     assert json.loads((tmp_path / "both" / "report.json").read_text())["limit"] == 15e-6
+
+
+def test_summary_and_report_of_a_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shares of the candidates in percent, in the order of their rank."""
+
+    class Candidate(NamedTuple):
+        name: str
+        failed_fraction: float
+        spurious_fraction: float
+
+    ranked = [Candidate("both", 0.0625, 0.0125), Candidate("second", 0.25, 0.5)]
+    asked: list[Any] = []
+    monkeypatch.setattr(sensor_pair, "rank_candidates", lambda *given: asked.append(given) or ranked)
+    drawn: list[Any] = []
+    for name in ("draw_errors", "draw_causes"):
+        monkeypatch.setattr(
+            sensor_pair, name, lambda path, *given, name=name, **how: drawn.append((name, path.name, given, how))
+        )
+    errors = {name: SimpleNamespace(summary=lambda limit, name=name: [name, limit]) for name in ("first", "both")}
+    simulated: Any = SimpleNamespace(attribution="one", moves_backward=True, write=lambda *_, **__: None)
+    monkeypatch.setattr(sensor_pair.PictureScale, "of", lambda parts, limit: (tuple(parts), limit))
+    pair = SensorPair(first=simulated, second=simulated, errors=errors, fusion=SensorFusion(), limit=15e-6)
+    assert pair.summary() == (
+        "surface samples read within 15 µm: both 93.8 % (1.2 % spurious), second 75.0 % (50.0 % spurious)"
+    )
+    pair.write(tmp_path)
+    assert asked == [(errors, 15e-6)] * 2
+    scale = (("one", "one", errors["both"]), 15e-6)
+    assert drawn == [
+        (f"draw_{name}", f"{name}.png", (errors["both"], "Both sensors", scale), {"backward": True})
+        for name in ("errors", "causes")
+    ]
+    assert json.loads((tmp_path / "both" / "report.json").read_text()) == {
+        "rule": SensorFusion().rule,
+        "limit": 15e-6,
+        "ranking": [each._asdict() for each in ranked],
+        "errors": {"first": ["first", 15e-6], "both": ["both", 15e-6]},
+    }
 
 
 def test_the_fusion_interpolates_over_a_missing_sample(monkeypatch: pytest.MonkeyPatch) -> None:

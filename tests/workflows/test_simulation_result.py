@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from importlib.metadata import version
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from gpuvision.host import Device
 from gpuvision.simulation.light_paths import PATHS
+from gpuvision.workflows import simulation_result
 from gpuvision.workflows.simulation_result import Simulation, light_strength, simulation_files
 
 ERRORS: dict[str, Any] = {
@@ -142,3 +144,52 @@ def test_light_strength_and_files() -> None:
     assert strength.dtype == np.float32
     assert set(simulation_files(has_mask=True)) - set(simulation_files(has_mask=False)) == {"mask.txt"}
     assert len(simulation_files(has_mask=False)) == 8
+
+
+class Points(NamedTuple):
+    """Points with their status."""
+
+    x: str
+    y: str
+    z: str
+    status: str
+
+
+@pytest.mark.parametrize(("name", "title"), [("corner", "corner"), ("", "Simulation")])
+def test_pictures_have_the_name_of_the_sensor(
+    name: str, title: str, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The transport of this task increases; the pictures of errors get the scale of both."""
+    drawn: list[Any] = []
+    written: dict[str, Any] = {}
+    for writer in ("write_tiff", "write_png16", "write_ply", "write_npz"):
+        monkeypatch.setattr(
+            simulation_result, writer, lambda path, *given: written.update({path.name: given}) or path.touch()
+        )
+    for draw in ("draw_height_map", "draw_errors", "draw_causes"):
+        monkeypatch.setattr(
+            simulation_result, draw, lambda path, *given, **how: drawn.append((path.name, given, how)) or path.touch()
+        )
+    points = Points("x", "y", "z", "status")
+    made = simulation(device, heights=SimpleNamespace(z="heights"), grid="grid", points=points)
+    task, attribution = made.task, made.attribution
+    task.sensor = SimpleNamespace(name=name, kind="psd", light=None, files=())
+    attribution.reading = SimpleNamespace(strength=np.array([2.0, np.nan]))
+    monkeypatch.setattr(simulation_result.Simulation, "_arrays", lambda _: ({}, {}))
+    monkeypatch.setattr(simulation_result.Simulation, "report", lambda _: {"a": 1})
+    scale: Any = "scale"
+    made.write(tmp_path / "out", scale=scale)
+    assert drawn == [
+        ("picture.png", (made.heights, "grid"), {"title": f"{title}: as measured"}),
+        ("errors.png", (attribution, title, "scale"), {"backward": False}),
+        ("causes.png", (attribution, title, "scale"), {"backward": False}),
+    ]
+    assert written["range_image.tiff"] == written["range_image.png"] == ("heights", "grid")
+    *places, strength, status = written["range_image.ply"]
+    assert (places, strength.tolist(), status) == (["x", "y", "z"], [2.0, 0.0], "status")
+    assert written["simulation.npz"] == ({}, {})
+    assert (tmp_path / "out" / "report.json").read_text() == '{\n "a": 1\n}\n'
+    drawn.clear()
+    monkeypatch.setattr(simulation_result.PictureScale, "of", lambda parts, limit: (parts, limit))
+    made.write(tmp_path / "out")
+    assert [given[-1] for _, given, _ in drawn[1:]] == [([attribution], 5e-6)] * 2

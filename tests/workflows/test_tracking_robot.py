@@ -20,7 +20,7 @@ from gpuvision.host.errors import RecordingError
 from gpuvision.matching.field.odometry import PoseEstimate, predict
 from gpuvision.matching.field.robot_filter import RobotState
 from gpuvision.status import Status
-from gpuvision.workflows.tracking_robot import RobotTrack, read_odometry, track_robot
+from gpuvision.workflows.tracking_robot import MotionUncertainty, RobotTrack, _motion, read_odometry, track_robot
 
 SCALE, SHAPE, WIDE = 0.04, (300, 330), 0.125
 MOTION = np.array([0.15, 0.02, 0.04])
@@ -181,6 +181,18 @@ def test_short_odometry_is_refused_before_the_first_frame(tmp_path: Path) -> Non
     source = ArraySource(np.zeros((4, *SHAPE), np.uint8))
     with pytest.raises(ValueError, match="has 2 motions, expected 3 between 4 frames"):
         track_robot(source, read_field("robocup_msl"), rate=10.0, odometry=np.zeros((2, 3)), scale=-1.0)
+
+
+def test_motion_between_two_frames() -> None:
+    """Without odometry the robot may have moved at its speed; else by the odometry with an error relative to it."""
+    uncertainty = MotionUncertainty(speed=1.2, turn_rate=1.6, share=0.1, least=2e-3, least_turn=3e-3)
+    move, covariance = _motion(None, 4, 10.0, uncertainty)
+    np.testing.assert_array_equal(move, np.zeros(3))
+    np.testing.assert_allclose(covariance, np.diag([0.12**2, 0.12**2, 0.16**2]))
+    motions = np.array([[9.0, 9.0, 9.0], [0.3, -0.4, -0.5]])
+    move, covariance = _motion(motions, 1, 10.0, uncertainty)
+    np.testing.assert_array_equal(move, motions[1])
+    np.testing.assert_allclose(covariance, np.diag([0.052**2, 0.052**2, 0.053**2]))
 
 
 def test_report_and_summary_of_a_track(device: Device) -> None:

@@ -159,7 +159,7 @@ def _some_finite(measured: Float64, model: Lens | Camera) -> Float64:
 
 def _without_homography(columns: Float64, corrected: Float64, count: int) -> Float64:
     """Remove from displacement fields (n, 2, m) the homography that fits the last ``count`` points best."""
-    if not columns.shape[-1] or not count:
+    if not count:
         return columns
     middle = corrected[-count:].mean(axis=0)
     x, y = ((corrected - middle) / max(float(np.ptp(corrected[-count:])), 1.0)).T

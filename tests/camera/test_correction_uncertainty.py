@@ -270,3 +270,12 @@ def test_without_a_lens_there_is_no_uncertainty(rng: np.random.Generator) -> Non
     points = plane_grid(rng, 0.0)
     fit = fit_lens(grid_lines(points + rng.normal(0.0, 0.1, points.shape)), model="none")
     assert np.all(correction_sigma(fit, points, points) == 0.0)
+
+
+def test_parameters_without_an_error_have_no_part() -> None:
+    """All parameters are exact: the covariance is zero, with and without measured points."""
+    camera = Camera(matrix=((900.0, 0.0, 640.0), (0.0, 900.0, 480.0), (0.0, 0.0, 1.0)))
+    fit: Any = SimpleNamespace(camera=camera, names=("f", "cx"), covariance=np.zeros((2, 2)))
+    points = np.array([[[10.0, 20.0], [900.0, 700.0], [500.0, 30.0]]])
+    for measured in (np.empty((0, 2)), np.random.default_rng(1).uniform(0.0, 900.0, (9, 2))):
+        np.testing.assert_array_equal(correction_covariance(fit, points, measured), np.zeros((1, 3, 2, 2)))

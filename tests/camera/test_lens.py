@@ -42,6 +42,10 @@ def field(lens: Lens, reach: float = 0.999) -> np.ndarray:
     return points[radius < reach * lens.fold_radius]
 
 
+def test_a_lens_has_no_distortion_about_the_first_pixel_by_default() -> None:
+    assert Lens(k1=2e-7) == Lens(k1=2e-7, k2=0.0, k3=0.0, k4=0.0, centre=(0.0, 0.0))
+
+
 @pytest.mark.parametrize("lens", LENSES)
 def test_polynomial(lens: Lens) -> None:
     points = field(lens)

@@ -102,6 +102,12 @@ def test_numbers_out_of_bounds(change, message):
         TiltedSensor(**({"focal_length": 1700.0, "centre": (640.0, 512.0), "alpha": 0.1} | change))
 
 
+def test_pixels_that_are_not_square_are_refused():
+    camera = Camera(matrix=((900.0, 0.0, 640.0), (0.0, 950.0, 480.0), (0.0, 0.0, 1.0)))
+    with pytest.raises(ValueError, match=r"^the camera has fx = 900, fy = 950, expected square pixels$"):
+        TiltedSensor.from_camera(camera)
+
+
 def test_what_cannot_be_sharp_and_what_is_not_square():
     sensor = TiltedSensor(focal_length=5000.0, centre=(0.0, 0.0), alpha=0.1)
     with pytest.raises(ValueError, match="below f'"):

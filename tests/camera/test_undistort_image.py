@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -452,6 +453,20 @@ def test_a_map_is_small() -> None:
     op = UndistortImage(model=Lens(k1=1e-8, centre=(500.0, 500.0)))
     packed = PackedMap(*op._packed(1024, 1024))
     assert sum(each.nbytes for each in packed) < 4 * 1024 * 1024
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_frames_of_2_to_the_30_samples_are_refused(device: Device, channels: int) -> None:
+    """Of the input or of the result; the smallest size that is refused, and one row less."""
+    undistort = UndistortImage(model=Lens(k1=0.0), channels=channels, coordinates="computed")
+    rows, columns = 2**15, 2**15 // channels + (channels > 1)
+    tail = (3,) if channels == 3 else ()
+    with pytest.raises(ValueError, match=rf"fewer than 2\*\*30 samples, got {rows} x {columns} pixels"):
+        undistort.launch(device, (rows, columns, *tail), np.dtype(np.uint8))
+    undistort.launch(device, (rows - 1, columns, *tail), np.dtype(np.uint8))
+    large = replace(undistort, region=(0, 0, columns, rows))
+    with pytest.raises(ValueError, match=r"fewer than 2\*\*30 samples, got 5 x 7 pixels"):
+        large.launch(device, (5, 7, *tail), np.dtype(np.uint8))
 
 
 def test_wrong_arguments(device: Device) -> None:

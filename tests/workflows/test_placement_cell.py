@@ -82,3 +82,38 @@ def test_vibration_is_identified_in_twelve_periods_of_the_slowest_resonance(monk
     assert cell.machine.settling.rule == "vibration"
     assert cell.machine.settling.frequency == (30.0, 20.0, 0.0)
     assert cell.machine.settling.damping == (0.02, 0.03, 0.0)
+
+
+def test_reach_is_the_largest_error_in_a_period_after_the_contact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The head touches 0.1 s after the last frame, at 1.5 s; the slowest resonance has 10 Hz. Poses are t, 2 t, 3 t."""
+    asked: list[np.ndarray] = []
+
+    def pose(time: Any) -> np.ndarray:
+        asked.append(np.asarray(time))
+        return np.multiply.outer(time, [1.0, 2.0, 3.0])
+
+    plant = SimpleNamespace(pose=pose)
+    times = np.array([0.0, 0.5, 1.0, 1.4])
+    run: Any = SimpleNamespace(released=True, record=SimpleNamespace(time=times))
+    cell = object.__new__(PlacementCell)
+    cell.machine = machine = SimpleNamespace(  # type: ignore[assignment]
+        axes=[SimpleNamespace(resonance=2.0 * math.pi * frequency) for frequency in (10.0, 40.0, 0.0)],
+        settling=SimpleNamespace(lead=0.1),
+    )
+    target, offset = np.array([0.25, 0.5, 1.0]), np.array([0.05, 0.25, 0.5])
+    cell._plan = SimpleNamespace(target=target)  # type: ignore[assignment]
+    given: list[Any] = []
+    monkeypatch.setattr(cell, "_steer", lambda *args: given.append(args) or (run, plant))
+    monkeypatch.setattr(placement_cell, "error_share", lambda _, error: float(np.abs(error).max()))
+    start, swing, true = (np.full(3, value) for value in (1.0, 2.0, 3.0))
+    placement, motion, reach = cell.place(start, swing, true, offset)
+    assert given == [(machine, start, swing, true)]
+    assert placement is run
+    np.testing.assert_allclose(motion, np.outer(times, [1.0, 2.0, 3.0]) - target)
+    np.testing.assert_allclose(asked[1], np.linspace(1.5, 1.6, 33))
+    assert reach == pytest.approx(3.0 * 1.6 - 1.5)
+    for axis in machine.axes:
+        axis.resonance = 0.0
+    assert cell.place(start, swing, true, offset)[2] == pytest.approx(3.0 * 1.5 - 1.5)  # rigid axes: at the contact
+    run.released = False
+    assert math.isnan(cell.place(start, swing, true, offset)[2])

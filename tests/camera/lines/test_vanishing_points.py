@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import scipy.stats
 
 from gpuvision.camera.lens import Lens
+from gpuvision.camera.lines import vanishing_points
 from gpuvision.camera.lines.line_families import grid_lines
-from gpuvision.camera.lines.vanishing_points import LensFit, fit_lens, straightness_px
+from gpuvision.camera.lines.vanishing_points import LensFit, _ModelSearch, fit_lens, straightness_px
 from gpuvision.camera.patterns.dots import find_dots
 from gpuvision.camera.patterns.line_pattern import find_lines
 from straight_lines import bound, plane_grid, radial_lens, straightness
@@ -64,6 +69,83 @@ def test_predicted_errors_are_the_bound(rng: np.random.Generator, border: float,
     ratio = np.sqrt(np.diag(fit.covariance))[:4] / bound(ideal, lens, 0.05, meet=lines == "vanishing")
     assert np.all(ratio > 0.999)
     assert np.all(ratio < 1.1)
+
+
+class Search(_ModelSearch):
+    """Fits with given costs (order, concurrent), coefficients k_n = n and covariance; 90 residuals of 60 errors."""
+
+    def __init__(self, *, correlated: bool, sigma: float | None) -> None:
+        self.packed: Any = SimpleNamespace(x=np.zeros(90))
+        self.independent, self.sigma, self.correlated = 60, sigma, correlated
+        self.costs = {(0, False): 120.0, (1, False): 80.0, (3, False): 50.0, (3, True): 75.0, (1, True): 95.0}
+
+    def fit(self, order: int, concurrent: bool) -> Any:
+        k = np.arange(1.0, order + 1.0)
+        return SimpleNamespace(
+            evaluation=SimpleNamespace(cost=self.costs[order, concurrent]), parameters=SimpleNamespace(k=k)
+        )
+
+    def parameters(self, order: int, concurrent: bool) -> int:
+        return (order + 2 if order else 0) + (10 if concurrent else 20)
+
+    def is_correlated(self, order: int, concurrent: bool) -> bool:
+        return self.correlated
+
+    def covariance(self, order: int, concurrent: bool) -> np.ndarray:
+        return np.array([[9.0, 1.0, 2.0, 0.5], [1.0, 4.0, 1.0, 0.2], [2.0, 1.0, 6.0, 0.1], [0.5, 0.2, 0.1, 3.0]])
+
+    def smooth_residuals(self, order: int, concurrent: bool) -> Any:
+        return SimpleNamespace(lack_of_fit=SimpleNamespace(modes=11))
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+@pytest.mark.parametrize("sigma", [None, 0.8])
+def test_which_test_compares_two_models(correlated: bool, sigma: float | None) -> None:
+    """Wald's test of the further coefficients where errors are correlated; without a lens, or of lines, the F test."""
+    search = Search(correlated=correlated, sigma=sigma)
+    value, covariance = np.array([2.0, 3.0]), np.array([[4.0, 1.0], [1.0, 6.0]])
+    wald = scipy.stats.f.sf(value @ np.linalg.solve(covariance, value) / 2.0, 2, 11)
+
+    def by_cost(worse: float, better: float, more: int, parameters: int) -> float:
+        """Each of the 60 independent errors counts 1.5 times."""
+        gain = (worse - better) / 1.5
+        if sigma is not None:
+            return float(scipy.stats.chi2.sf(gain / sigma**2, more))
+        freedom = 90 - parameters
+        return float(scipy.stats.f.sf(gain / more / (better / freedom), more, freedom / 1.5))
+
+    expected = by_cost(80.0, 50.0, 2, 25)
+    assert search.p_value((1, False), (3, False)) == pytest.approx(wald if correlated else expected, rel=1e-9)
+    assert search.p_value((1, True), (3, True)) == pytest.approx(
+        wald if correlated else by_cost(95.0, 75.0, 2, 15), rel=1e-9
+    )
+    assert search.p_value((0, False), (3, False)) == pytest.approx(by_cost(120.0, 50.0, 5, 25), rel=1e-9)
+    assert search.p_value((3, True), (3, False)) == pytest.approx(by_cost(75.0, 50.0, 10, 25), rel=1e-9)
+    assert search.p_value((1, True), (3, False)) == pytest.approx(by_cost(95.0, 50.0, 12, 25), rel=1e-9)
+
+
+@pytest.mark.parametrize("tests_residuals", [False, True])
+def test_noise_and_correlation_of_a_model(tests_residuals: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    search: Any = object.__new__(_ModelSearch)
+    search.packed = SimpleNamespace(x=np.zeros(90))
+    search.fits = {(2, True): SimpleNamespace(evaluation=SimpleNamespace(cost=50.0))}
+    monkeypatch.setattr(_ModelSearch, "parameters", lambda *_: 18)
+    for sigma, scale, noise in ((None, 0.0, math.sqrt(50.0 / 72.0)), (None, 0.3, 0.3), (0.7, 0.3, 0.7)):
+        search.sigma, search.scale = sigma, scale
+        assert search.noise(2, True) == pytest.approx(noise)
+    search.tests_residuals, search.limits = tests_residuals, SimpleNamespace(lack_of_fit_significance=0.01)
+    search.owner, search.independent = None, 60
+    asked: list[Any] = []
+    for sigma, p_value, is_correlated in ((0.7, 0.0099, True), (None, 0.01, False)):
+        search.smooth, search.sigma = {}, sigma
+        smooth = SimpleNamespace(lack_of_fit=SimpleNamespace(p_value=p_value))
+        monkeypatch.setattr(vanishing_points, "smooth_residuals", lambda *given, s=smooth: asked.append(given) or s)
+        assert search.is_correlated(2, True) == (is_correlated and tests_residuals)
+        assert search.is_correlated(2, True) == (is_correlated and tests_residuals)
+    # Computed once for each model, with the given variance.
+    found = search.fits[2, True]
+    variances = [pytest.approx(0.49), None] if tests_residuals else []
+    assert asked == [(search.packed, found, 72, 60, variance) for variance in variances]
 
 
 def coverage(rng: np.random.Generator, draws: int, cases: list[tuple[float, float, float]]) -> np.ndarray:

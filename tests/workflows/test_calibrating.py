@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +25,7 @@ from gpuvision.host.errors import RecordingError
 from gpuvision.host.outputs import MANIFEST
 from gpuvision.schema import DescriptionError
 from gpuvision.sensor.sensor import Sensor
+from gpuvision.workflows import calibrating
 from gpuvision.workflows.calibrating import calibrate, write_calibration
 from gpuvision.workflows.undistorting import undistort_files
 from target_images import View, dots, photo, view
@@ -254,6 +258,84 @@ def test_images_keep_their_type(device: Device, kind: str, channels: int, tmp_pa
         again = again[..., ::-1]
     assert again.dtype == kind
     np.testing.assert_array_equal(again, image)
+
+
+# ---- choice of the method ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def dispatched(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """Return a function that calibrates from detected grids, and returns the calibration; the fits are recorded."""
+
+    def fitted(kind: str) -> Any:
+        def fit(*given: Any, **options: Any) -> Any:
+            return SimpleNamespace(kind=kind, given=given, options=options, camera="camera", lens="lens")
+
+        return fit
+
+    monkeypatch.setattr(calibrating, "fit_camera", fitted("camera"))
+    monkeypatch.setattr(calibrating, "fit_lens", fitted("lens"))
+    monkeypatch.setattr(calibrating, "make_view", lambda grid, pitch: (grid, pitch))
+    monkeypatch.setattr(calibrating, "straightness_px", lambda families, model=None: (families, model))
+
+    def run(grids: tuple[str | None, ...], **options: Any) -> Any:
+        detected = [
+            SimpleNamespace(grid=grid, families=(f"rows {number}", f"columns {number}"))
+            for number, grid in enumerate(grids)
+        ]
+        monkeypatch.setattr(calibrating, "detect_targets", lambda *given: (detected, [("e.png", "dark")], (640, 480)))
+        return calibrate(["a.png"], **options)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("grids", "options", "kind"),
+    [
+        (("g", "h", "i"), {}, "camera"),
+        (("g", "h"), {}, "lens"),
+        (("g", "h", None), {}, "lens"),
+        (("g",), {"focal_length": 900.0}, "camera"),
+        (("g", "h", "i"), {"method": "lines"}, "lens"),
+        (("g",), {"method": "views", "pitch": 2e-3}, "camera"),
+        ((None, None), {"pattern": "lines"}, "lens"),
+    ],
+)
+def test_views_are_used_where_they_give_a_camera(
+    dispatched: Callable[..., Any], grids: tuple[str | None, ...], options: dict[str, Any], kind: str
+) -> None:
+    done = dispatched(grids, model="k1", loss="huber", **options)
+    families = tuple(name for n in range(len(grids)) for name in (f"rows {n}", f"columns {n}"))
+    assert done.fit.kind == kind
+    if kind == "camera":
+        assert done.fit.given == ([(grid, options.get("pitch", 1.0)) for grid in grids], (640, 480))
+        assert done.fit.options == {"model": "k1", "focal_length": options.get("focal_length"), "loss": "huber"}
+    else:
+        assert (done.fit.given, done.fit.options) == ((families,), {"model": "k1", "loss": "huber"})
+    assert done.straightness_px == ((families, None), (families, kind))
+    assert (done.pattern, done.image_size) == (options.get("pattern", "dots"), (640, 480))
+    assert done.skipped_images == (("e.png", "dark"),)
+    assert [each.grid for each in done.detected_targets] == list(grids)
+
+
+def test_options_that_a_method_does_not_take(dispatched: Callable[..., Any]) -> None:
+    with pytest.raises(ValueError, match=r"pitch has no effect with method 'lines'.*fewer than 3 images of a grid"):
+        dispatched(("g", "h"), pitch=1e-3)
+    with pytest.raises(ValueError, match="focal_length has no effect with method 'lines'"):
+        dispatched(("g", "h", "i"), method="lines", focal_length=900.0)
+    with pytest.raises(ValueError, match="method 'views' needs a grid of points, a line pattern has none"):
+        dispatched((None,), method="views", pattern="lines")
+
+
+@pytest.mark.parametrize(("count", "more"), [(1, ""), (2, r" \(and 1 more images\)"), (4, r" \(and 3 more images\)")])
+def test_images_without_a_target_are_counted(count: int, more: str, tmp_path: Path) -> None:
+    files = [tmp_path / f"{number}.png" for number in range(count)]
+    for number, file in enumerate(files):
+        cv2.imwrite(str(file), np.full((48, 64), 80 + number, np.uint8))
+    steps: list[tuple[int, int | None]] = []
+    with pytest.raises(ValueError, match=rf"^{re.escape(str(files[0]))}{more}: no dots found"):
+        calibrate(files, progress=lambda done, of: steps.append((done, of)))
+    assert steps == [(number, count) for number in range(count + 1)]
 
 
 # ---- errors ------------------------------------------------------------------------------------------

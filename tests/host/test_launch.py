@@ -136,6 +136,14 @@ def test_work_sizes() -> None:
     assert group_per_element(33, 64) == WorkSize((2112,), (64,), 1)
 
 
+def test_messages_name_the_operation() -> None:
+    single = Machine(has_double=False)
+    for options, name in (({}, "Scale"), ({"name": "Outer"}, "Outer")):
+        with pytest.raises(ValueError, match=f"^{name}: device machine has no double precision and reads no float64"):
+            builder((3,), np.float64, machine=single, **options).real  # noqa: B018
+        assert builder((3,), machine=single, **options).name == name
+
+
 def test_variant_follows_the_device_unless_it_is_named() -> None:
     cpu, gpu = Machine(), Machine(is_cpu=False)
     for machine, variant, expected in (

@@ -16,6 +16,7 @@ from gpuvision.host.program import build, options
 from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
+from gpuvision.ranging.triangulation import Triangulation
 
 READOUT = PsdReadout(strip_length=2.0)
 
@@ -362,6 +363,16 @@ def test_an_array_of_another_device_is_refused(pairs):
         READOUT(frame, device=devices[1])
     with pytest.raises(ValueError, match="another device"):
         READOUT.bind(devices[1], pairs.shape, pairs.dtype)(frame)
+
+
+def test_inputs_of_two_devices_are_refused_by_the_device_of_the_first():
+    devices = Device.all()
+    if len(devices) < 2:
+        pytest.skip("there is one device only")
+    sheet = Triangulation(homography=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), region=((-1, 1), (-1, 1)))
+    position, light = (each.empty((4, 5), np.float32) for each in devices[:2])
+    with pytest.raises(ValueError, match=f"the array lies on another device than {devices[0].label}"):
+        sheet(position, light)
 
 
 def test_a_part_of_an_array_is_refused(device):

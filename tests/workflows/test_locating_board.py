@@ -34,7 +34,18 @@ from gpuvision.matching.board.edge_measurement import BoardMeasurer
 from gpuvision.matching.board.located_board import LocatedBoard
 from gpuvision.matching.board.measurement_result import MeasurementLimits
 from gpuvision.matching.pose.pose import BoardPose
-from gpuvision.workflows.locating_board import _reason_of_ambiguity, locate_board
+from gpuvision.status import Status
+from gpuvision.workflows import locating_board
+from gpuvision.workflows.locating_board import (
+    LocalizationLimits,
+    _Clock,
+    _ExpectedPose,
+    _initial_view,
+    _Job,
+    _reason_of_ambiguity,
+    _search_range,
+    locate_board,
+)
 from gpuvision.workflows.locating_robot import floor_points
 
 PIXEL, SHAPE, NOISE = 40e-6, (300, 400), 2.0
@@ -83,6 +94,223 @@ def camera_image(
 def errors_in_sigmas(located: LocatedBoard, pose: tuple[float, float, float]) -> np.ndarray:
     """Return the error of a pose in units of its sigmas."""
     return (np.array(located.pose) - pose) / located.sigmas
+
+
+LIMITS = LocalizationLimits()
+
+
+@pytest.mark.parametrize(
+    ("given", "known", "scale", "has_features", "expected"),
+    [
+        ((1e-3, 0.2), True, 1e-5, True, (1e-3, 0.2)),
+        ((1e-3, math.pi), False, 1e-5, False, (1e-3, math.pi)),
+        (None, False, 1e-5, True, (2e-3, math.radians(5.0))),
+        (None, True, 1e-5, True, (7e-5, 0.01)),
+        (None, True, 2.5e-5, False, (1e-4, math.radians(0.3))),
+        (None, True, 3e-5, False, (1.2e-4, math.radians(0.3))),  # 4 pixels
+    ],
+)
+def test_search_range_of_a_board(
+    given: Any, known: bool, scale: float, has_features: bool, expected: tuple[float, float]
+) -> None:
+    features: Any = SimpleNamespace(imaging=SimpleNamespace(shift=7e-5, angle=0.01)) if has_features else None
+    assert _search_range(given, known, scale, features, LIMITS) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("given", [(0.0, 0.1), (math.inf, 0.1), (1e-3, -1e-9), (1e-3, 3.15)])
+def test_search_ranges_out_of_bounds(given: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match=r"search_range is .*, expected metres above 0, and an angle of 0 to pi"):
+        _search_range(given, True, 1e-5, None, LIMITS)
+
+
+def test_initial_view_of_a_board() -> None:
+    board: Any = SimpleNamespace(bounds=np.array([[0.0, 0.01], [0.02, 0.05]]), side="bottom")
+    view = _initial_view(None, board, 3e-5, (5, 7), None)
+    assert (view.pose, view.mirrored, view.scale, view.shape) == (
+        pytest.approx((0.01, 0.03, 0.0)),
+        True,
+        3e-5,
+        (5, 7),
+    )
+    board.side = "top"
+    view = _initial_view((0.5, 0.25, 0.125), board, 3e-5, (5, 7), None)
+    assert (view.pose, view.mirrored) == ((0.5, 0.25, 0.125), False)
+
+
+def test_time_of_a_step_that_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = iter([10.0, 11.5, 14.0, 20.0])
+    monkeypatch.setattr(locating_board.time, "perf_counter", lambda: next(now))
+    clock = _Clock()
+    clock.record("features")
+    clock.record_apart("choose device", 0.5)
+    clock.record_apart("choose device", 0.25)
+    clock.record("rulers")
+    clock.record("support")
+    assert clock.seconds == {"features": 1.5, "choose device": 0.75, "rulers": 1.75, "support": 6.0}
+
+
+def job(**changes: Any) -> _Job:
+    """Return a job that runs each step on the device "cpu"."""
+    devices: Any = SimpleNamespace(
+        choose=lambda step, run, *size: run("cpu") and "cpu",
+        choices={"rulers": SimpleNamespace(device="cpu")},
+        report=lambda: {"rulers": "cpu"},
+    )
+    artwork: Any = SimpleNamespace(side="top", warnings=("a warning",))
+    values: dict[str, Any] = {
+        "grey": np.zeros((5, 7), np.uint8),
+        "artwork": artwork,
+        "noise": 2.0,
+        "threshold": 9.0,
+        "blur_px": 1.25,
+        "etch_bias_sigma": 8e-6,
+        "devices": devices,
+        "limits": LIMITS,
+    }
+    return _Job(**(values | changes))
+
+
+def board_view(x: float, y: float, theta: float = 0.0, scale: float = 2e-5) -> BoardView:
+    return BoardView(scale=scale, shape=(5, 7), pose=(x, y, theta))
+
+
+@pytest.mark.parametrize(
+    ("reach", "scale", "is_registered"),
+    [
+        ((2.5e-4, math.radians(1.0)), 2e-5, False),
+        ((2.51e-4, 0.0), 2e-5, True),
+        ((1e-4, math.radians(1.01)), 2e-5, True),
+        ((3e-4, 0.0), 3e-5, False),  # 10 pixels
+    ],
+)
+def test_a_large_search_range_is_registered_first(
+    monkeypatch: pytest.MonkeyPatch, reach: tuple[float, float], scale: float, is_registered: bool
+) -> None:
+    prepared: list[Any] = []
+
+    class Search:
+        search = SimpleNamespace(point=np.zeros((4, 2)))
+        rulers = SimpleNamespace(point=np.zeros((6, 2)))
+
+        def __call__(self, image: Any, device: Any) -> Any:
+            return SimpleNamespace(pose=np.ones(3), status=Status.OK, runner_up_pose=None)
+
+    monkeypatch.setattr(
+        locating_board, "prepare_board_registration", lambda *given, **how: prepared.append((given, how)) or Search()
+    )
+    monkeypatch.setattr(locating_board, "move_view", lambda view, pose: (view, pose))
+    done, view = job(), board_view(0.1, 0.2, scale=scale)
+    expected: Any = done.register(view, reach)
+    if not is_registered:
+        assert (expected, prepared) == (_ExpectedPose(view, reach), [])
+        return
+    ((given, how),) = prepared
+    assert given[0] is done.artwork
+    assert (how["shift"], how["angle"]) == reach
+    assert (how["blur_px"], how["threshold"]) == (1.25, 9.0)
+    assert expected.reach == pytest.approx((max(6e-5, 3.0 * scale), 2e-3))
+    assert (expected.other, expected.reason) == (None, "")
+    kept, moved = tuple(expected.view)
+    assert kept is view
+    np.testing.assert_array_equal(moved, np.ones(3))
+
+
+@pytest.mark.parametrize("rulers", [0, 3])
+@pytest.mark.parametrize("status", [Status.OK, Status.AMBIGUOUS, Status.NO_DATA])
+def test_results_of_a_registration(monkeypatch: pytest.MonkeyPatch, status: Status, rulers: int) -> None:
+    found = SimpleNamespace(
+        pose=np.full(3, np.nan) if status == Status.NO_DATA else np.ones(3),
+        status=status,
+        runner_up_pose=np.zeros(3),
+        score=0.375,
+        rulers=rulers,
+    )
+
+    class Search:
+        search = rulers = SimpleNamespace(point=np.zeros((4, 2)))
+
+        def __call__(self, image: Any, device: Any) -> Any:
+            assert device == "cpu"
+            return found
+
+    monkeypatch.setattr(locating_board, "prepare_board_registration", lambda *_, **__: Search())
+    monkeypatch.setattr(locating_board, "move_view", lambda view, pose: (view, tuple(pose)))
+    done, view = job(), board_view(0.1, 0.2, scale=3e-5)
+    expected: Any = done.register(view, (2e-3, 0.1))
+    assert expected.found is found
+    assert expected.reach == pytest.approx((9e-5, 2e-3))
+    if status == Status.NO_DATA:
+        few = "too few straight edges are in view; give an initial pose (fiducials are enough then), or another scale"
+        many = "the best candidate has 38% of its edges; is the board in view, is the scale right?"
+        assert expected.reason == f"the coarse registration found no pose of the board: {many if rulers else few}"
+        assert (expected.view, expected.other) == (view, None)
+    else:
+        assert (expected.view, expected.reason) == ((view, (1.0, 1.0, 1.0)), "")
+        assert expected.other == ((view, (0.0, 0.0, 0.0)) if status == Status.AMBIGUOUS else None)
+    assert {"prepare registration", "registration", "choose device"} <= set(done.clock.seconds)
+
+
+@pytest.mark.parametrize(
+    ("preference", "distance", "bright", "found_at", "words"),
+    [
+        (3.1, 1e-3, True, 0.0, ""),
+        (3.0, 1e-3, True, 0.0, ""),  # undecided; only the found pose lies in the range
+        (
+            -3.1,
+            1e-3,
+            True,
+            0.0,
+            "fits better 1.00 mm away (x 1.00 mm, y 0.00 mm), with bright copper; check the initial",
+        ),
+        (-3.0, 1e-3, True, 0.0, ""),
+        (0.0, 1e-4, True, 0.0, "fits as well 0.10 mm away (x 0.10 mm, y 0.00 mm), with bright copper; show the end"),
+        (0.0, 1e-4, False, 0.0, ""),  # the given polarity decides
+        (0.0, 1e-3, False, 3e-4, "fits as well 1.00 mm away (x 1.00 mm, y 0.00 mm), with dark copper; show the end"),
+    ],
+)
+def test_support_of_a_pose_by_the_image(
+    monkeypatch: pytest.MonkeyPatch, preference: float, distance: float, bright: bool, found_at: float, words: str
+) -> None:
+    """The search range is 0.2 mm; the second pose lies at x = distance, y = 0, the expected one at 0."""
+    asked: list[Any] = []
+    other = SimpleNamespace(preference=preference, view=board_view(distance, 0.0), distance=distance, is_bright=bright)
+    monkeypatch.setattr(
+        locating_board, "find_other_pose", lambda *given, **how: asked.append((given[1:], how)) or other
+    )
+    done, found = job(), board_view(0.0, found_at)
+    text = done._test_support(board_view(0.0, 0.0), found, "bright", 2e-4)
+    assert words in text
+    assert bool(words) == bool(text)
+    assert asked == [((done.artwork, found, 4.0 * 2e-4, 1.25), {"is_bright": True})]
+    monkeypatch.setattr(locating_board, "find_other_pose", lambda *_, **__: None)
+    assert done._test_support(board_view(0.0, 0.0), found, "dark", 2e-4) == ""
+
+
+def test_covariance_at_the_image_centre(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The camera moves against the board; a turn about the placement point moves the centre, 3 and -2 mm away."""
+    covariance = np.array([[4.0, 1.0, 0.5], [1.0, 9.0, -0.25], [0.5, -0.25, 16.0]]) * 1e-12
+    solution = SimpleNamespace(
+        covariance=covariance,
+        warnings=("another",),
+        **dict.fromkeys(("rulers", "fiducials", "etch_bias", "residual_scale", "condition", "scale_error")),
+    )
+    view = board_view(0.013, 0.018)
+    measurement: Any = SimpleNamespace(view=view, solution=solution)
+    features: Any = SimpleNamespace(placement=np.array([0.010, 0.020]))
+    done = job()
+    located = done._result(measurement, "bright", features, None, "")
+    # A turn t about the placement point moves a point at (3, -2) mm from it by t (2, 3) mm.
+    motion = np.array([[-1.0, 0.0, -2e-3], [0.0, -1.0, -3e-3], [0.0, 0.0, -1.0]])
+    np.testing.assert_allclose(located.covariance, motion @ covariance @ motion.T, rtol=1e-12)
+    np.testing.assert_array_equal(located.placement_covariance, covariance)
+    np.testing.assert_allclose(located.placement_px, view.to_measured_pixels(features.placement))
+    assert (located.noise, located.threshold, located.copper) == (2.0, 9.0, "bright")
+    assert located.warnings == ("a warning", "another")
+    assert (located.device, located.steps) == ("cpu", {"rulers": "cpu"})
+    refused = done._result(measurement, "dark", features, None, "too few")
+    assert np.isnan(refused.covariance).all()
+    assert np.isnan(refused.placement_covariance).all()
+    assert (refused.reason, refused.copper) == ("too few", "dark")
 
 
 def test_a_view_s_places_and_pixels_are_each_other_s() -> None:

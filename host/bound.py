@@ -13,6 +13,7 @@ import pyopencl as cl
 import pyopencl.array
 
 from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
+from gpuvision.host.build_notice import building
 from gpuvision.host.constant_memory import fitting_defines
 from gpuvision.host.device import Device
 from gpuvision.host.failure import launch_failure
@@ -378,15 +379,16 @@ class Bound(Generic[R]):
         launch, operation = self._launch, self.operation
         if operation.kernel_folder is None:
             raise ValueError(f"{type(operation).__name__} has no kernel_folder; set it to the folder of its .cl files")
-        program = build(
-            self.device,
-            operation.kernel_folder,
-            launch.source,
-            fitting_defines(launch, queue.device, operation.kernel_folder, operation.include_folders),
-            include_folders=operation.include_folders,
-            handle=queue.device,
-        )
-        kernel = cl.Kernel(program, launch.kernel)
+        with building(launch.source):
+            program = build(
+                self.device,
+                operation.kernel_folder,
+                launch.source,
+                fitting_defines(launch, queue.device, operation.kernel_folder, operation.include_folders),
+                include_folders=operation.include_folders,
+                handle=queue.device,
+            )
+            kernel = cl.Kernel(program, launch.kernel)
         name = type(operation).__name__
         self._global, self._local = fit_work(kernel, queue.device, launch, name=name, label=self.device.label)
         after_inputs = len(launch.inputs)

@@ -162,8 +162,11 @@ def _end_after_grace(ear: int, numbers: frozenset[int]) -> None:
 
 
 def _run() -> None:
+    from gpuvision.host.build_notice import BuildNotice, show_builds
     from gpuvision.host.errors import GpuVisionError
 
+    if sys.stderr.isatty() and os.environ.get("TERM") != "dumb":
+        show_builds(BuildNotice(sys.stderr))
     try:
         application()()
     except (GpuVisionError, ValueError, TypeError, ArithmeticError, MemoryError, OSError) as error:

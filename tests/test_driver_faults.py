@@ -91,6 +91,7 @@ def test_case(is_wrong):
 
 
 @pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_the_summary_lists_expected_failures_that_pass(tmp_path: Path, workers: int) -> None:
     (tmp_path / "conftest.py").write_text((ROOT / "tests" / "conftest.py").read_text())
     (tmp_path / "test_cases.py").write_text(MARKED_CASES)

@@ -21,6 +21,7 @@ def _without_recordings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
     calibration.case_of.cache_clear()
 
 
+@pytest.mark.slow
 def test_cases_without_recordings(device: Device) -> None:
     cases = list(calibration.cases(device))
     assert [case.name for case in cases] == [

@@ -263,7 +263,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "kernel_varia
 @needs_compilers
 @pytest.mark.parametrize(
     ("operation", "inputs", "loads", "stores", "requests", "sectors"),
-    [each[1:] for each in STREAMS],
+    [pytest.param(*each[1:], marks=[pytest.mark.slow] * ("colour" in each[0])) for each in STREAMS],
     ids=[each[0] for each in STREAMS],
 )
 def test_streams_are_coalesced(
@@ -316,7 +316,8 @@ def test_kernels_compiled_for_a_group_size_refuse_another_one(name: str, group_s
 
 
 @needs_compilers
-@pytest.mark.parametrize("group_size", [32, pytest.param(16, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("group_size", [32, 16])
 def test_a_smaller_group_solves_a_problem(group_size: int) -> None:
     """`FitLines` launches a group of 64 per line: smaller groups are as many, and give the same results."""
     operation = gv.FitLines(variant="work_item")

@@ -138,6 +138,7 @@ def test_a_point_is_described_by_the_parameters_that_differ():
     assert plot.describe(points[0], points) == "method ml"
 
 
+@pytest.mark.slow
 def test_the_command_writes_points_and_pictures(device, tmp_path):
     options = ["--device", device.label, "--seconds", "0.01", "--json", str(tmp_path / "points.json")]
     result = CliRunner().invoke(application(), ["curves", "pose", *options, "--plots", str(tmp_path / "plots")])

@@ -62,6 +62,7 @@ def test_registers_and_spills_are_those_of_the_kernel() -> None:
     assert build.read_log("successfully vectorised", "psd") == {}
 
 
+@pytest.mark.slow
 def test_an_example_is_built(device: Device) -> None:
     row = build.build_example(device.label, 0)
     assert row["source"] == "psd/psd.cl"

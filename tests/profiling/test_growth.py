@@ -39,6 +39,7 @@ def test_the_cache_knee_is_where_the_arrays_fill_the_cache() -> None:
     assert growth.cache_knee(curve(1.0, 1.0, 1.0), 10) == 1.0  # one item does not fit
 
 
+@pytest.mark.slow
 def test_a_curve_goes_from_one_item_to_the_limit_of_memory(device: Any) -> None:
     """A sample of float32 currents with position and status takes 13 bytes."""
     found = growth.measure_growth(["psd"], [device], memory=13 * 4**5, seconds=0.002)
@@ -71,6 +72,7 @@ def test_the_items_of_a_workload_are_repeated(name: str, device: Any) -> None:
     assert [(tuple(shape), dtype) for shape, dtype in specs.inputs] == [(each.shape, each.dtype) for each in inputs]
 
 
+@pytest.mark.slow
 def test_inputs_beyond_the_limit_of_memory_are_not_made(monkeypatch: pytest.MonkeyPatch, device: Any) -> None:
     made: list[int] = []
     inputs = growth.Workload.inputs
@@ -79,6 +81,7 @@ def test_inputs_beyond_the_limit_of_memory_are_not_made(monkeypatch: pytest.Monk
     assert made == [1, 4, 16]
 
 
+@pytest.mark.slow
 def test_the_other_workloads_are_measured_when_one_fails(monkeypatch: pytest.MonkeyPatch, device: Any) -> None:
     known = growth.workloads()
     broken = dataclasses.replace(known["line"], samples=[np.zeros((4, 0, 0), np.uint8)])
@@ -103,6 +106,7 @@ def test_without_points_a_message_says_so(tmp_path: Any, device: Any) -> None:
         draw_growth(tmp_path, found)
 
 
+@pytest.mark.slow
 def test_a_slow_operation_is_not_measured_with_more_items(monkeypatch: pytest.MonkeyPatch, device: Any) -> None:
     monkeypatch.setattr(growth, "take_turns", lambda calls, *_, **__: {"": np.full(7, 1.5)})
     found = growth.measure_growth(["psd"], [device], memory=1 << 20)
@@ -124,6 +128,7 @@ def test_the_picture_has_the_curves_and_their_knees(tmp_path: Any, monkeypatch: 
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("after", "code"), [(101e9, 0), (55e9, 1)])
 def test_the_command_measures_and_writes(
     tmp_path: Any, monkeypatch: pytest.MonkeyPatch, device: Any, after: float, code: int

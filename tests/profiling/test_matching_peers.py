@@ -51,12 +51,9 @@ def test_a_wrong_edge_of_a_peer_is_noticed(exact_rulers):
             ruler.check_peer("changed", edges, status, exact)
 
 
-# Numba compiles each form for seconds; the shortest one runs in the fast tier.
-@pytest.mark.parametrize(
-    ("rays", "is_long"),
-    [(4, False), *(pytest.param(*form, marks=pytest.mark.slow) for form in ((4, True), (8, False), (8, True)))]
-    + [pytest.param(16, is_long, marks=pytest.mark.slow) for is_long in (False, True)],
-)
+@pytest.mark.slow  # Numba compiles each form for seconds
+@pytest.mark.parametrize("is_long", [False, True])
+@pytest.mark.parametrize("rays", [4, 8, 16])
 def test_numba_adds_the_shifted_rows(rays, is_long):
     """61 or 131 rays fill neither the passes nor the sums of 16 bits; some are not used."""
     rng = np.random.default_rng(8)

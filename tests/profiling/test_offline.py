@@ -71,6 +71,7 @@ def known_builds() -> tuple[KernelBuild, ...]:
     return tuple(registry.all_builds())
 
 
+@pytest.mark.slow
 def test_every_kernel_file_has_a_build() -> None:
     files = {path.relative_to(KERNEL_FOLDER).as_posix() for path in KERNEL_FOLDER.glob("*/*.cl")}
     assert files - {each.source for each in known_builds()} == set()

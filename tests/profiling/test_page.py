@@ -109,6 +109,7 @@ def check_offline(text: str) -> Parsed:
     return parsed
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_whole_run() -> None:
     parsed = check_offline(page(full_run()))
     text = parsed.text
@@ -218,6 +219,7 @@ def test_numbers_are_short() -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two-core-epyc.json", "two-core-epyc-simulation.json", "two-core-epyc-stream.json"])
 def test_stored_results_are_read_and_shown(name: str) -> None:
     stored = read_run(RESULTS / name)
@@ -257,6 +259,7 @@ def test_other_files_are_refused_with_the_reason(tmp_path: Path, content: str, m
 # The command ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_makes_the_page_of_a_stored_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(harness, "profile", lambda *_, **__: pytest.fail("measured"))
     full_run().write(tmp_path / "run.json")

@@ -10,7 +10,8 @@ from gpuvision.profiling import triangulation
 from gpuvision.ranging.triangulation import Triangulation
 
 
-@pytest.mark.parametrize("lens", [None, pytest.param(triangulation.LENS, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("lens", [None, triangulation.LENS])
 def test_the_peers_agree_with_the_kernel(device: Device, lens: object) -> None:
     operation = Triangulation(homography=triangulation.HOMOGRAPHY, region=triangulation.REGION, lens=lens)
     # `_case` compares the flags of kernel and NumPy in double precision, and the results of both with Numba's.

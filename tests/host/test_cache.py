@@ -61,6 +61,7 @@ def test_folder_and_files_are_for_the_user_alone(folder: Path, umask: int) -> No
     assert mode(folder / "file") == 0o600
     assert cache.read_private(folder / "file") == "text"
     assert (mode(folder / "vendors" / "x"), mode(folder / "vendors" / "x" / "a.icd")) == (0o700, 0o600)
+    assert mode(folder / "vendors") == 0o700
 
 
 def test_a_folder_that_another_process_makes_meanwhile_is_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,8 @@ from gpuvision.host import (
     plan_stream,
     planning,
 )
+from gpuvision.host.cache import write_private
+from gpuvision.host.kept_numbers import kept_number
 from gpuvision.host.planning import Cost
 from gpuvision.host.program import sources_digest
 from gpuvision.ranging.psd import PsdReadout
@@ -195,6 +197,18 @@ def kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(device_choice, "_failures", {})
     monkeypatch.setattr(kept_numbers, "cache_folder", lambda: tmp_path)
     return tmp_path / "step_seconds.json"
+
+
+def test_the_newest_thousand_numbers_are_kept(kept: Path) -> None:
+    """A key that is measured again counts as new; damaged entries are left out."""
+    old = {f"key {number}": number + 1.0 for number in range(1000)}
+    write_private(kept, json.dumps({"bad": "text", "zero": 0.0} | old))
+    assert kept_number(kept.name, ("a", 1), lambda: 2.5) == 2.5
+    assert kept_number(kept.name, ("a", 1), lambda: 9.0) == 2.5
+    entries = json.loads(kept.read_text())
+    assert [*entries.values()] == [*list(old.values())[1:], 2.5]
+    assert kept_number(kept.name, ("a", 2), lambda: 3.5) == 3.5
+    assert [*json.loads(kept.read_text()).values()] == [*list(old.values())[2:], 2.5, 3.5]
 
 
 def test_each_step_runs_where_it_is_fastest(gpu: Device, device: Device, kept: Path, clock: Clock) -> None:

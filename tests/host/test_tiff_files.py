@@ -1,0 +1,106 @@
+"""Sizes of compressed TIFF segments, before they are decoded."""
+
+from __future__ import annotations
+
+import io
+import lzma
+import zlib
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpuvision.host import tiff_files
+from gpuvision.host.errors import RecordingError
+from gpuvision.host.tiff_files import _unpacks_beyond, check_tiff_page
+
+PACKBITS, DEFLATE, LZMA = 32773, 8, 34925
+
+
+def packed_bits(rng: np.random.Generator, parts: int) -> tuple[bytes, int]:
+    """Return a PackBits segment of literals, runs and no-operations, and the number of bytes that it unpacks to."""
+    packed, size = bytearray(), 0
+    for _ in range(parts):
+        kind, count = rng.integers(0, 3), int(rng.integers(2, 129))
+        if kind == 0:
+            packed += bytes([count - 1]) + rng.bytes(count)
+        elif kind == 1:
+            packed += bytes([257 - count]) + rng.bytes(1)
+        else:
+            packed += bytes([128])
+        size += count if kind < 2 else 0
+    return bytes(packed), size
+
+
+def test_packbits_segments(rng: np.random.Generator) -> None:
+    """A byte of a literal that is read as a control would change the sum."""
+    for parts in range(1, 40):
+        packed, size = packed_bits(rng, parts)
+        assert not _unpacks_beyond(packed, PACKBITS, size)
+        assert size == 0 or _unpacks_beyond(packed, PACKBITS, size - 1)
+    # A literal of one byte, a run of 128, a run of 2.
+    for packed, size in ((b"\x00a", 1), (b"\x81a", 128), (b"\xffa", 2), (b"\x7f" + 128 * b"a", 128), (b"\x80", 0)):
+        assert not _unpacks_beyond(packed, PACKBITS, size)
+        assert size == 0 or _unpacks_beyond(packed, PACKBITS, size - 1)
+
+
+@pytest.mark.parametrize(("compression", "compress"), [(DEFLATE, zlib.compress), (LZMA, lzma.compress)])
+@pytest.mark.parametrize("size", [1, 1000, 3_000_000])
+def test_other_segments(compression: int, compress: Any, size: int) -> None:
+    packed = compress(bytes(size))
+    assert not _unpacks_beyond(packed, compression, size)
+    assert _unpacks_beyond(packed, compression, size - 1)
+    # A segment that is cut unpacks to less.
+    assert not _unpacks_beyond(packed[: len(packed) // 2], compression, size)
+
+
+def test_unpacking_ends_at_the_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A segment of many chunks is not unpacked to its end, and a decoder that gives nothing is not asked again."""
+    chunk = tiff_files._CHUNK
+    asked: list[int] = []
+
+    class Unpacker:
+        eof, unconsumed_tail, empty = False, b"rest", False
+
+        def decompress(self, packed: bytes, most: int) -> bytes:
+            asked.append(most)
+            return b"" if self.empty else bytes(most)
+
+    monkeypatch.setattr(tiff_files.zlib, "decompressobj", Unpacker)
+    assert _unpacks_beyond(b"packed", DEFLATE, 3 * chunk)
+    assert asked == [chunk] * 4
+    asked.clear()
+    Unpacker.empty = True
+    assert not _unpacks_beyond(b"packed", DEFLATE, 3 * chunk)
+    assert asked == [chunk]
+
+
+def test_pages_whose_segments_unpack_to_too_much_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A strip may unpack to twice its pixels, and small segments always."""
+    strip = zlib.compress(bytes(70_000))
+    file = io.BytesIO(b"head" + strip)
+
+    def page(rows: int, columns: int, **changes: Any) -> Any:
+        values = {
+            "dtype": np.dtype(np.uint16),
+            "shape": (rows, columns),
+            "chunks": (rows, columns),
+            "compression": DEFLATE,
+            "dataoffsets": (0, 4),
+            "databytecounts": (1, len(strip)),
+            "parent": SimpleNamespace(filehandle=file),
+        }
+        return SimpleNamespace(**(values | changes))
+
+    monkeypatch.setattr(tiff_files, "_SMALL_SEGMENT", 1000)
+    check_tiff_page(page(100, 175), "page")  # 2 x 35 000 bytes
+    with pytest.raises(RecordingError, match="page: a segment unpacks to more than the 69600 bytes expected"):
+        check_tiff_page(page(100, 174), "page")
+    with pytest.raises(RecordingError, match="more than the 2000 bytes"):
+        check_tiff_page(page(100, 175, chunks=(10, 50)), "page")
+    check_tiff_page(page(100, 175, chunks=(10, 50), compression=5), "page")  # not counted
+    monkeypatch.setattr(tiff_files, "_SMALL_SEGMENT", 70_000)
+    check_tiff_page(page(10, 17), "page")
+    with pytest.raises(RecordingError, match="page: pixels of an unknown type"):
+        check_tiff_page(page(10, 10, dtype=None), "page")

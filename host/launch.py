@@ -45,8 +45,9 @@ class Launch:
         NumPy scalars, passed by value; NumPy arrays, uploaded once (tables, parameters); ``None``: a null pointer for
         a table that this build does not read.
     passes_once : bool
-        Whether the kernel does little more than read and write its memory once. Small launches of such kernels run in
-        the calling thread, because waking a worker thread takes longer than the work. Default False.
+        Whether the kernel does little more than read and write its memory once, or is known to take as short for
+        another reason. Small launches of such kernels run in the calling thread, because waking a worker thread takes
+        longer than the work. Default False.
     problem_per_group : bool
         Whether each work-group of the work-item variant solves one problem, with results that do not depend on the
         size of the group. A device without registers for the groups then runs the same number of smaller groups.

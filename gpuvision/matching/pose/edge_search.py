@@ -34,7 +34,13 @@ from gpuvision.host import (
     to_numpy,
     type_defines,
 )
-from gpuvision.matching.field.field_pose import MIN_SHIFTS, PoseCosts, pose_cost_outputs, pose_grid_work
+from gpuvision.matching.field.field_pose import (
+    MIN_SHIFTS,
+    PoseCosts,
+    is_short_search,
+    pose_cost_outputs,
+    pose_grid_work,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite, integer
 
@@ -226,6 +232,7 @@ class EdgeSearch(VisionOperation[PoseCosts]):
                 **flags(WITH_SCORES=self.with_scores),
             },
             arguments=[*map(np.int32, (self.points, self.rows, self.columns, shape[2], limit, work.each))],
+            passes_once=is_short_search(work, math.prod(grid), self.points),
         )
 
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from canary import Guarded
+from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device
-from gpuvision.matching.field.field_pose import PoseCosts
+from gpuvision.matching.field.distance_map import DistanceMap
+from gpuvision.matching.field.field_pose import FieldPoseSearch, PoseCosts
 from gpuvision.matching.pose.edge_search import (
     COST_LEVELS,
     CellMeans,
@@ -49,7 +53,7 @@ def test_cells_and_levels_are_those_of_their_definition(device: Device, dtype: A
 
 
 @VARIANTS
-@pytest.mark.parametrize(("rows", "columns"), [(9, 7), (5, 64), (1, 1), (3, 131)])
+@pytest.mark.parametrize(("rows", "columns"), [(9, 7), (5, 64), (1, 1), (3, 131), (2, 96), (2, 97)])
 def test_scores_are_sums_of_levels(
     device: Device, variant: Any, rows: int, columns: int, rng: np.random.Generator
 ) -> None:
@@ -104,3 +108,17 @@ def test_a_shift_is_where_its_edge_is_cheap(device: Device) -> None:
     assert np.all(np.abs(best.cells[1:] - best.cells[0]).max(axis=1) > 3)
     far = cell_offsets((edges[:, :2] + 200.0)[None], edges[None, :, 2:], cell, border, level.shape, positions)
     assert (far == -1).all()
+
+
+@pytest.mark.parametrize(("points", "is_short"), [(3, False), (2, True)])
+def test_short_searches_run_in_the_calling_thread(device: Device, points: int, is_short: bool) -> None:
+    """At most 2^22 = 2 x 2^21 additions, in the vector variant: 8 headings x 512 x 512 positions x 2 points."""
+    op = EdgeSearch(rows=512, columns=512, headings=8, points=points, variant="vector")
+    launch = op.launch(device, (8, 600, 600), np.dtype(np.uint16))
+    assert launch.passes_once == is_short
+    field_map = DistanceMap(field=read_field("robocup_junior"), cell=0.01, scale=0.05, max_range=1.5, device=device)
+    count = (1 << 22) // (2 * math.prod(field_map.positions)) + (not is_short)
+    search = FieldPoseSearch(map=field_map, headings=(0.1, 0.2), variant="vector")
+    assert search.launch(device, (count, 2), np.dtype(np.float32)).passes_once == is_short
+    by_items = replace(search, variant="work_item")
+    assert not by_items.launch(device, (count, 2), np.dtype(np.float32)).passes_once

@@ -51,6 +51,14 @@ def test_efficiency_is_that_of_the_cie_table() -> None:
         irradiance_from_lux(1.0, 850e-9)
 
 
+@pytest.mark.parametrize(("nanometres", "efficiency"), [(450.0, 0.038), (507.0, 0.444), (555.0, 1.0), (620.0, 0.381)])
+def test_irradiance_of_light_that_the_eye_sees(nanometres: float, efficiency: float) -> None:
+    """1000 lx of one wavelength; the efficiencies are the CIE's, which the two Gaussians meet to 0.01."""
+    irradiance = irradiance_from_lux(1000.0, nanometres * 1e-9)
+    assert 1000.0 / 683.0 / irradiance == pytest.approx(efficiency, abs=0.01)
+    assert irradiance_from_lux(250.0, nanometres * 1e-9) == pytest.approx(irradiance / 4.0)
+
+
 def test_electrons_are_those_of_the_energy_of_photons() -> None:
     """A photon of 500 nm has 2.4797 eV; 1 eV is 1.602177e-19 J."""
     sensor = replace(SENSOR, wavelength=500e-9)

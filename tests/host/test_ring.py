@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyopencl as cl
 import pytest
 
-from gpuvision.host import Device
+from gpuvision.host import Device, ring
 from gpuvision.host.launch import Specs, nbytes_of
 from gpuvision.host.operation import Operation
-from gpuvision.host.ring import StagedSlot, Step, check_chain, queues_of, slot_bytes, steps_of
+from gpuvision.host.ring import SharedSlot, StagedSlot, Step, check_chain, queues_of, slot_bytes, steps_of
 from streams import READOUT, currents_of
 
 PAPER: Any = None  # the operations below ask no device
@@ -135,6 +136,16 @@ def test_the_download_lasts_from_its_first_copy_to_its_last(device: Device, monk
     assert spans["download"] == (min(start for start, _ in times[1:]), max(end for _, end in times[1:]))
     assert spans["upload"][1] <= spans["compute"][0] < spans["compute"][1] <= spans["download"][0]
     assert slot.queued <= spans["compute"][0]
+
+
+@pytest.mark.parametrize("kind", [StagedSlot, SharedSlot])
+def test_the_source_writes_the_first_input(kind: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other inputs are the fixed arrays of a step."""
+    slot = object.__new__(kind)
+    slot._first, slot._outputs = SimpleNamespace(inputs=("frames", "rulers", "poses")), Pair(None, "second")
+    monkeypatch.setattr(StagedSlot, "_pinned", lambda _, array: f"host {array}")
+    monkeypatch.setattr(ring, "host_view", lambda array: f"host {array}")
+    assert slot._host_side() == ("host frames", Pair(None, "host second"))
 
 
 def test_a_short_batch_trims_all_computed_fields(device: Device) -> None:

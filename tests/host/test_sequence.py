@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from gpuvision.host import Device, Launch, LaunchBuilder, Layout, Operation, OperationSequence, Stage, Trace
@@ -109,6 +110,29 @@ def test_outputs_that_are_missing_or_not_computed_are_refused(device: Device) ->
         bound.on_host([FRAME], Chained(last, nothing, parity, first))
     with pytest.raises(ValueError, match=r"out.first is missing"):
         bound.on_host([FRAME], Chained(last, None, parity, None))
+
+
+def test_each_stage_is_launched_once(device: Device) -> None:
+    """The first one waits for the given events; `begun` is its event, the last event is returned."""
+    bound: Any = Chain().bind(device, FRAME.shape, FRAME.dtype)
+    calls: list[Any] = []
+    own = bound._bounds
+
+    def counted(number: int) -> Any:
+        return lambda *given, **how: calls.append((number, given, how)) or f"event {number}"
+
+    bound._bounds = tuple(counted(number) for number in range(3))
+    gate: Any = ["gate"]
+    assert bound(wait_for=gate) == "event 2"
+    assert bound.begun == "event 0"
+    assert calls == [(0, (), {"wait_for": gate}), (1, (), {}), (2, (), {})]
+    bound._bounds = own
+    bound.inputs[0].set(FRAME)
+    gate = cl.UserEvent(device.context)
+    event = bound(wait_for=[gate])
+    gate.set_status(cl.command_execution_status.COMPLETE)
+    event.wait()
+    check(Chained(*(None if each is None else each.get() for each in bound.outputs)), FRAME)
 
 
 def test_device_arrays(device: Device) -> None:

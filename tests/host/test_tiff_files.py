@@ -5,15 +5,17 @@ from __future__ import annotations
 import io
 import lzma
 import zlib
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 
 from gpuvision.host import tiff_files
 from gpuvision.host.errors import RecordingError
-from gpuvision.host.tiff_files import _unpacks_beyond, check_tiff_page
+from gpuvision.host.tiff_files import _unpacks_beyond, check_tiff_page, open_stack
 
 PACKBITS, DEFLATE, LZMA = 32773, 8, 34925
 
@@ -104,3 +106,27 @@ def test_pages_whose_segments_unpack_to_too_much_are_refused(monkeypatch: pytest
     check_tiff_page(page(10, 17), "page")
     with pytest.raises(RecordingError, match="page: pixels of an unknown type"):
         check_tiff_page(page(10, 10, dtype=None), "page")
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("compression", [None, "zlib"])
+def test_pages_are_frames(tmp_path: Path, rng: np.random.Generator, channels: int, compression: Any) -> None:
+    """Grey pages, and the green channel of pages in red, green and blue."""
+    pages = rng.integers(0, 60_000, (4, 5, 7, 3)).astype(np.uint16)
+    with tifffile.TiffWriter(tmp_path / "stack.tif") as file:
+        for page in pages:
+            file.write(
+                page if channels == 3 else page[..., 1],
+                photometric="rgb" if channels == 3 else "minisblack",
+                compression=compression,
+                contiguous=False,
+            )
+    source = open_stack(tmp_path / "stack.tif", "green" if channels == 3 else "grey")
+    assert (source.shape, source.dtype, source.length) == ((5, 7), np.uint16, 4)
+    frames, arrived = np.zeros((6, 5, 7), np.uint16), np.zeros(6, np.int64)
+    count = 0
+    while source.wait() and (read := source.read_into(frames[count:], arrived[count:])):
+        count += read
+    source.close()
+    assert count == 4
+    np.testing.assert_array_equal(frames[:4], pages[..., 1])

@@ -23,7 +23,19 @@ from gpuvision.cli.main import application
 from gpuvision.formats.camera_file import covariance_table, write_lens
 from gpuvision.host import Device
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.workflows.calibrating_sensor import BlockViews, TransportViews, _warnings, calibrate_sensor
+from gpuvision.workflows import calibrating_sensor
+from gpuvision.workflows.calibrating_sensor import (
+    BlockViews,
+    TransportViews,
+    _cell,
+    _check_transport_targets,
+    _Light,
+    _lit_targets,
+    _motion,
+    _sheet_of_points,
+    _warnings,
+    calibrate_sensor,
+)
 from gpuvision.workflows.laser_images import pair_images, split_steps
 from gpuvision.workflows.scanning import scan
 from laser_sensor import PITCH, PROFILES_BETWEEN, LaserSensor, sensor, up, write_images
@@ -98,6 +110,122 @@ def readings(truth: LaserSensor, height: float, profile: float) -> Float64:
     rows = truth.line(up(truth), truth.origin + height * up(truth) + profile * truth.step)
     columns = np.arange(60.0, 420.0, 4.0)
     return np.stack([columns, rows[columns.astype(int)]], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("along", "step", "cell"), [("columns", 1e-5, 41e-6), ("rows", -2e-5, 21e-6), ("rows", -5.55e-5, 56e-6)]
+)
+def test_cell_is_the_larger_of_step_and_samples(along: Any, step: float, cell: float) -> None:
+    """A pixel is 40.2 um wide and 20.1 um high; the median of the readings is taken over all lines."""
+    asked: list[Float64] = []
+
+    def points(pixels: Float64) -> Float64:
+        asked.append(pixels)
+        return np.array([40.2e-6 * pixels[0], 20.1e-6 * pixels[1], 7.0])
+
+    lines: Any = [SimpleNamespace(points=np.array(each)) for each in ([[0.0, 9.0], [4.0, 1.0]], [[5.0, 2.0]])]
+    geometry: Any = SimpleNamespace(points=points, step=step)
+    assert _cell(geometry, lines, along) == pytest.approx(cell, rel=1e-12)
+    assert [4.0, 2.0] in [each.tolist() for each in asked]
+
+
+def test_only_targets_with_a_laser_image_are_lit() -> None:
+    detected: Any = [SimpleNamespace(image=name) for name in "abc"]
+    lasers: Any = {"a": "a_laser", "b": None, "c": "c_laser"}
+    found = _lit_targets(detected, lasers, at_least=2)
+    assert [(each.image, laser) for each, laser in found] == [("a", "a_laser"), ("c", "c_laser")]
+    with pytest.raises(ValueError, match="2 target images with a laser image show the target, expected two at least"):
+        _lit_targets(detected, lasers, at_least=3)
+    assert _lit_targets(detected, {}, at_least=0) == []
+
+
+def test_readings_of_targets_blocks_and_points_are_in_order() -> None:
+    lines: Any = {"one": "line one", "two": "line two"}
+    blocks: Any = (("block one", np.zeros(3)), ("block two", np.zeros(3)))
+    points: Any = "points"
+    light = _Light("rows", lines, blocks, points)
+    assert light.others == ("block one", "block two", "points")
+    assert light.readings == ("line one", "line two", "block one", "block two", "points")
+    assert _Light("rows", lines, blocks).others == ("block one", "block two")
+
+
+def test_transport_views_show_the_whole_target() -> None:
+    names = [Path(name) for name in ("m1.png", "m2.png", "m3.png")]
+
+    def target(name: Path, rows: int, columns: int, missing: int = 0) -> Any:
+        grid = np.ones((rows, columns, 2))
+        grid.reshape(-1, 2)[:missing] = np.nan
+        return SimpleNamespace(image=name, grid=grid)
+
+    good = [target(name, 4, 6) for name in names]
+    _check_transport_targets(good, [], names)
+    _check_transport_targets([*good, target(Path("pose.png"), 3, 5)], [(Path("other.png"), "dark")], names)
+    with pytest.raises(ValueError, match=r"^m2\.png: the transport needs the target in every view .*; no dots"):
+        _check_transport_targets([good[0], good[2]], [(names[1], "no dots")], names)
+    with pytest.raises(ValueError, match=r"^m3\.png: 18 points in a grid of 6 x 3, m1\.png shows 6 x 4; the transport"):
+        _check_transport_targets([*good[:2], target(names[2], 3, 6)], [], names)
+    with pytest.raises(ValueError, match=r"^m2\.png: 22 points in a grid of 6 x 4, m1\.png shows 6 x 4"):
+        _check_transport_targets([good[0], target(names[1], 4, 6, missing=2), good[2]], [], names)
+
+
+@pytest.mark.parametrize(("ratio", "factor"), [(9.0, None), (9.01, "3.0"), (25.0, "5.0")])
+def test_views_that_scatter_are_named(ratio: float, factor: str | None) -> None:
+    lines: Any = [SimpleNamespace(image=Path("a.png"), note="dim"), SimpleNamespace(image=Path("b.png"), note="")]
+    few, many = np.zeros(20), np.zeros(20)
+    few[:10], many[:11] = np.nan, np.nan
+    for sheet_ratio, transport_ratio, words in (
+        (ratio, 1.0, "the laser lines scatter {} times as much from view to view as readings and poses predict"),
+        (1.0, ratio, "the transport views scatter {} times as much about a straight uniform motion"),
+    ):
+        sheet = SimpleNamespace(residuals=(few, many), view_ratio=sheet_ratio)
+        geometry: Any = SimpleNamespace(sheet=sheet, transport=SimpleNamespace(view_ratio=transport_ratio))
+        found = _warnings(geometry, lines)
+        assert found[:2] == [
+            "a.png: dim",
+            "b.png: the sheet rejects 11 of 20 readings; check that the target did not move between its two images",
+        ]
+        assert [each.startswith(words.format(factor)) for each in found[2:]] == ([] if factor is None else [True])
+    geometry.transport = None
+    assert _warnings(geometry, lines)[-1].startswith("no transport views: the part is assumed to move along -(g x h)")
+
+
+def test_points_of_a_fixture_give_the_direction_of_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    pixels, places = np.array([[10.0, 5.0], [30.0, 7.0], [50.0, 6.0]]), np.ones((3, 3))
+    calls: list[Any] = []
+    monkeypatch.setattr(calibrating_sensor, "read_known_points", lambda file: (pixels, places))
+    monkeypatch.setattr(
+        calibrating_sensor, "sheet_from_points", lambda *given, **how: calls.append((given, how)) or "fit"
+    )
+    found: Any = SimpleNamespace(camera="camera", names=("f",))
+    for given, along in ((None, "columns"), ("rows", "rows")):
+        asked: Any = given
+        light, sheet = _sheet_of_points(Path("points.csv"), found, asked)
+        assert (light.along, light.lines, light.blocks, sheet) == (along, {}, (), "fit")
+        assert light.points is not None
+        assert (light.points.image, light.points.note) == (Path("points.csv"), "")
+        assert math.isnan(light.points.threshold)
+        np.testing.assert_array_equal(light.points.points, pixels)
+        (camera, by_places, by_pixels), how = calls[-1]
+        assert (camera, by_places is places, by_pixels is pixels) == ("camera", True, True)
+        assert how == {"along": along, "names": ("f",)}
+    pixels[:] = pixels[:, ::-1].copy()
+    assert _sheet_of_points(Path("points.csv"), found, None)[0].along == "rows"
+
+
+def test_transport_is_fitted_about_the_middle_of_the_target(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four profiles lie between two views; the first view shows 2 x 3 points at a pitch of 5 mm."""
+    monkeypatch.setattr(calibrating_sensor, "fit_transport", lambda *given: given)
+    names = [Path(name) for name in ("m1.png", "m2.png", "m3.png")]
+    views: Any = SimpleNamespace(
+        detected=[SimpleNamespace(image=name, grid=np.ones((2, 3, 2)) * n) for n, name in enumerate(names)], pitch=5e-3
+    )
+    found: Any = SimpleNamespace(targets={name: f"pose of {name}" for name in names})
+    transport = TransportViews(folder=Path("moved"), profiles_between=4.0)
+    fit: Any = _motion(transport, views, found, names)
+    targets, profiles, middle = fit
+    assert targets == [f"pose of {name}" for name in names]
+    np.testing.assert_array_equal(profiles, [0.0, 4.0, 8.0])
+    np.testing.assert_allclose(middle, [5e-3, 2.5e-3, 0.0][: len(middle)])
 
 
 def test_parameters_are_within_their_sigma(written: Path) -> None:

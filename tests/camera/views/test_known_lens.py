@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from gpuvision.camera.lens import Lens
+from gpuvision.camera.views import known_lens
+from gpuvision.camera.views.bundle_adjustment import FitState
 from gpuvision.camera.views.known_lens import fit_tilt
 from tilted_camera import scene
 
@@ -34,6 +37,37 @@ def test_exact_points_give_the_exact_sensor(rng, tilt, count, known, kappa):
         np.testing.assert_allclose(pose.rotation, rotation, atol=1e-6)
         np.testing.assert_allclose(pose.translation, translation, atol=1e-6)
     assert fit.rms_px < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("focus", "noise", "is_known"),
+    [
+        (0.299, 0.01, True),
+        (0.301, 0.01, False),
+        (0.149, 0.005, True),
+        (0.151, 0.005, False),
+        (0.299, 5.0, True),
+        (math.nan, 1.0, False),
+    ],
+)
+def test_a_focal_length_that_the_views_do_not_determine(focus, noise, is_known, monkeypatch):
+    """The relative error is at most 0.3 for noise of 0.01 px or more; less noise counts as 0.01 px."""
+    monkeypatch.setattr(known_lens, "covariances", lambda *_: (np.diag([4.0, 9e-6, 1e-6]), None, focus))
+    monkeypatch.setattr(known_lens, "residual_sigma", lambda *_: noise)
+    values = np.zeros(14)
+    values[:6] = 900.0, 1.0, 640.0, 480.0, 640.0, 480.0
+    state = FitState(values, np.eye(3)[None], np.array([[0.0, 0.0, 0.5]]), cost=72.0)
+    free = SimpleNamespace(names=("f", "tauX", "tauY"))
+    views = SimpleNamespace(coordinates=16)
+    if not is_known:
+        with pytest.raises(ValueError, match="the views do not determine f'"):
+            known_lens._result(views, free, state, Lens(k1=1e-8))
+        return
+    fit = known_lens._result(views, free, state, Lens(k1=1e-8))
+    assert (fit.sensor.focal_length, fit.sensor.alpha, fit.names) == (900.0, 0.0, ("f", "tauX", "tauY"))
+    assert fit.rms_px == pytest.approx(3.0)
+    assert fit.alpha_sigma == pytest.approx(3e-3)  # of the less certain angle, where alpha is 0
+    np.testing.assert_array_equal(fit.covariance, np.diag([4.0, 9e-6, 1e-6]))
 
 
 def _axis(alpha, direction):

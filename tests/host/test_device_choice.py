@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -197,6 +198,30 @@ def kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(device_choice, "_failures", {})
     monkeypatch.setattr(kept_numbers, "cache_folder", lambda: tmp_path)
     return tmp_path / "step_seconds.json"
+
+
+@pytest.mark.parametrize(
+    ("calls", "limit", "made", "median"),
+    [
+        (7, math.inf, 9, 5.0),  # of 8, 2, 5, 3, 9, 7, 4
+        (4, math.inf, 6, 5.0),  # the upper one of the two in the middle of 8, 2, 5, 3
+        (7, 120.0, 4, 8.0),  # the limit counts the calls of the warm-up: 112 + 8 s do not exceed it, 2 more do
+        (7, 1.0, 3, 8.0),  # one timed call at least
+    ],
+)
+def test_median_time_of_calls(
+    calls: int, limit: float, made: int, median: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    durations = [12.0, 100.0, 8.0, 2.0, 5.0, 3.0, 9.0, 7.0, 4.0]
+    now, done = [0.0], [0]
+
+    def call() -> None:
+        now[0] += durations[done[0]]
+        done[0] += 1
+
+    monkeypatch.setattr(device_choice, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    assert device_choice._median_seconds(call, 2, calls, limit) == median
+    assert done == [made]
 
 
 def test_the_newest_thousand_numbers_are_kept(kept: Path) -> None:

@@ -25,6 +25,9 @@ NONE6, NONE2, NONE4 = (0.0,) * 6, (0.0,) * 2, (0.0,) * 4
         ((0.3, 0.3, 0.7), [0.7]),
         ((0.3, 0.7, 0.7), [0.3]),
         ((0.3, 0.7, 0.7, 2.0), [0.3, 2.0]),
+        ((1e7,), [1e7]),
+        ((0.5, 9e11), [0.5, 9e11]),
+        ((0.5, 1.1e12), [0.5]),  # beyond the square of the farthest radius
     ],
 )
 def test_sign_changes_are_at_positive_roots_of_odd_order(roots: tuple[complex, ...], expected: list[float]) -> None:

@@ -102,6 +102,14 @@ def test_the_first_frame_of_a_group_gives_the_threshold(background: Background) 
     assert found.minimum_peak == max(40.0, found.threshold)
 
 
+def test_grey_levels_far_from_zero_keep_their_noise() -> None:
+    """An offset that the background removes changes nothing; float32 would round these levels to multiples of 64."""
+    frames = daylight("median").astype(np.float64)[:, None]
+    plain: Any = sensor_with_threshold(sensor("median"), frames).readout
+    moved: Any = sensor_with_threshold(sensor("median"), frames + 2.0**29).readout
+    assert moved.threshold == plain.threshold
+
+
 def test_a_source_that_gives_its_frames_once_is_refused() -> None:
     for given in (sensor("median", automatic=False), sensor()):
         with pytest.raises(RecordingError, match="need a recording that can be read twice"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from types import SimpleNamespace
 from typing import Any
 
@@ -33,7 +34,9 @@ def test_report_of_the_repeatability() -> None:
 
 def test_one_frame_has_no_scatter_and_no_frame_no_mean() -> None:
     zero = np.zeros(3)
-    one, none = (Repeatability(np.ones((count, 3)), zero, zero).report() for count in (1, 0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of NumPy, for a mean of nothing
+        one, none = (Repeatability(np.ones((count, 3)), zero, zero).report() for count in (1, 0))
     assert one["mean"] == dict.fromkeys(NAMES, 1.0)
     for values in (one["measured_sigma"], none["measured_sigma"], none["mean"]):
         assert np.isnan(list(values.values())).all()

@@ -24,10 +24,10 @@ def box(left: float, bottom: float, right: float, top: float) -> Any:
 
 
 APERTURES = [
-    box(-0.5, 1.0, -0.2, 1.2),
-    box(-0.05, 0.9, 0.1, 1.4),
+    box(-0.507, 1.007, -0.207, 1.207),
+    box(-0.057, 0.907, 0.107, 1.407),
     box(-0.89, 0.7, -0.7, 0.8),  # its margin leaves the map on the left
-    box(-0.86, 0.1, -0.7, 0.3),  # its margin ends at the border
+    box(-0.865, 0.107, -0.707, 0.307),  # its margin ends at the border
     box(0.3, 1.0, 0.305, 1.005),  # between the centres of cells
     box(0.4, 1.88, 0.5, 1.9),  # its margin leaves the map at the top
 ]

@@ -9,6 +9,7 @@ import signal
 import sys
 from importlib import resources
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.sensors.readings import PATHS
+from gpuvision.workflows import simulating
 from gpuvision.workflows.light_cache import (
     PROFILES_PER_BLOCK,
     LightStore,
@@ -66,6 +68,16 @@ def light(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def task_of(part_file: Path, sensor: str = "psd_line", **more: Any) -> Any:
     part, materials = load_part(part_file, 1.0, None, 0.5)
     return prepare_simulation(part, materials, Sensor.load(sensor), **({"profiles": 40} | more))
+
+
+def test_the_limit_is_five_sigmas_or_the_tolerance() -> None:
+    """The median of the known sigmas, 3 um."""
+    reading: Any = SimpleNamespace(sigma=np.array([[1e-6, np.nan, 3e-6], [np.inf, 9e-6, np.nan]]))
+    for tolerance, limit in ((1e-6, 15e-6), (16e-6, 16e-6)):
+        task: Any = SimpleNamespace(tolerance=tolerance)
+        assert simulating._default_limit(reading, task, simulating.SimulationLimits()) == pytest.approx(limit)
+    reading.sigma[:] = np.nan
+    assert simulating._default_limit(reading, task, simulating.SimulationLimits()) == 16e-6
 
 
 def test_a_part_is_scanned_from_end_to_end(part_file: Path) -> None:

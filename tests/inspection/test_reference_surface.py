@@ -35,7 +35,8 @@ def test_exact_surfaces_beside_cells_of_another_level(order: int, share: float, 
     np.testing.assert_allclose(found.centre, [x.mean(), y.mean()])
     assert found.length == pytest.approx(np.hypot(x - x.mean(), y - y.mean()).max())
     assert (found.order, found.cells) == (order, 300)
-    assert found.scale < 1e-10
+    # The scale is that of the first fit, which ends early where cells lie on another level, 60 um away.
+    assert found.scale < (1e-9 if share else 1.1e-12)
     grid = np.meshgrid(np.linspace(2e-3, 5e-3, 4), np.linspace(0.0, 3e-3, 5))
     u, v = (grid[0] - x.mean()) / found.length, (grid[1] - y.mean()) / found.length
     every = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v])[: design.shape[1]]

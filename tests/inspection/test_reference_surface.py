@@ -59,7 +59,7 @@ def test_the_fit_minimises_tukeys_loss(order: int, rng: np.random.Generator) -> 
     assert 200 < np.count_nonzero(inside) < 300
     psi = np.where(inside, residual * (1.0 - ratio**2) ** 2, 0.0)
     slope = np.where(inside, (1.0 - ratio**2) * (1.0 - 5.0 * ratio**2), 0.0).mean()
-    size = np.abs(design.T @ np.abs(psi))
+    size = np.abs(design).T @ np.abs(psi)
     assert (np.abs(design.T @ psi) < 1e-4 * size).all()
     factor = len(x) / (len(x) - design.shape[1]) * np.mean(psi**2) / slope**2
     np.testing.assert_allclose(found.covariance, factor * np.linalg.inv(design.T @ design), rtol=1e-3, atol=1e-18)

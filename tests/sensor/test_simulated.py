@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 from gpuvision.ranging.sheet import SampleAxes
+from gpuvision.schema import Section
+from gpuvision.sensor.light_source import Light, read_light
+from gpuvision.sensor.polygon import read_polygon
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.simulated import (
     line_noise,
@@ -141,3 +144,20 @@ def changed(sensor: Sensor, values: dict[str, Any]) -> Any:
     for name in sensor.__dataclass_fields__:
         object.__setattr__(copied, name, values.get(name, getattr(sensor, name)))
     return copied
+
+
+def test_light_sources_read_and_made_have_the_same_defaults() -> None:
+    found = read_light(Section({"aperture": 2e-3, "power": 0.5}, "sensor.toml"))
+    made = Light(lens=None, aperture=2e-3, power=0.5)
+    assert found == made
+    assert (made.exposure, made.full_well, made.read_noise, made.responsivity) == (1e-3, 20_000.0, 0.0, 0.4)
+    assert (made.thickness, made.sub_sheets, made.blur, made.bins, made.nodes) == (0.0, 1, 0.0, 64, (1, 1))
+    assert (made.source, made.width, made.profile, made.patch_size) == (None, None, None, None)
+    assert (made.ambient, made.modulated) == (0.0, False)
+
+
+def test_a_mirror_that_reflects_no_sample_names_its_rotations() -> None:
+    """Eight facets reflect the beam from -22.5 to 22.5 degrees at most; three samples are farther away."""
+    values = {"apothem": 0.03, "facets": 8, "height": 0.2, "first_rotation": 1.0, "rotation_step": 0.25}
+    with pytest.raises(ValueError, match=r"turns from 1 to 1\.5 rad, expected a part of .* where a facet reflects"):
+        read_polygon(Section(values, "sensor.toml"), 3, None)

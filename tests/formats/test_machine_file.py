@@ -85,6 +85,7 @@ def test_all_keys_of_loop_and_settling_are_read(tmp_path: Path) -> None:
         ({"loop": {"rate": 1000.0, "observer": "kalmann"}}, "kalman"),
         ({"loop": {"rate": 1000.0, "observer": "kalman"}}, "loop: motion_sigma belongs to the observer"),
         ({"settling": {"rule": "fixed"}}, "settling: wait belongs to the rule"),
+        ({"axes": {"y": {"resonance": 90.0, "swing": -1e-9}}}, "axes.y.swing is -1e-09"),
         ({"loop": {"rte": 1000.0}}, "the key 'loop.rate' is missing"),
         ({"loop": {"rate": 1000.0, "gian": 0.1}}, "did you mean 'loop.gain'"),
         ({"loop": {"rate": 1000.0, "gain": 1.9}}, "limit of stability"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -14,7 +15,7 @@ from gpuvision.host import Device
 from gpuvision.host.outputs import MANIFEST
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
-from gpuvision.workflows.preview import preview_scan
+from gpuvision.workflows.preview import Preview, preview_scan
 from gpuvision.workflows.scanning import scan
 from scanning import Ran, check_refused, currents
 from scanning import line_frames as frames_of_lines
@@ -34,6 +35,16 @@ def daylight() -> Sensor:
     shipped = Sensor.load("camera_line")
     median = dataclasses.replace(shipped.recording, background="median")
     return dataclasses.replace(shipped, recording=median, auto_threshold=True)
+
+
+@pytest.mark.parametrize(
+    ("damaged", "words"), [((), ""), ((3,), "; 1 damaged frame"), ((3, 7, 9), "; 3 damaged frames")]
+)
+def test_summary_counts_damaged_frames(damaged: tuple[int, ...], words: str) -> None:
+    frames: Any = tuple(SimpleNamespace(found_fraction=each) for each in (0.5, 0.25, 0.125))
+    preview = Preview(name="", sensor=Sensor.load("camera_line"), frames=frames, damaged_frames=damaged)
+    assert preview.summary().startswith("preview of 3 frames at ")
+    assert preview.summary().endswith(f": a line in 29.2 % of the samples{words}")
 
 
 def test_frames_are_spread_over_the_recording(device: Device) -> None:

@@ -122,10 +122,10 @@ def test_the_download_lasts_from_its_first_copy_to_its_last(device: Device, monk
     currents = currents_of(3, strips=40_000)
     slot: StagedSlot[Any] = StagedSlot([Step(READOUT)], device, queues, 3, currents.shape[1:], currents.dtype)
     slot.frames[...] = currents
+    expected = READOUT(currents, device=device)
     monkeypatch.setattr(cl, "enqueue_copy", recorded)
     slot.launch()
     slot.wait()
-    expected = READOUT(currents, device=device)
     np.testing.assert_array_equal(slot.result.position, expected.position)
     np.testing.assert_array_equal(slot.result.status, expected.status)
     assert [queue for queue, _ in copied] == [queues.upload] + 3 * [queues.download]

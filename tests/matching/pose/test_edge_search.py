@@ -110,6 +110,7 @@ def test_a_shift_is_where_its_edge_is_cheap(device: Device) -> None:
     assert (far == -1).all()
 
 
+@pytest.mark.vectors
 @pytest.mark.parametrize(("points", "is_short"), [(3, False), (2, True)])
 def test_short_searches_run_in_the_calling_thread(device: Device, points: int, is_short: bool) -> None:
     """At most 2^22 = 2 x 2^21 additions, in the vector variant: 8 headings x 512 x 512 positions x 2 points."""

@@ -134,6 +134,16 @@ def test_the_download_lasts_from_its_first_copy_to_its_last(device: Device, monk
     assert list(spans) == ["upload", "compute", "download"]
     assert spans["upload"] == times[0]
     assert spans["download"] == (min(start for start, _ in times[1:]), max(end for _, end in times[1:]))
+
+
+def test_steps_of_a_slot_follow_one_another(device: Device) -> None:
+    queues = queues_of(device, 1, zero_copy=False, profiling=True, inline=False)[0]
+    currents = currents_of(3, strips=40_000)
+    slot: StagedSlot[Any] = StagedSlot([Step(READOUT)], device, queues, 3, currents.shape[1:], currents.dtype)
+    slot.frames[...] = currents
+    slot.launch()
+    slot.wait()
+    spans = slot.spans()
     assert spans["upload"][1] <= spans["compute"][0] < spans["compute"][1] <= spans["download"][0]
     assert slot.queued <= spans["compute"][0]
 

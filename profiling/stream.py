@@ -5,7 +5,8 @@ frame waits longer for its slot than the buffers of a sensor last. Latency is th
 its positions are in host memory.
 
 One case runs beside a second process that loads one core half of the time. The stream of this case has the settings
-that `plan_stream` finds before the load begins. ``python -m gpuvision.profiling.stream`` repeats this case.
+that `plan_stream` finds before the load begins. ``python -m gpuvision.profiling.stream`` repeats this case: five runs
+of 60 s on each device, a table at the end, and exit code 1 if a run lost a frame or is void.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import copy
+import math
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +25,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from gpuvision.host import Device, DeviceArray
+from gpuvision.host import Device, DeviceArray, GpuVisionError, Stall, StreamError
 from gpuvision.host.pipeline import Pipeline
 from gpuvision.host.planning import Plan, plan_stream
 from gpuvision.host.report import StreamReport
@@ -163,6 +165,8 @@ def _half_loaded_core() -> Iterator[None]:
         load.stdout.readline()
         try:
             yield
+            if load.poll() is not None:
+                raise StreamError(f"the second process ended with exit code {load.returncode} during the run")
         finally:
             load.stdin.close()
 
@@ -229,23 +233,99 @@ def _error(frames: NDArray[np.uint8], device: Device) -> float:
     return error
 
 
+@dataclass(frozen=True)
+class LoadedRun:
+    """Run beside a half-loaded core: number, label of the device, and the result or the reason why there is none."""
+
+    number: int
+    device: str
+    held: Held | None
+    failure: str = ""
+
+    @property
+    def problem(self) -> str:
+        """Reason why the run does not count; empty for a run that counts."""
+        if self.held is None:
+            return f"void: {self.failure}"
+        if self.held.report.dropped:
+            return "frames lost"
+        if not self.held.holds:
+            return f"void: frames were read up to {1e3 * self.held.late:.3g} ms late"
+        return ""
+
+
+def loaded_run(number: int, frames: NDArray[np.uint8], device: Device, seconds: float) -> LoadedRun:
+    """Return a run beside a half-loaded core; a run that fails is void, and the other runs go on."""
+    try:
+        return LoadedRun(number, device.label, hold_loaded(frames, device, _LOADED_RATE, seconds))
+    except GpuVisionError as error:
+        return LoadedRun(number, device.label, None, str(error).splitlines()[0])
+
+
+def table(runs: Sequence[LoadedRun]) -> list[str]:
+    """Return the lines of the table of runs."""
+    head = ("run", "device", "lost", "p50 [us]", "p99 [us]", "stall [ms]", "spent in", "result")
+    cells = [head, *(_cells(each) for each in runs)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in cells]
+
+
+def _cells(run: LoadedRun) -> tuple[str, ...]:
+    """Return the row of a run; a run without a result has no numbers."""
+    numbers: tuple[str, ...] = ("-",) * 5
+    if run.held is not None:
+        report = run.held.report
+        stall = ("-", "-") if report.longest_stall is None else _stall_cells(report.longest_stall)
+        quantiles = [f"{1e6 * each:.0f}" for each in (report.latency.p50, report.latency.p99)]
+        numbers = (str(report.dropped), *quantiles, *stall)
+    return (str(run.number), run.device, *numbers, run.problem or "held")
+
+
+def _stall_cells(stall: Stall) -> tuple[str, str]:
+    return f"{1e3 * stall.seconds:.2f}", stall.place
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Repeat the case beside a half-loaded core, print a line for each run, and return 1 if a run lost frames."""
+    """Repeat the case beside a half-loaded core and print a table; return 1 if a run lost frames or is void.
+
+    A run is void if the frames came late by more than the buffers of a sensor bridge, if the second process ended
+    early, or if the stream failed.
+    """
     parser = argparse.ArgumentParser(prog="python -m gpuvision.profiling.stream", description=main.__doc__)
     parser.add_argument("--device", action="append", help="label of a device; repeat for several; default: all")
-    parser.add_argument("--runs", type=int, default=5, help="number of runs on each device")
-    parser.add_argument("--seconds", type=float, default=60.0, help="duration of a run [s]")
+    parser.add_argument("--runs", type=_positive(int), default=5, help="number of runs on each device; default: 5")
+    parser.add_argument("--seconds", type=_positive(float), default=60.0, help="duration of a run [s]; default: 60")
     options = parser.parse_args(arguments)
     frames = line_frames()
-    lost = 0
+    runs: list[LoadedRun] = []
     for device in [Device.named(each) for each in options.device] if options.device else Device.all():
-        for number in range(options.runs):
-            held = hold_loaded(frames, device, _LOADED_RATE, options.seconds)
-            if not number:
-                print(f"{device.label}: {held.plan}", flush=True)
-            print(f"{device.label} run {number + 1}: {held.report}, frames read up to {1e3 * held.late:.3g} ms late")
-            lost += held.report.dropped
-    return int(lost > 0)
+        for _ in range(options.runs):
+            runs.append(loaded_run(len(runs) + 1, frames, device, options.seconds))
+            _print_run(runs[-1])
+    print("\n".join(["", *table(runs)]))
+    return int(not runs or any(each.problem for each in runs))
+
+
+def _print_run(run: LoadedRun) -> None:
+    """Print the plan and the report of a run when it has ended: all runs take ten minutes."""
+    name = f"{run.device} run {run.number}"
+    if run.held is None:
+        print(f"{name}: {run.problem}", flush=True)
+    else:
+        print(f"{name}: {run.held.plan}", flush=True)
+        print(f"{name}: {run.held.report}, frames read up to {1e3 * run.held.late:.3g} ms late", flush=True)
+
+
+def _positive(kind: Callable[[str], float]) -> Callable[[str], float]:
+    """Return a converter of a positive finite number for the command line."""
+
+    def convert(text: str) -> float:
+        number = kind(text)
+        if not 0 < number < math.inf:
+            raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+        return number
+
+    return convert
 
 
 if __name__ == "__main__":

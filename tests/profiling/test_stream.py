@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import time
 
 import pytest
 
-from gpuvision.host import Device, StreamError
+from gpuvision.host import Device, Stall, StreamError
 
 pytest.importorskip("numba", reason="the extra 'profile' is not installed")
 
@@ -71,17 +72,61 @@ def test_rows_for_each_rate_and_the_highest(device):
     assert cases[3].metadata["holds"]
 
 
-def test_the_command_repeats_the_loaded_case_and_reports_loss(monkeypatch, capsys):
-    losses = iter([0, 7, 0, 0])
+def _command(monkeypatch, runs, *results):
+    """Run the command with these results of its runs; an exception is raised."""
+    left = iter(results)
 
     def hold_loaded(frames, device, rate, seconds):
         assert (rate, seconds) == (4000, 0.5)
-        return _held(4000.0, dropped=next(losses))
+        result = next(left)
+        if isinstance(result, Exception):
+            raise result
+        return result
 
     monkeypatch.setattr(stream, "hold_loaded", hold_loaded)
-    command = ["--device", Device.best().label, "--runs", "2", "--seconds", "0.5"]
-    assert stream.main(command) == 1
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 3
-    assert "run 2: 16 frames, 7 dropped" in lines[2]
-    assert stream.main(command) == 0
+    code = stream.main(["--device", Device.best().label, "--runs", str(runs), "--seconds", "0.5"])
+    assert list(left) == []
+    return code
+
+
+def test_the_command_repeats_the_loaded_case_and_prints_a_table(monkeypatch, capsys):
+    latency = dataclasses.replace(_report().latency, p50=1.234e-3, p99=5.6e-3)
+    stall = Stall(seconds=0.0125, frame=3, producer=0.01, device=0.0025, consumer=0.0, collector=0.0)
+    told = dataclasses.replace(_report(), dropped=0, latency=latency, longest_stall=stall)
+    assert _command(monkeypatch, 2, stream.Held(4000.0, told, 0.099), _held(4000.0)) == 0
+    printed = capsys.readouterr().out
+    assert "run 2: 16 frames" in printed
+    head, first, second = printed.split("\n\n")[-1].splitlines()
+    assert head.split("  ")[0] == "run"
+    assert first.split() == ["1", Device.best().label, "0", "1234", "5600", "12.50", "producer", "held"]
+    assert second.split()[-1] == "held"
+
+
+@pytest.mark.parametrize(
+    ("result", "text"),
+    [
+        (lambda: _held(4000.0, dropped=7), "frames lost"),
+        (lambda: _held(4000.0, late=0.25), "void: frames were read up to 250 ms late"),
+        (lambda: StreamError("no slot\nis free"), "void: no slot"),
+    ],
+)
+def test_a_run_that_lost_frames_or_is_void_gives_exit_code_1(monkeypatch, capsys, result, text):
+    """The other runs go on."""
+    assert _command(monkeypatch, 3, _held(4000.0), result(), _held(4000.0)) == 1
+    results = capsys.readouterr().out.split("\n\n")[-1].splitlines()[1:]
+    assert [line.endswith("  held") for line in results] == [True, False, True]
+    assert results[1].endswith(f"  {text}")
+
+
+@pytest.mark.parametrize("words", [["--runs", "0"], ["--seconds", "nan"], ["--seconds", "-1"], ["--runs", "x"]])
+def test_runs_and_seconds_are_positive(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        stream.main(words)
+    assert ended.value.code == 2
+    assert words[0] in capsys.readouterr().err
+
+
+def test_a_second_process_that_ends_early_is_an_error(monkeypatch):
+    monkeypatch.setattr(stream, "_LOAD_CODE", "print('ready', flush=True)")
+    with pytest.raises(StreamError, match="second process ended with exit code 0"), stream._half_loaded_core():
+        time.sleep(0.5)

@@ -64,12 +64,12 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.rendered
 def test_the_search_covers_two_millimetres_and_three_degrees() -> None:
     default = inspect.signature(inspect_paste).parameters["search_range"].default
     assert default == pytest.approx((0.002, np.deg2rad(3.0)))
 
 
+@pytest.mark.rendered
 def test_the_paste_of_a_board(gerbers: Path, paste: Path, tmp_path: Path, run: Any) -> None:
     out = tmp_path / "out"
     ran = run(paste, "--board", gerbers, "--stencil=120um", *LAYERS, "--out", out, "--scale-sigma=0.01,0.002")

@@ -13,7 +13,7 @@ of kernels, of code that kernels share, and of ``tests/host``. Expected failures
 minutes to compile.
 
 No tier runs the cases that a device refuses: double precision without doubles, vectors on a runtime without them. The
-last lines of a run state their number. A case that PoCL or Intel's CPU runtime refuses is an error.
+last lines of a run state their number. Of cases that PoCL or Intel's CPU runtime refuses, one runs alone and fails.
 """
 
 from __future__ import annotations
@@ -43,7 +43,19 @@ from driver_faults import mark_faults
 from gpuvision.host import Device, debug
 from gpuvision.host.discovery import INSTALL_HINT
 from processor_time import record_test, table_of_files
-from tiers import LEFT, best_devices, device_of, has_one_case, one_case_each, select_fast, select_full, split_refused
+from tiers import (
+    LEFT,
+    best_devices,
+    device_of,
+    has_one_case,
+    is_refused,
+    one_case_each,
+    refusal_message,
+    select_fast,
+    select_full,
+    split_refused,
+    unexpected_refusal,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 # Compiled kernels of all runtimes, verdicts of devices, fonts of matplotlib: kept in the clone, so that a second run is
@@ -111,8 +123,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect the tests that the tier omits; draw the tier's number of hypothesis examples."""
     tier = config.getoption("tier")
+    items[:], refused = split_refused(items)
+    unexpected = unexpected_refusal(refused)
+    if unexpected is not None:
+        items[:] = [unexpected]  # fails in `pytest_runtest_setup`: an error of a worker's collection may get lost
+        return
     try:
-        items[:], refused = split_refused(items)
         best = best_devices()
     except pytest.UsageError as error:
         if hasattr(config, "workerinput"):  # pytest-xdist prints other errors of a worker, not this one
@@ -202,7 +218,9 @@ def _a_device_is_there(request: pytest.FixtureRequest, monkeypatch: pytest.Monke
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Start the processor time of a test, before its fixtures."""
+    """Fail a test that its device refuses; start the processor time of a test, before its fixtures."""
+    if is_refused(item):
+        pytest.fail(refusal_message(item), pytrace=False)
     _freeze_objects(item.config)
     record_test(item)
 

@@ -101,18 +101,32 @@ def planted_faults() -> list[Fault]:
     return faults
 
 
-def draw_faults(rng: random.Random, code: int, kernels: int) -> Iterator[Fault]:
+def draw_faults(
+    rng: random.Random, count: int, *, kernel_share: float, only: tuple[str, ...] = ("",)
+) -> Iterator[Fault]:
     """Yield faults in Python files and in kernels; a file is drawn by its size, a place within it at random.
 
     Faults in the list of equivalent faults are omitted.
+
+    Parameters
+    ----------
+    rng : random.Random
+        Random numbers.
+    count : int
+        Number of faults.
+    kernel_share : float
+        Share of the faults that are in kernels, if there are files of both kinds.
+    only : tuple of str
+        Starts of paths: faults are drawn in these files only.
     """
-    python = [path for folder in ("gpuvision", "host") for path in sorted((ROOT / folder).rglob("*.py"))]
-    opencl = [path for path in sorted((ROOT / "kernels").rglob("*")) if path.suffix in (".cl", ".h")]
+    python = _chosen(only, [path for folder in ("gpuvision", "host") for path in (ROOT / folder).rglob("*.py")])
+    opencl = _chosen(only, [path for path in (ROOT / "kernels").rglob("*") if path.suffix in (".cl", ".h")])
+    kernels = (round(kernel_share * count) if python else count) if opencl else 0
     drawn = set()
     equivalent = tomllib.loads(EQUIVALENT.read_text())["fault"]
-    for files, draw, count in ((python, _code_fault, code), (opencl, _kernel_fault, kernels)):
+    for files, draw, share in ((python, _code_fault, count - kernels), (opencl, _kernel_fault, kernels)):
         sizes = [path.stat().st_size for path in files]
-        enough = len(drawn) + count
+        enough = len(drawn) + share
         while len(drawn) < enough:
             fault = draw(rng.choices(files, sizes)[0], rng)
             if fault is None or fault in drawn:
@@ -122,6 +136,11 @@ def draw_faults(rng: random.Random, code: int, kernels: int) -> Iterator[Fault]:
                 continue
             drawn.add(fault)
             yield fault
+
+
+def _chosen(only: tuple[str, ...], paths: list[Path]) -> list[Path]:
+    """Return the paths that begin with one of the starts, sorted."""
+    return sorted(path for path in paths if str(path.relative_to(ROOT)).startswith(only))
 
 
 def _code_fault(path: Path, rng: random.Random) -> Fault | None:

@@ -35,7 +35,7 @@ def record_lines(arguments: Iterable[str] = ()) -> None:
     """Run the fast tier with a record of the lines that each test runs."""
     OUT.mkdir(parents=True, exist_ok=True)
     settings = OUT / "coveragerc"
-    settings.write_text(f"[run]\ndata_file = {_DATA}\nomit = {ROOT}/tests/*\n")
+    settings.write_text(f"[run]\ndata_file = {_DATA}\nrelative_files = true\nomit = {ROOT}/tests/*\n")
     measured = ["--cov", str(ROOT), "--cov-config", str(settings), "--cov-context=test", "--cov-report="]
     words = ["-n", "logical", "--tier", "fast", "-q", *measured, "--junitxml", str(_TIMES), *arguments]
     subprocess.run([sys.executable, "-m", "pytest", *words], cwd=ROOT, env=environment(ROOT), check=True)
@@ -149,7 +149,7 @@ def _contexts_of(path: Path) -> dict[int, list[str]]:
     data.read()
     return {
         line: [context.partition("|")[0] for context in contexts if context]
-        for line, contexts in data.contexts_by_lineno(str(path)).items()
+        for line, contexts in data.contexts_by_lineno(str(path.relative_to(ROOT))).items()
     }
 
 

@@ -17,7 +17,9 @@ import json
 import os
 import queue
 import random
+import resource
 import shutil
+import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -43,7 +45,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[2])
     parser.add_argument("--sample", type=int, default=100, help="number of faults to draw")
     parser.add_argument("--seed", type=int, default=1, help="of the sample")
+    parser.add_argument("--only", nargs="+", default=[""], metavar="START", help="draw files whose paths begin so")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="faults tested at the same time")
+    parser.add_argument(
+        "--seconds", type=int, default=0, help="limit of the processor time of the tests of a fault [s]; 0: no limit"
+    )
     records = parser.add_mutually_exclusive_group()
     records.add_argument("--record", action="store_true", help="record anew which tests run which lines")
     records.add_argument("--no-record", action="store_true", help="run only the test files of the changed file")
@@ -53,12 +59,13 @@ def main() -> int:
     if arguments.record or not (record.is_recorded() or arguments.no_record or arguments.sample == 0):
         record.record_lines()
     planted = [] if arguments.without_planted else planted_faults()
-    kernels = round(_KERNEL_SHARE * arguments.sample)
-    sample = list(draw_faults(random.Random(arguments.seed), arguments.sample - kernels, kernels))
+    rng, only = random.Random(arguments.seed), tuple(arguments.only)
+    sample = list(draw_faults(rng, arguments.sample, kernel_share=_KERNEL_SHARE, only=only))
     # In random order: an interrupted run has tested a random part of the sample.
     random.Random(arguments.seed).shuffle(sample)
     budget = 0.0 if arguments.no_record else _BUDGET
-    rows = _run(planted + sample, arguments.jobs, budget, arguments.out)
+    trees = [_Tree(record.OUT / f"tree-{number}", arguments.seconds) for number in range(arguments.jobs)]
+    rows = _run(planted + sample, trees, budget, arguments.out)
     killed, survived = _summary("planted", rows[: len(planted)]), _summary("sampled", rows[len(planted) :])
     print(f"report: {arguments.out}")
     return int(not (killed and survived))
@@ -73,12 +80,11 @@ def _summary(name: str, rows: list[dict[str, str | int]]) -> bool:
     return counts["killed"] >= (1.0 if name == "planted" else 0.9) * tried
 
 
-def _run(faults: list[Fault], jobs: int, budget: float, report: Path) -> list[dict[str, str | int]]:
+def _run(faults: list[Fault], trees: list[_Tree], budget: float, report: Path) -> list[dict[str, str | int]]:
     """Test the faults, each in a copy of the repository; write the report after each fault.
 
     Tests that fail without a fault kill nothing: their faults are tested again without them.
     """
-    trees = [_Tree(record.OUT / f"tree-{number}") for number in range(jobs)]
     rows: list[dict[str, str | int]] = [{"state": "not tested"} for _ in faults]
     left = list(range(len(faults)))
     unsound: set[str] = set()
@@ -126,8 +132,9 @@ def _run_some(
 class _Tree:
     """Copy of the files that git knows. Compiled kernels are shared: their cache has the kernels' text as key."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, seconds: int) -> None:
         self.folder = folder
+        self.seconds = seconds  # limit of the processor time of a run of tests [s]; 0: no limit
         self.omitted: list[str] = []  # tests that fail without a fault
         shutil.rmtree(folder, ignore_errors=True)
         names = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
@@ -156,6 +163,8 @@ class _Tree:
             place.write_text(text)
         if status == 0:
             return {"state": "survived", "by": " ".join(tests)[:200]}
+        if status == -signal.SIGXCPU:
+            return {"state": "did not end", "by": f"limit of {self.seconds} s"}
         if fault.file.startswith("kernels") and any(word in said for word in _UNBUILT):
             return {"state": "not built", "by": failed[0] if failed else ""}
         if failed:
@@ -183,10 +192,15 @@ class _Tree:
             capture_output=True,
             text=True,
             timeout=_TIMEOUT,
+            preexec_fn=self._limit_processor_time,
         )
         said = done.stdout + done.stderr
         lines = [line for line in said.splitlines() if line.startswith(("FAILED ", "ERROR ")) and "::" in line]
         return done.returncode, [line.partition(" ")[2].partition(" - ")[0] for line in lines], said
+
+    def _limit_processor_time(self) -> None:
+        if self.seconds:
+            resource.setrlimit(resource.RLIMIT_CPU, (self.seconds, self.seconds + 5))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 ``python -m gpuvision.profiling.compare_runs FIRST.json SECOND.json`` lists the rows that are not compared, with the
 reason, the rows that do not agree, and the share of the rows that do. The exit code is 1 if fewer than 90 % agree, or
-if a run is invalid because the machine changed its speed.
+if a run is invalid because the machine changed its speed, and 2 if a file is not a run.
 
 Two medians with 95 % confidence intervals of rounds within a run agree if the intervals overlap. The intervals hold the
 spread within a run; the spread between runs (place of the arrays in memory, frequency) comes on top.
@@ -10,16 +10,15 @@ spread within a run; the spread between runs (place of the arrays in memory, fre
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
-from gpuvision.profiling.rounds import stated_interval
+from gpuvision.host.errors import ReadError
+from gpuvision.profiling.harness import Row, Run
+from gpuvision.profiling.stored_run import read_run
 
 _AGREEING = 0.9  # smallest share of agreeing rows
-_KEYS = ("operation", "case", "device", "peer")
 
 
 class Change(NamedTuple):
@@ -41,38 +40,34 @@ class Change(NamedTuple):
     agree: bool
 
 
-def compare(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[Change]:
+def compare(first: Run, second: Run) -> list[Change]:
     """Return the change of each row that both runs contain with 95 % confidence and with the same form of the peer."""
     one, other = _by_name(first), _by_name(second)
     changes = []
     for name in one.keys() & other.keys():
-        mine, theirs = stated_interval(one[name]), stated_interval(other[name])
-        if mine is not None and theirs is not None and _form(one[name]) == _form(other[name]):
+        mine, theirs = one[name].interval, other[name].interval
+        if mine is not None and theirs is not None and one[name].form == other[name].form:
             agree = mine[0] <= theirs[1] and theirs[0] <= mine[1]
-            changes.append(Change(name, one[name]["ratio"], other[name]["ratio"], agree))
+            changes.append(Change(name, one[name].ratio, other[name].ratio, agree))
     return sorted(changes)
 
 
-def left_out(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+def left_out(first: Run, second: Run) -> list[str]:
     """Return a line with the reason for each row that `compare` leaves out."""
     one, other = _by_name(first), _by_name(second)
     lines = [f"{name}: only in the first run" for name in sorted(one.keys() - other.keys())]
     lines += [f"{name}: only in the second run" for name in sorted(other.keys() - one.keys())]
     for name in sorted(one.keys() & other.keys()):
-        forms = _form(one[name]), _form(other[name])
+        forms = one[name].form, other[name].form
         if forms[0] != forms[1]:
             lines.append(f"{name}: the fastest form is {forms[0]!r} in the first run, {forms[1]!r} in the second one")
-        elif any(stated_interval(each[name]) is None for each in (one, other)):
+        elif any(each[name].interval is None for each in (one, other)):
             lines.append(f"{name}: no interval with 95 % confidence")
     return lines
 
 
-def _by_name(run: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    return {" ".join(row[key] for key in _KEYS): row for row in run["rows"]}
-
-
-def _form(row: Mapping[str, Any]) -> str:
-    return str(row.get("form", ""))
+def _by_name(run: Run) -> dict[str, Row]:
+    return {f"{row.operation} {row.case} {row.device} {row.peer}": row for row in run.rows}
 
 
 def report(changes: Sequence[Change]) -> list[str]:
@@ -87,9 +82,13 @@ def report(changes: Sequence[Change]) -> list[str]:
 
 def main(paths: Sequence[str]) -> int:
     """Print the report of two files; return the exit code."""
-    first, second = (json.loads(Path(path).read_text()) for path in paths)
+    try:
+        first, second = map(read_run, paths)
+    except (ReadError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
     changes = compare(first, second)
-    invalid = [path for path, run in zip(paths, (first, second), strict=True) if not run["valid"]]
+    invalid = [path for path, run in zip(paths, (first, second), strict=True) if not run.valid]
     lines = [f"{path} is not valid: the machine changed its speed during the measurement" for path in invalid]
     lines += [f"not compared: {line}" for line in left_out(first, second)]
     print("\n".join([*lines, *report(changes)]))

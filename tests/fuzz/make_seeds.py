@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import zipfile
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -15,6 +18,9 @@ from fuzz.readers import SEEDS
 from gpuvision.camera.camera import Camera
 from gpuvision.formats.camera_file import write_lens
 from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
+from gpuvision.host.outputs import MANIFEST
+from gpuvision.host.tuned_settings import TunedEntry, TunedSettings
+from gpuvision.profiling.harness import Probe, Row, Run
 from gpuvision.ranging.regrid import Grid
 
 _HEAD = "%FSLAX46Y46*%\n%MOMM*%\n%TF.FileFunction,Copper,L1,Top*%\n%LPD*%\nG01*\n"
@@ -75,9 +81,8 @@ radius = 0.3
 
 def main() -> None:
     """Write all seeds."""
-    SEEDS.mkdir(exist_ok=True)
-    for each in SEEDS.iterdir():
-        each.unlink()
+    shutil.rmtree(SEEDS)
+    (SEEDS / "beside").mkdir(parents=True)
     rng = np.random.default_rng(1)
     frames = rng.integers(0, 255, (3, 8, 12), dtype=np.uint8)
     np.save(SEEDS / "frames.npy", frames)
@@ -127,6 +132,7 @@ def main() -> None:
     (SEEDS / "encoder.csv").write_text("count\n0\n12\n25.5\n")
     np.savez_compressed(SEEDS / "encoder.npz", count=np.arange(5))
     np.save(SEEDS / "points.npy", z.reshape(-1, 2))
+    _write_own_files()
     (SEEDS / "mask.txt").write_text("# lower, upper end\n0.0, 1.0\n0.5, 2.0\n")
 
 
@@ -179,9 +185,35 @@ def _write_tables() -> None:
     (SEEDS / "features.toml").write_text(tomli_w.dumps(features))
 
 
-def _imaging() -> dict[str, object]:
-    from dataclasses import asdict
+def _write_own_files() -> None:
+    """Write seeds of the files of caches, of outputs and of measurements."""
+    driver = ("Portable Computing Language", "OpenCL 3.0", "cpu", "3.1")
+    entry = TunedEntry(
+        operation="gpuvision.ranging.psd.PsdReadout",
+        program="0123456789abcdef",
+        dtype="float32",
+        size_class=9,
+        device="pocl",
+        driver=driver,
+        version="0.1",
+        settings=TunedSettings(strip=4096, inline=True),
+        gain=1.5,
+    )
+    row = Row("psd", "float32/1e6", "pocl", 1e-3, "numba", "0.61", 2e-3, 2.0, 1e-9, None, rounds=7)
+    run = Run(
+        rows=[row], valid=True, machine={"cores": 2}, probes=[Probe("psd", "pocl", 1e10, 1.1e10, True)], seconds=12.5
+    )
+    files = {
+        "tuned_settings.json": {"format": 2, "entries": [asdict(entry)]},
+        "kept_numbers.json": {"0123456789abcdef01234567": 1.5e-3, "89abcdef0123456789abcdef": 2},
+        MANIFEST: {"files": {"range.png": {"job": "scan", "size": 1234, "mtime_ns": 1_700_000_000_000_000_000}}},
+    }
+    for name, tree in files.items():
+        (SEEDS / name).write_text(json.dumps(tree, indent=1))
+    (SEEDS / "run.json").write_text(run.to_json())
 
+
+def _imaging() -> dict[str, object]:
     from gpuvision.matching.features.imaging import Imaging
 
     return {

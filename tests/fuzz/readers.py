@@ -23,10 +23,11 @@ from gpuvision.formats.loop_recording import read_loop_recording
 from gpuvision.formats.machine_file import read_machine
 from gpuvision.formats.materials_file import read_materials
 from gpuvision.formats.range_image import read_npz, read_ply, read_png16, read_tiff
-from gpuvision.host import GpuVisionError, open_recording
+from gpuvision.host import GpuVisionError, kept_numbers, open_recording, outputs, tuned_settings
 from gpuvision.host.array_files import read_array
 from gpuvision.host.image_files import read_image
 from gpuvision.matching.artwork.artwork import read_artwork
+from gpuvision.profiling.stored_run import read_run
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.masks import Mask
@@ -150,5 +151,10 @@ _ALL = (
     Reader("points.csv", read_points),
     Reader("points.npy", read_array),
     Reader("mask.txt", Mask.load),
+    Reader("run.json", read_run),
+    # Files of ours that nobody writes by hand: damaged entries are left out, without an error.
+    Reader("tuned_settings.json", lambda path: tuned_settings._read(path)),
+    Reader("kept_numbers.json", lambda path: kept_numbers._read(path)),
+    Reader(outputs.MANIFEST, lambda path: list(outputs._files(path.parent))),
 )
 READERS = {each.seed: each for each in _ALL}

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from gpuvision.profiling import compare_runs
+from gpuvision.profiling.harness import Row, Run
 
 
-def run(*rows: dict[str, Any]) -> dict[str, Any]:
-    common = {"operation": "psd", "device": "pocl", "peer": "numba", "form": "", "confidence": 0.96}
-    return {"valid": True, "rows": [common | row for row in rows]}
+def run(*rows: Row, valid: bool = True) -> Run:
+    return Run(rows=list(rows), valid=valid, machine={"cores": 2})
 
 
-def row(case: str, ratio: float, **changes: Any) -> dict[str, Any]:
-    return {"case": case, "ratio": ratio, "ratio_low": 0.9 * ratio, "ratio_high": 1.1 * ratio} | changes
+def row(case: str, ratio: float, **changes: Any) -> Row:
+    columns = {"operation": "psd", "case": case, "device": "pocl", "seconds": 1e-3, "peer": "numba"}
+    columns |= {"peer_version": "0", "peer_seconds": 1e-3 * ratio, "ratio": ratio, "error": 0.0, "fraction": None}
+    columns |= {"confidence": 0.96, "ratio_low": 0.9 * ratio, "ratio_high": 1.1 * ratio}
+    return Row(**columns | changes)
+
+
+def stored(path: Path, run: Run) -> str:
+    run.write(path)
+    return str(path)
 
 
 def test_rows_agree_when_their_intervals_overlap() -> None:
@@ -54,9 +61,7 @@ def test_rows_that_are_not_compared_are_listed_with_the_reason() -> None:
 
 
 def test_an_invalid_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    paths = [str(tmp_path / f"{number}.json") for number in range(2)]
-    for path, valid in zip(paths, (True, False), strict=True):
-        Path(path).write_text(json.dumps(run(row("a", 1.0)) | {"valid": valid}))
+    paths = [stored(tmp_path / f"{valid}.json", run(row("a", 1.0), valid=valid)) for valid in (True, False)]
     assert compare_runs.main(paths) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"{paths[1]} is not valid: the machine changed its speed during the measurement"
@@ -68,6 +73,26 @@ def test_the_exit_code_is_1_if_fewer_than_nine_of_ten_rows_agree(tmp_path: Path,
     paths = []
     for number, ratio in enumerate((1.0, 2.0)):
         rows = [row(str(k), ratio if k < apart else 1.0) for k in range(10)]
-        paths.append(str(tmp_path / f"{number}.json"))
-        Path(paths[-1]).write_text(json.dumps(run(*rows)))
+        paths.append(stored(tmp_path / f"{number}.json", run(*rows)))
     assert compare_runs.main(paths) == code
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"), [("{}", "not a run of gpuvision profile"), ("[", "not a readable JSON file")]
+)
+def test_a_file_that_is_no_run_is_named_in_one_line(
+    text: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, bad = stored(tmp_path / "good.json", run(row("a", 1.0))), tmp_path / "bad.json"
+    bad.write_text(text)
+    assert compare_runs.main([good, str(bad)]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.count("\n") == 1
+    assert str(bad) in said.err
+    assert reason in said.err
+
+
+def test_a_missing_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert compare_runs.main([str(tmp_path / "none.json")] * 2) == 2
+    assert str(tmp_path / "none.json") in capsys.readouterr().err

@@ -39,8 +39,11 @@ def test_delay_is_found_to_a_tenth_of_a_frame(delay: float, jitter: float) -> No
         assert abs(found.jitter - jitter) < 4.0 * found.jitter_sigma
         assert found.jitter == pytest.approx(jitter, rel=0.25)
         assert np.std(found.delays) == pytest.approx(jitter, rel=0.3)
+        assert np.mean(found.delays) == pytest.approx(delay, abs=4.0 * jitter / np.sqrt(len(found.delays)))
+        assert len(found.delays) > 100
     else:
         assert found.jitter < 0.05 * PERIOD
+        assert (found.jitter_sigma == np.inf) == (found.jitter == 0.0) == (len(found.delays) == 0)
 
 
 @pytest.mark.slow
@@ -123,3 +126,59 @@ def test_excitation_rests_moves_and_returns() -> None:
 def test_useless_recordings_are_refused(change: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         measure_delay(*change(*recording(2e-3, 0.0, 1e-6)))
+
+
+def test_a_mirrored_axis_with_uneven_frames_has_a_negative_scale() -> None:
+    """Times that scatter by a tenth of a frame; the noise is that of the positions, in metres."""
+    rng = np.random.default_rng(4)
+    time = PERIOD * (np.arange(300) + rng.uniform(-0.1, 0.1, 300)) + 5.0
+    command = np.concatenate([[0.0], np.cumsum(excitation(299, SPEED, hold=3, seed=2) * np.diff(time))])
+    measured = -2.5 * np.interp(time - 1.3e-3, time, command) - 0.2 + 4e-6 * rng.standard_normal(300)
+    found = measure_delay(time, command, measured)
+    assert found.scale == pytest.approx(-2.5, rel=0.01)
+    assert found.mean == pytest.approx(1.3e-3, abs=4.0 * found.mean_sigma)
+    assert found.mean_sigma < 0.03 * PERIOD
+    assert found.noise == pytest.approx(4e-6, rel=0.3)
+    assert found.frames == pytest.approx(found.mean / np.median(np.diff(time)), rel=1e-12)
+
+
+def test_twenty_samples_with_a_command_that_moves_are_enough() -> None:
+    time, command, measured = recording(1.2e-3, 0.0, 1e-7, count=40)
+    seen = np.where(np.arange(40) < 20, measured, np.nan)
+    assert measure_delay(time, command, seen, longest=3e-3).mean == pytest.approx(1.2e-3, abs=0.05 * PERIOD)
+    with pytest.raises(ValueError, match="19 samples, expected 20 or more"):
+        measure_delay(time, command, np.where(np.arange(40) < 19, measured, np.nan), longest=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t, c, m: (t[:, None], c, m), r"shapes \(400, 1\), \(400,\), \(400,\)"),
+        (lambda t, c, m: (t, c, m[1:]), r"shapes \(400,\), \(400,\), \(399,\)"),
+        (lambda t, c, m: (np.r_[t[0], t[:-1]], c, m), "must increase"),
+        (lambda t, c, m: (t, np.r_[np.nan, c[1:]], m), "must be finite"),
+        (lambda t, c, m: (np.r_[t[:-1], np.inf], c, m), "must be finite"),
+    ],
+)
+def test_wrong_arrays_are_refused(change: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        measure_delay(*change(*recording(2e-3, 0.0, 1e-6)))
+
+
+def test_excitation_has_two_of_each_velocity_in_a_block() -> None:
+    velocities = excitation(50, 0.5, hold=3, seed=8)
+    assert velocities.shape == (50,)
+    for block in velocities[:36].reshape(2, 6, 3):
+        assert np.all(block == block[:, :1])
+        assert sorted(block[:, 0]) == [-0.5, -0.5, 0.0, 0.0, 0.5, 0.5]
+    assert len(excitation(36, 0.5, hold=3)) == 36
+    np.testing.assert_array_equal(excitation(7, 1.0), excitation(24, 1.0, hold=4, seed=0)[:7])
+
+
+def test_frequency_of_a_chirp_rises_linearly() -> None:
+    """The phase is the integral of the frequency, by trapezoids, which are exact for a linear one."""
+    time = 0.05 * np.arange(11)
+    frequency = 1.5 + (4.0 - 1.5) * time / 0.5
+    phase = np.r_[0.0, np.cumsum(0.05 * 0.5 * (frequency[1:] + frequency[:-1]))]
+    np.testing.assert_allclose(chirp(11, 0.05, 3.0, 1.5, 4.0), 3.0 * np.sin(2.0 * np.pi * phase), atol=1e-12)
+    assert chirp(2, 0.25, 3.0, 0.5, 0.5) == pytest.approx([0.0, 3.0 * np.sin(0.25 * np.pi)])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from gpuvision.servoing.guard import TravelGuard
-from gpuvision.servoing.observer import PoseMeasurement
+from gpuvision.servoing.guard import FaultCounter, LoopLimits, Outcome, TravelGuard
+from gpuvision.servoing.observer import PoseMeasurement, Verdict
 
 LAG = np.array([0.0, 0.03, 0.2])
 OVERSHOOT = np.array([0.5, 0.25, 0.125])
@@ -70,3 +72,76 @@ def test_motion_back_is_bounded_too() -> None:
 
 def measurement(exposed: float, pose: np.ndarray) -> PoseMeasurement:
     return PoseMeasurement(exposed, exposed, pose, COVARIANCE, 0)
+
+
+LIMITS = LoopLimits(gated=3, readings=2, missed=4, abort_after=0.2, encoder_error=(1.0, 2.0, 3.0))
+NO_LIMIT = np.zeros(3, np.int8)
+
+
+def test_measurements_beyond_the_gate_are_counted_until_an_accepted_one() -> None:
+    faults = FaultCounter(LIMITS)
+    for verdict in (Verdict.GATED, Verdict.GATED, Verdict.ACCEPTED, Verdict.GATED, Verdict.REFUSED, Verdict.GATED):
+        faults.verdict(verdict)
+        assert faults.outcome(0.0) is None
+    faults.verdict(Verdict.GATED)
+    assert faults.outcome(0.0) is Outcome.INCONSISTENT
+
+
+def test_late_frames_are_counted_until_one_in_time() -> None:
+    faults = FaultCounter(LIMITS)
+    for late in (True, True, True, False, True, True, True):
+        faults.tick(late)
+        assert faults.outcome(0.0) is None
+    faults.tick(True)
+    assert faults.outcome(0.0) is Outcome.TOO_SLOW
+
+
+def test_the_loop_is_lost_beyond_the_age() -> None:
+    faults = FaultCounter(LIMITS)
+    assert faults.outcome(0.2) is None
+    assert faults.outcome(0.2001) is Outcome.LOST
+
+
+@pytest.mark.parametrize(("axis", "error"), [(0, 1.0), (1, 2.0), (2, 3.0)])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_encoders_may_differ_by_the_limit_of_their_axis(axis: int, error: float, sign: float) -> None:
+    """The zero is the first reading; the same difference twice in a row ends the loop."""
+    faults, zero, away = FaultCounter(LIMITS), np.array([0.5, -0.25, 0.125]), np.eye(3)[axis] * sign
+    commanded = np.array([4.0, 5.0, 6.0])
+    for factor, glitches in ((0.0, 0), (error, 0), (1.01 * error, 1), (0.0, 1), (1.01 * error, 2)):
+        faults.reading(commanded + zero + factor * away, NO_LIMIT, commanded, np.ones(3))
+        assert faults.glitches == glitches
+        assert faults.outcome(0.0) is None
+    faults.reading(commanded + zero + 1.01 * error * away, NO_LIMIT, commanded, np.ones(3))
+    assert faults.glitches == 3
+    assert faults.outcome(0.0) is Outcome.ENCODER
+
+
+def test_an_axis_at_its_limit_counts_only_with_a_target_beyond_it() -> None:
+    faults = FaultCounter(LIMITS)
+    rows = [
+        ([0, -1, 0], [1.0, -1.0, 0.0]),
+        ([0, -1, 0], [1.0, 1.0, -2.0]),  # the target is on the other side
+        ([0, 0, 1], [1.0, -1.0, 0.5]),
+        ([1, 0, 0], [0.0, 1.0, 0.5]),  # the target is reached
+        ([1, 0, 0], [0.1, -1.0, -0.5]),
+    ]
+    for at_limit, error in rows:
+        faults.reading(np.zeros(3), np.array(at_limit, np.int8), np.zeros(3), np.array(error))
+        assert faults.outcome(0.0) is None
+    faults.reading(np.zeros(3), np.array([0, -1, 1], np.int8), np.zeros(3), np.array([1.0, -0.1, -1.0]))
+    assert faults.outcome(0.0) is Outcome.AT_LIMIT
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"hold_after": 0.2, "abort_after": 0.19}, "abort_after is 0.19, expected a number >= 0.2"),
+        ({"encoder_error": (1.0, 1.0)}, "encoder_error must be 3 numbers above 0"),
+        ({"encoder_error": (1.0, 0.0, 1.0)}, "encoder_error must be 3 numbers above 0"),
+    ],
+)
+def test_limits_that_cannot_work_are_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        LoopLimits(**given)
+    LoopLimits(hold_after=0.2, abort_after=0.2, encoder_error=(1e-9, 1e-9, 1e-9))

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pytest
 from scipy.integrate import quad
 from scipy.linalg import expm
+from scipy.stats import chi2
 
 from gpuvision.servoing.observer import LatestPose, MotionModel, Observer, PoseMeasurement, PoseObserver, Verdict
 
@@ -252,3 +253,80 @@ def test_transitions_of_jittering_times_are_dropped_one_by_one() -> None:
         kept.append(len(observer._transitions))
     assert min(np.diff(kept)) >= 0
     assert kept[-1] < 1000
+
+
+def test_default_gate_is_exceeded_with_a_probability_of_one_in_a_thousand() -> None:
+    """The pose is at rest, with the covariance of the start: a residual along an eigenvector of the sum of both."""
+    values, vectors = np.linalg.eigh(1e-10 * np.eye(3) + NOISE)
+    for axis in range(3):
+        for factor, verdict in ((0.9995, Verdict.ACCEPTED), (1.0005, Verdict.GATED)):
+            observer = fresh(MotionModel(lag=(0.0, 0.0, 0.0)))
+            pose = vectors[:, axis] * math.sqrt(factor * chi2.isf(1e-3, 3) * values[axis])
+            assert observer.add(measured(1e-3, pose)) is verdict
+
+
+@pytest.mark.parametrize("away", [-0.5e-9, 0.5e-9])
+def test_times_within_a_nanosecond_are_the_same(away: float) -> None:
+    observer, same = fresh(), 5e-3 + away
+    observer.command(5e-3, np.array([1.0, 2.0, 3.0]))
+    observer.command(same, np.array([-1.0, 0.5, 2.0]))  # replaces the command
+    assert observer.estimate(6e-3).pose[1] == pytest.approx(0.5e-3)
+    assert observer.add(measured(2e-3, np.zeros(3))) is Verdict.ACCEPTED
+    assert observer.add(measured(2e-3 + away, np.zeros(3))) is Verdict.DUPLICATE
+    assert observer.add(measured(2e-3 + 4.0 * away, np.zeros(3))) is Verdict.ACCEPTED
+    assert observer.estimate(5e-3 - 0.5e-9).pose[1] == pytest.approx(observer.estimate(5e-3).pose[1], abs=1e-8)
+    fresh_one = fresh()
+    assert fresh_one.add(measured(-0.5e-9, np.zeros(3))) is Verdict.ACCEPTED
+    assert fresh_one.add(measured(-2e-9, np.zeros(3))) is Verdict.TOO_OLD
+    assert fresh_one.predicted_pose(-0.5e-9) is not None
+    assert fresh_one.predicted_pose(-2e-9) is None
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_history_keeps_the_newest_entries(count: int) -> None:
+    """After many commands a measurement is taken from the oldest kept one on, wherever the arrays have moved."""
+    for last in range(count, 4 * count):
+        observer = fresh(history=count)
+        for k in range(1, last + 1):
+            observer.command(1e-3 * k, np.zeros(3))
+        oldest = 1e-3 * (last - count + 1)
+        assert observer.predicted_pose(oldest) is None  # no measurement yet
+        assert observer.add(measured(oldest - 1e-6, np.zeros(3))) is Verdict.TOO_OLD
+        assert observer.add(measured(oldest + 1e-6, np.zeros(3))) is Verdict.ACCEPTED
+
+
+def test_a_measurement_takes_the_command_before_it() -> None:
+    """Two measurements in a frame: the motion after them is that of the command, up to the next one."""
+    model = MotionModel(lag=(0.0, 0.0, 0.0), position_noise=(1e9,) * 3)  # each measurement counts alone
+    observer = fresh(model, gate=1e99)
+    for time, velocity in ((1.0, (1.0, -2.0, 0.25)), (2.0, (3.0, 5.0, -0.5))):
+        observer.command(time, np.array(velocity))
+    for time, pose in ((1.6, [9.0, 8.0, 0.5]), (1.2, [4.0, 3.0, 1.0])):
+        assert observer.add(measured(time, pose, arrived=3.0)) is Verdict.ACCEPTED
+    np.testing.assert_allclose(observer.predicted_pose(1.4), [4.2, 2.6, 1.05], atol=1e-12)
+    np.testing.assert_allclose(observer.predicted_pose(1.8), [9.2, 7.6, 0.55], atol=1e-12)
+    found = observer.estimate(2.5)
+    np.testing.assert_allclose(found.pose, [9.0 + 0.4 + 1.5, 8.0 - 0.8 + 2.5, 0.5 + 0.1 - 0.25], atol=1e-12)
+    np.testing.assert_allclose(found.velocity, [3.0, 5.0, -0.5], atol=1e-12)
+    np.testing.assert_allclose(found.covariance, NOISE + 0.9e9 * np.eye(3), rtol=1e-12)
+    assert (found.time, observer.exposed) == (2.5, 1.6)
+
+
+def test_latest_pose_has_no_motion() -> None:
+    latest = LatestPose()
+    latest.reset(1.0, [1.0, 2.0, 3.0], 2.0 * NOISE)
+    assert latest.add(measured(1.0, np.zeros(3))) is Verdict.DUPLICATE
+    assert latest.add(measured(0.5, np.zeros(3))) is Verdict.TOO_OLD
+    latest.command(2.0, np.ones(3))
+    found = latest.estimate(7.0)
+    assert (found.time, latest.exposed) == (7.0, 1.0)
+    assert (found.pose.tolist(), found.velocity.tolist()) == ([1.0, 2.0, 3.0], [0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(found.covariance, 2.0 * NOISE)
+    assert latest.predicted_pose(9.0).tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize("name", ["lag", "acceleration_noise", "position_noise"])
+@pytest.mark.parametrize("wrong", [(0.0, -1.0, 0.0), (0.0, 0.0, math.inf), (0.0, 0.0)])
+def test_models_of_motion_are_checked(name: str, wrong: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match=name):
+        MotionModel(**{name: wrong})

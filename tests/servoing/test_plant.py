@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -146,3 +148,87 @@ def test_velocity_must_be_finite(axis: Axis, wrong: float) -> None:
     plant = SimulatedPlant((axis,) * 3)
     with pytest.raises(ValueError, match="velocity"):
         plant.command(0.0, np.array([0.0, wrong, 0.0]))
+
+
+@pytest.mark.parametrize(
+    "axis",
+    [
+        Axis(lag=3e-3, coulomb=4.0, viscous=10.0, lower=-1e-4, upper=7e-4),
+        Axis(lag=1e-3, acceleration=8.0, speed=0.04, resonance=300.0),
+        Axis(lag=2e-2, fine=FineStage(lag=1e-3, stroke=2e-4, recentring=30.0)),
+    ],
+)
+def test_mirrored_commands_move_a_mirrored_axis_by_the_mirrored_path(axis: Axis) -> None:
+    mirrored = dataclasses.replace(axis, lower=-axis.upper, upper=-axis.lower)
+    found = moved(axis)
+    np.testing.assert_allclose(moved(mirrored, commands=tuple((time, -v) for time, v in COMMANDS)), -found, atol=1e-12)
+    assert np.ptp(found) > 4e-4
+
+
+def test_commands_are_cut_to_the_largest_speed() -> None:
+    times = np.array([0.01, 0.02, 0.03, 0.05])
+    found = moved(Axis(speed=0.04), times, ((0.0, 0.05), (0.02, -0.03), (0.03, -0.9)))
+    assert found == pytest.approx([4e-4, 8e-4, 5e-4, -3e-4], abs=1e-15)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_limited_drive_reaches_its_speed_in_closed_form(sign: float) -> None:
+    """The drive saturates until the command exceeds the velocity by acceleration times lag; then the lag decays."""
+    plant = SimulatedPlant((Axis(lag=0.01, acceleration=2.0), Axis(), Axis()), start=(0.3, 0.0, 0.0))
+    plant.command(0.0, np.array([0.1 * sign, 0.0, 0.0]))
+    times = np.array([0.02, 0.04, 0.045, 0.07])
+    since = np.maximum(times - 0.04, 0.0)
+    ramp = 0.5 * 2.0 * np.minimum(times, 0.04) ** 2
+    decayed = 0.1 * since - 0.02 * 0.01 * -np.expm1(-since / 0.01)
+    assert plant.pose(times)[:, 0] - 0.3 == pytest.approx(sign * (ramp + decayed), rel=1e-8)
+
+
+def test_the_watchdog_stops_the_axes_after_its_time() -> None:
+    plant = SimulatedPlant((Axis(lag=0.2), Axis(), Axis()), watchdog=0.5)
+    plant.command(0.0, np.array([1.0, -2.0, 0.0]))
+    assert plant.pose([0.4, 0.5, 0.6, 9.0])[:, 1] == pytest.approx([-0.8, -1.0, -1.0, -1.0])
+    velocity = -math.expm1(-2.5)
+    stopped = 0.5 - 0.2 * velocity
+    assert plant.pose([0.5, 0.7])[:, 0] == pytest.approx([stopped, stopped + 0.2 * velocity * -math.expm1(-1.0)])
+    plant.command(0.7, np.array([0.0, 3.0, 0.0]))
+    assert plant.pose([0.9, 1.2, 1.5])[:, 1] == pytest.approx([-0.4, 0.5, 0.5])
+
+
+def test_start_and_swing_of_each_axis() -> None:
+    axes = (Axis(), Axis(resonance=50.0, damping=0.0), Axis(resonance=20.0, damping=0.1))
+    plant = SimulatedPlant(axes, start=(1.0, 2.0, 3.0), swing=(0.0, 0.5, -0.25))
+    assert plant.read(0.0).position.tolist() == [1.0, 2.0, 3.0]
+    times = np.array([[-1.0, 0.0], [0.03, 0.1]])
+    since, rate = np.maximum(times, 0.0), 20.0 * math.sqrt(0.99)
+    decay = np.exp(-2.0 * since) * (np.cos(rate * since) + 2.0 / rate * np.sin(rate * since))
+    expected = np.stack([np.ones((2, 2)), 2.0 + 0.5 * np.cos(50.0 * since), 3.0 - 0.25 * decay], axis=-1)
+    np.testing.assert_allclose(plant.pose(times), expected, atol=1e-12)
+    with pytest.raises(ValueError, match=r"a plant has 3 axes \(x, y, theta\), got 2"):
+        SimulatedPlant((Axis(), Axis()))
+
+
+def test_history_keeps_its_number_of_commands() -> None:
+    plant = SimulatedPlant(history=3)
+    for k in range(1, 6):
+        plant.command(0.1 * k, np.array([1.0, 0.0, 0.0]))
+    assert plant.pose(0.3)[0] == pytest.approx(0.2)
+    with pytest.raises(ValueError, match=r"0\.299000 s is before the history of the plant; enlarge history"):
+        plant.pose(0.299)
+    with pytest.raises(ValueError, match=r"0\.499000 s is before the last command at 0\.500000 s"):
+        plant.read(0.499)
+    assert plant.read(0.5).at_limit.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"lower": 1.0, "upper": 1.0}, "acceleration and speed must be above 0, and lower below upper"),
+        ({"acceleration": 0.0, "lag": 1.0}, "acceleration and speed must be above 0"),
+        ({"viscous": 1.0}, "needs a lag above 0"),
+        ({"acceleration": 1.0}, "needs a lag above 0"),
+        ({"fine": FineStage(lag=1.0, stroke=1.0)}, "needs a lag above 0"),
+    ],
+)
+def test_axes_that_cannot_work_are_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Axis(**given)

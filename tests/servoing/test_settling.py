@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.controllers import PidController, PidGains
@@ -233,3 +234,107 @@ def test_rule_on_the_estimates_of_an_observer_keeps_its_probability() -> None:
 
     assert sum(allows(1.05 * tolerance) for _ in range(40)) == 0
     assert sum(allows(0.0) for _ in range(8)) >= 6
+
+
+def miss(
+    samples: list[tuple[float, np.ndarray, np.ndarray]],
+    tolerance: tuple[float, ...],
+    *,
+    frequency: tuple[float, ...],
+    damping: tuple[float, ...],
+    lead: float,
+    is_filtered: bool,
+) -> float:
+    """Return the probability of a miss by a weighted pseudo-inverse and the normal distribution."""
+    total = 0.0
+    for axis in range(3):
+        sigmas = np.array([math.sqrt(covariance[axis, axis]) for _, _, covariance in samples])
+        rate = damping[axis] / math.sqrt(1.0 - damping[axis] ** 2)  # decay per radian of the swing
+        rows = []
+        for time, _, _ in samples:
+            angle = 2.0 * math.pi * frequency[axis] * (time - samples[-1][0])
+            swing = [math.exp(-rate * angle) * part for part in (math.cos(angle), math.sin(angle))]
+            rows.append([1.0, *swing] if frequency[axis] else [1.0])
+        weights = np.linalg.pinv(np.array(rows) / sigmas[:, None], rcond=1e-12) / sigmas
+        fit = weights @ np.array([error[axis] for _, error, _ in samples])
+        fading = math.exp(-rate * 2.0 * math.pi * frequency[axis] * lead)
+        worst = abs(fit[0]) + (fading * math.hypot(*fit[1:]) if len(fit) > 1 else 0.0)
+        spread = np.abs(weights) @ sigmas if is_filtered else np.sqrt(np.square(weights) @ np.square(sigmas))
+        swing_spread = fading * math.hypot(*spread[1:]) / math.sqrt(2.0) if len(fit) > 1 else 0.0
+        sigma = spread[0] + swing_spread if is_filtered else math.hypot(spread[0], swing_spread)
+        total += norm.sf((tolerance[axis] - worst) / sigma) + norm.cdf((-tolerance[axis] - worst) / sigma)
+    return total
+
+
+@pytest.mark.parametrize("is_filtered", [True, False])
+@pytest.mark.parametrize("lead", [0.0, 3e-3])
+def test_miss_probability_is_that_of_offset_and_envelope(is_filtered: bool, lead: float) -> None:
+    """Errors with a noise that grows, on three axes of which two swing; the window keeps the last six errors."""
+    frequency, damping, tolerance = (70.0, 0.0, 40.0), (0.03, 0.02, 0.2), (2.5e-5, 6e-6, 7e-5)
+    rule = VibrationSettling(
+        tolerance, frequency=frequency, damping=damping, window=6, lead=lead, is_filtered=is_filtered
+    )
+    rng, samples, probabilities = np.random.default_rng(6), [], []
+    for k in range(11):
+        time = 0.7 + PERIOD * (k + 0.3 * math.sin(k))
+        mean = np.array([3e-6 * math.cos(0.4 * k), -2e-6, 2e-5 * math.sin(0.25 * k)])
+        covariance = np.diag([1e-12, 3e-12, 2e-11]) * (1.0 + 0.2 * k) + 1e-13
+        samples.append((time, mean + np.sqrt(np.diag(covariance)) * rng.standard_normal(3), covariance))
+        rule(*samples[-1])
+        if k >= 3:
+            known = miss(
+                samples[-6:], tolerance, frequency=frequency, damping=damping, lead=lead, is_filtered=is_filtered
+            )
+            assert rule.miss_probability() == pytest.approx(known, rel=1e-6)
+            probabilities.append(known)
+    assert probabilities[-1] < 0.9
+
+
+def test_placement_is_allowed_at_the_probability_itself() -> None:
+    rules = [VibrationSettling((3e-6, 1.0, 1.0), is_filtered=False) for _ in range(3)]
+    for k in range(4):
+        rules[0](k * PERIOD, np.array([2e-6, 0.0, 0.0]), SIGMA**2 * np.eye(3))
+    found = rules[0].miss_probability()
+    for factor, is_allowed in ((1.0, True), (1.0 - 1e-9, False)):
+        rule = VibrationSettling((3e-6, 1.0, 1.0), is_filtered=False, miss_probability=factor * found)
+        allowed = [rule(k * PERIOD, np.array([2e-6, 0.0, 0.0]), SIGMA**2 * np.eye(3)) for k in range(4)]
+        assert allowed == [False, False, False, is_allowed]
+
+
+def test_default_window_has_24_errors() -> None:
+    """An error of 1 mm counts until 24 others came."""
+    rule = VibrationSettling((1e-4, 1.0, 1.0), is_filtered=False)
+    allowed = [rule(k * PERIOD, np.array([1e-3 * (k == 0), 0.0, 0.0]), SIGMA**2 * np.eye(3)) for k in range(26)]
+    found = rule.miss_probability()
+    assert allowed[24:] == [True, True]
+    assert found < 1e-9
+    short = VibrationSettling((3.8e-5, 1.0, 1.0), is_filtered=False)
+    allowed = [short(k * PERIOD, np.array([1e-3 * (k == 0), 0.0, 0.0]), SIGMA**2 * np.eye(3)) for k in range(25)]
+    assert allowed == [False] * 24 + [True]  # a mean of 1 mm / 24, 41.7 um, is beyond the tolerance
+
+
+@pytest.mark.parametrize(
+    ("time", "error", "message"),
+    [
+        (np.arange(7.0), np.arange(7.0), r"shapes \(7,\) and \(7,\), expected 8 samples"),
+        (np.arange(8.0), np.arange(9.0), r"shapes \(8,\) and \(9,\)"),
+        (np.zeros((8, 1)), np.zeros((8, 1)), r"shapes \(8, 1\)"),
+        (np.arange(8.0) % 7.0, np.arange(8.0), "time must increase"),
+        (np.r_[0.0, np.arange(7.0)], np.arange(8.0), "time must increase"),
+        (np.r_[np.arange(7.0), np.inf], np.arange(8.0), "must be finite"),
+        (np.arange(8.0), np.r_[np.arange(7.0), np.nan], "must be finite"),
+    ],
+)
+def test_samples_of_a_fit_are_checked(time: np.ndarray, error: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        fit_vibration(time, error)
+
+
+@pytest.mark.parametrize(("damping", "phase"), [(0.3, 2.0), (0.6, -1.0), (0.01, 3.0)])
+def test_fit_of_eight_exact_samples_gives_back_the_swing(damping: float, phase: float) -> None:
+    times = 2.0 + np.linspace(0.0, 1.1, 8)
+    angle = 2.0 * math.pi * (times - 2.0)
+    swing = np.exp(-damping / math.sqrt(1.0 - damping**2) * angle) * np.cos(angle + phase)
+    found = fit_vibration(times, -4.0 + 3.0 * swing, damping=0.8 * damping)
+    assert found[:5] == pytest.approx((-4.0, 3.0, phase, 1.0, damping), rel=1e-3)
+    assert found.residual < 1e-5

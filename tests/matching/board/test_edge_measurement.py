@@ -89,7 +89,10 @@ def test_range_in_which_fiducials_are_searched(
 
 @pytest.mark.parametrize(("copper", "polarities"), [("bright", ["falling", "rising"]), ("dark", ["rising", "falling"])])
 def test_rulers_of_edges_and_of_traces(monkeypatch: pytest.MonkeyPatch, copper: Copper, polarities: list[str]) -> None:
-    """Single edges, then traces of 10 to 11 px: their widths are searched from 0.6 w - 2 to 1.4 w + 2 pixels."""
+    """Single edges, then traces of 4 px and of 10 to 11 px: widths are searched from 0.6 w - 2 to 1.4 w + 2 pixels.
+
+    The least width is 1 px.
+    """
     rulers: list[dict[str, Any]] = []
 
     def measure(**how: Any) -> Any:
@@ -101,9 +104,9 @@ def test_rulers_of_edges_and_of_traces(monkeypatch: pytest.MonkeyPatch, copper: 
     monkeypatch.setattr(edge_measurement, "RulerEdges", measure)
     view = BoardView(scale=1e-4, shape=(40, 60), pose=(0.0, 0.0, 0.0))
     features: Any = types.SimpleNamespace(
-        point=np.array([[1e-3, 0.0], [2e-3, 0.0], [-1e-3, 0.0]]),
-        normal=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]]),
-        spacing=np.array([1.1e-3, 0.0, 1e-3]),
+        point=np.array([[1e-3, 0.0], [2e-3, 0.0], [-1e-3, 0.0], [3e-4, 0.0]]),
+        normal=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [-1.0, 0.0]]),
+        spacing=np.array([1.1e-3, 0.0, 1e-3, 0.4e-3]),
         imaging=types.SimpleNamespace(width_px=5, smoothing_ratio=1.5),
     )
     device: Any = None
@@ -118,12 +121,12 @@ def test_rulers_of_edges_and_of_traces(monkeypatch: pytest.MonkeyPatch, copper: 
         device=device,
         limits=limits,
     )
-    found = measurer._measure_rulers(view, copper, np.array([20.0, 33.0, 10.0]))
-    assert [each["pairs"] for each in rulers] == [False, True]
-    assert [each["spacing_px"] for each in rulers] == [None, pytest.approx((4.0, 17.4))]
-    assert [each["polarity"] for each in rulers] == polarities
-    assert [(each["length"], each["smoothing_px"], each["width"]) for each in rulers] == [(48, 1.5, 5)] * 2
-    np.testing.assert_allclose(found.position_px, 29.5 + np.array([10.0, 20.0, -10.0]))
+    found = measurer._measure_rulers(view, copper, np.array([20.0, 33.0, 10.0, 15.0]))
+    assert [each["pairs"] for each in rulers] == [False, True, True]
+    assert [each["spacing_px"] for each in rulers] == [None, pytest.approx((1.0, 7.6)), pytest.approx((4.0, 17.4))]
+    assert [each["polarity"] for each in rulers] == [*polarities, polarities[1]]
+    assert [(each["length"], each["smoothing_px"], each["width"]) for each in rulers] == [(48, 1.5, 5)] * 3
+    np.testing.assert_allclose(found.position_px, 29.5 + np.array([10.0, 20.0, -10.0, 3.0]))
     np.testing.assert_allclose(found.sigma, np.hypot(0.3, limits.sampling_sigma_px) * 1e-4)
     np.testing.assert_array_equal(found.status, 2)
     np.testing.assert_array_equal(found.weight, 0.0)

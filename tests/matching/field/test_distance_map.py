@@ -78,3 +78,49 @@ def test_wrong_maps_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match=match):
             DistanceMap(field=field, **change)
+
+
+def test_fields_at_their_limits_are_taken() -> None:
+    line = (0.0, 0.0, 1.0, 0.0)
+    Field(length=1e-3, width=1e-3, lines=(line,) * 255, arcs=(Arc(0.0, 0.0, 1.0),))
+    Field(length=1.0, width=1.0, arcs=(Arc(0.0, 0.0, 1e-3, 0.5, 0.5 + 2.0 * math.pi),))
+    with pytest.raises(ValueError, match="Field has 257 lines and arcs, expected 256 at most"):
+        Field(length=1.0, width=1.0, lines=(line,) * 256, arcs=(Arc(0.0, 0.0, 1.0),))
+    for wrong in (Arc(0.0, 0.0, 1.0, 0.5, 0.5), Arc(0.0, 0.0, 1.0, 0.0, 6.2832), Arc(0.0, 0.0, 0.0)):
+        with pytest.raises(ValueError, match="expected a radius above 0 and start < end <= start"):
+            Field(length=1.0, width=1.0, arcs=(wrong,))
+    with pytest.raises(ValueError, match=r"Field\.width is 0\.0, expected metres above 0"):
+        Field(length=1.0, width=0.0, lines=(line,))
+
+
+@pytest.mark.parametrize(
+    ("lines", "arcs", "is_symmetric"),
+    [
+        (((-1.0, 2.0, 3.0, 2.0), (1.0, -2.0, -3.0, -2.0)), (), True),
+        (((-1.0, 2.0, 3.0, 2.0), (-3.0, -2.0, 1.0, -2.0)), (), True),
+        (((-1.0, 2.0, 3.0, 2.0), (-3.0, -2.0, 1.0, -2.1)), (), False),
+        (((-1.0, 2.0, 3.0, 2.0), (-1.0, -2.0, 3.0, -2.0)), (), False),
+        (((-2.0, 0.0, 2.0, 0.0),), (), True),
+        (((2.0, 3.0, 2.0, -1.0), (-2.0, 1.0, -2.0, -3.0)), (), True),
+        ((), (Arc(0.0, 0.0, 1.0, 0.4, 0.4 + 2.0 * math.pi),), True),
+        ((), (Arc(0.1, 0.0, 1.0),), False),
+        ((), (Arc(0.0, 0.1, 1.0),), False),
+        ((), (Arc(1.0, 2.0, 1.0), Arc(-1.0, -2.0, 1.0)), True),
+        ((), (Arc(1.0, 2.0, 1.0), Arc(-1.0, -2.0, 1.1)), False),
+        ((), (Arc(1.0, 2.0, 1.0, 0.5, 1.5), Arc(-1.0, -2.0, 1.0, 0.5 + math.pi, 1.5 + math.pi)), True),
+        ((), (Arc(1.0, 2.0, 1.0, 0.5, 1.5), Arc(-1.0, -2.0, 1.0, 0.5 - math.pi, 1.5 - math.pi)), True),
+        ((), (Arc(1.0, 2.0, 1.0, 0.5, 1.5), Arc(-1.0, -2.0, 1.0, 0.5, 1.5)), False),
+        ((), (Arc(1.0, 2.0, 1.0, 0.5, 1.5), Arc(-1.0, -2.0, 1.0, 0.4 + math.pi, 1.6 + math.pi)), False),
+        ((), (Arc(0.0, 0.0, 1.0, 0.5, 1.5),), False),
+    ],
+)
+def test_half_a_turn_maps_a_symmetric_field_to_itself(lines: Any, arcs: Any, is_symmetric: bool) -> None:
+    assert Field(length=8.0, width=6.0, lines=lines, arcs=arcs).is_symmetric == is_symmetric
+
+
+def test_the_largest_map_has_2_to_the_26_cells() -> None:
+    """The larger one of length and width, the margin and the range on both sides, over the cells of a side, 8192."""
+    field = Field(length=2.0, width=7.0, lines=((0.0, 0.0, 1.0, 0.0),))
+    least = (7.0 + 2.0 * (0.5 + 3.0)) / 8192.0
+    with pytest.raises(ValueError, match=rf"DistanceMap\.cell is {0.999 * least} m, expected 0\.0017 m or more"):
+        DistanceMap(field=field, cell=0.999 * least, margin=0.5, max_range=3.0)

@@ -165,3 +165,94 @@ def test_seen_is_corrected_for_points_that_meet_crossings_by_chance() -> None:
     density, window = 7 / (10 + 2 * math.sqrt(2)), 0.1 * (5 + math.sqrt(2)) / 6
     by_chance = 1 - math.exp(-density * window)
     assert found.seen == pytest.approx((4 / 6 - by_chance) / (1 - by_chance), rel=1e-12)
+
+
+def crossings_of(field: Field, pose: tuple[float, float, float], path: np.ndarray, width: float) -> list[np.ndarray]:
+    """Return the expected crossings of one scan line in the robot's frame, by definition, with complex numbers."""
+    turn, origin = complex(math.cos(pose[2]), math.sin(pose[2])), complex(pose[0], pose[1])
+    start, end = (origin + turn * complex(*each) for each in (path[:2], path[2:]))
+    length, way = abs(end - start), (end - start) / abs(end - start)
+    found: list[tuple[float, float, bool]] = []  # distance, sine, away from the ends of the line
+    for x0, y0, x1, y1 in field.lines:
+        # In the frame of the scan line.
+        a, b = ((complex(*each) - start) / way for each in ((x0, y0), (x1, y1)))
+        size, sine = abs(b - a), abs((b - a).imag) / abs(b - a)
+        if sine <= 0.02:
+            continue
+        share = a.imag / (a.imag - b.imag)
+        if -width < share * size < size + width:
+            clear = width < share * size < size - width
+            found.append(((a + share * (b - a)).real, sine, clear))
+    for arc in field.arcs:
+        centre = (complex(arc.x, arc.y) - start) / way
+        if abs(centre.imag) >= arc.radius:
+            continue
+        half = math.sqrt(arc.radius**2 - centre.imag**2)
+        for away in (centre.real - half, centre.real + half):
+            place = start + away * way
+            along = (np.angle(place - complex(arc.x, arc.y)) - arc.start) % (2.0 * math.pi) * arc.radius
+            whole = arc.radius * (arc.end - arc.start)
+            if along <= whole:
+                is_circle = arc.end - arc.start > 2.0 * math.pi - 1e-9
+                found.append((away, half / arc.radius, is_circle or width < along < whole - width))
+    kept = []
+    for number, (away, sine, clear) in enumerate(found):
+        alone = all(abs(away - other[0]) > 3.0 * width for k, other in enumerate(found) if k != number)
+        if alone and clear and sine >= 0.5 and width < away < length - width:
+            kept.append(path[:2] + away / length * (path[2:] - path[:2]))
+    return kept
+
+
+def test_expected_crossings_are_those_of_the_definition(rng: np.random.Generator) -> None:
+    """Random scan lines over lines at all angles and arcs, one of which is a circle that does not begin at 0."""
+    lines = [tuple(each) for each in rng.uniform(-4.0, 4.0, (5, 4))]
+    arcs = (Arc(0.5, -1.0, 1.5, 0.7, 0.7 + 2.0 * math.pi), Arc(-2.0, 1.0, 1.2, -2.5, 1.0), Arc(2.0, 2.0, 0.8, 1.0, 5.0))
+    field, pose, width = Field(length=8.0, width=8.0, lines=tuple(lines), arcs=arcs), (0.4, -0.3, 2.1), 0.12
+    paths = rng.uniform(-5.0, 5.0, (300, 4))
+    expected = [place for path in paths for place in crossings_of(field, pose, path, width)]
+    found = expected_crossings(field, pose, paths, line_width=width)
+    assert len(expected) > 150
+    np.testing.assert_allclose(sorted(found.places.tolist()), sorted(np.array(expected).tolist()), atol=1e-9)
+    # The crossings of a line or an arc lie on it, and have the sine of the angle to it.
+    alone = [Field(length=8.0, width=8.0, lines=(each,)) for each in lines]
+    alone += [Field(length=8.0, width=8.0, arcs=(each,)) for each in arcs]
+    for number, each in enumerate(alone):
+        places = robot_to_field(found.places[found.lines == number], pose)
+        np.testing.assert_allclose(distances_to_lines(each, places), 0.0, atol=1e-9)
+    assert len(np.unique(found.lines)) > 5
+
+
+@pytest.mark.parametrize(
+    ("away", "is_expected"),
+    [(0.3, False), (0.301, True), (-0.3, False), (-0.301, True)],
+)
+def test_crossings_within_three_widths_of_another_are_left_out(away: float, is_expected: bool) -> None:
+    field = Field(length=10.0, width=6.0, lines=((-4.0, 0.0, 4.0, 0.0), (-4.0, away, 4.0, away)))
+    found = expected_crossings(field, (0.0, 0.0, 0.0), [(1.0, -2.0, 1.0, 2.0)], line_width=0.1)
+    assert len(found.places) == 2 * is_expected
+
+
+def test_crossings_at_30_degrees_or_more_are_expected() -> None:
+    for degrees, is_expected in ((29.9, False), (30.1, True), (149.9, True), (150.1, False)):
+        angle = math.radians(degrees)
+        end = np.array([math.cos(angle), math.sin(angle)])
+        found = expected_crossings(CROSS, (2.0, 0.0, 0.0), [(*-end, *end)], line_width=0.1)
+        assert len(found.places) == is_expected
+        if is_expected:
+            assert found.sines == pytest.approx([math.sin(angle)])
+
+
+def test_share_of_crossings_without_points_by_chance_is_at_most_one() -> None:
+    """So many points that each crossing meets one by chance: what is seen is not divided by nothing."""
+    paths = [(x, -1.0, x, 1.0) for x in (-3.5, -3.0, -2.5)]
+    points = np.column_stack([np.full(3000, -3.0), np.linspace(-1.0, 1.0, 3000)])
+    found = evidence(points, paths, CROSS, (0.0, 0.0, 0.0), half_line_width=0.05, scale=0.2, max_range=3.0, margin=0.5)
+    assert found.expected == 3
+    # One of three is seen; by chance all would be.
+    by_chance = 1.0 - math.exp(-3000 / 6.0 * 0.1)
+    assert found.seen == pytest.approx((1.0 / 3.0 - by_chance) / 1e-3)
+    assert found.missing == pytest.approx((1.0 - found.seen) / found.on_lines)
+    none = evidence(
+        points, np.zeros((0, 4)), CROSS, (0.0, 0.0, 0.0), half_line_width=0.05, scale=0.2, max_range=3.0, margin=None
+    )
+    assert (none.expected, none.missing) == (0, 0.0)

@@ -198,3 +198,89 @@ def test_wrong_times_are_refused() -> None:
         robot.see(0.2, [])
     with pytest.raises(ValueError, match="time"):
         robot.state(0.5)
+
+
+def places(robot: RobotFilter) -> list[float]:
+    """Return the x of all hypotheses, most probable first."""
+    return [round(float(each.estimate.pose[0]), 3) for each in robot.state().hypotheses]
+
+
+@pytest.mark.parametrize(("factor", "count"), [(0.99, 1), (1.01, 2)])
+def test_hypotheses_merge_below_their_distance(factor: float, count: int) -> None:
+    """Two candidates of a first view, whose squared distance in the sum of their covariances is 4 times the factor."""
+    away = math.sqrt(4.0 * factor * 2.0) * 0.03
+    robot = RobotFilter(FIELD, limits=RobotFilterLimits(merged=4.0))
+    robot.see(0.0, [candidate((1.0, 2.0, 0.3)), candidate((1.0 + away, 2.0, 0.3))])
+    found = robot.state().hypotheses
+    assert len(found) == count
+    assert sum(each.probability for each in found) == pytest.approx(1.0)
+    assert found[0].probability == pytest.approx(1.0 / count)
+
+
+@pytest.mark.parametrize(("factor", "corrected"), [(0.99, True), (1.01, False)])
+def test_candidates_beyond_the_gate_belong_to_no_hypothesis(factor: float, corrected: bool) -> None:
+    """Of a candidate that fixes x only, too: a squared distance of 9 times the factor."""
+    away = math.sqrt(9.0 * factor * (0.05**2 + 0.03**2))
+    seen = np.add(START.pose, (away * math.cos(0.0), 0.0, 0.0))
+    limits = RobotFilterLimits(gate=9.0, carried=1e-9, dropped=1e-12)
+    robot, partly = RobotFilter(FIELD, START, limits=limits), RobotFilter(FIELD, START, limits=limits)
+    robot.see(0.0, [candidate(seen)])
+    found = [h for h in robot.state().hypotheses if 1e-3 < h.estimate.pose[0] - START.pose[0] < 0.9 * away]
+    assert (len(found) == 1) == corrected
+    of_x = candidate(seen)._replace(information=np.diag([0.03**-2, 0.0, 0.0]), status=Status.AMBIGUOUS)
+    partly.see(0.0, [of_x._replace(pose=np.add(seen, (3.0, 0.0, 0.0))), of_x])
+    moved_by = away * 0.05**2 / (0.05**2 + 0.03**2) if corrected else 0.0
+    np.testing.assert_allclose(partly.state().pose, np.add(START.pose, (moved_by, 0.0, 0.0)), atol=1e-9)
+
+
+def test_the_most_probable_hypotheses_are_kept() -> None:
+    """Candidates far apart are equally probable; a second view of two of them makes these more probable."""
+    poses = [(x, 1.0, 0.2) for x in (-6.0, -2.0, 2.0, 6.0)]
+    for most, count in ((4, 4), (3, 3), (1, 1)):
+        robot = RobotFilter(FIELD, limits=RobotFilterLimits(max_hypotheses=most))
+        robot.see(0.0, [candidate(each) for each in poses])
+        found = robot.state().hypotheses
+        assert [each.probability for each in found] == pytest.approx([1.0 / count] * count)
+    robot = RobotFilter(FIELD, limits=RobotFilterLimits(dropped=1e-9))
+    robot.see(0.0, [candidate(each) for each in poses])
+    robot.move(1.0, np.zeros(3), STEP)
+    robot.see(1.0, [candidate(poses[1]), candidate(poses[3])])
+    first = robot.state().hypotheses
+    assert sorted(places(robot)[:2]) == [-2.0, 6.0]
+    assert sorted(places(robot)) == [-6.0, -2.0, 2.0, 6.0]
+    least = first[-1].probability
+    for factor, count in ((0.99, 4), (1.01, 2)):
+        robot = RobotFilter(FIELD, limits=RobotFilterLimits(dropped=factor * least))
+        robot.see(0.0, [candidate(each) for each in poses])
+        robot.move(1.0, np.zeros(3), STEP)
+        robot.see(1.0, [candidate(poses[1]), candidate(poses[3])])
+        assert len(robot.state().hypotheses) == count
+
+
+def test_a_pose_is_ambiguous_below_its_least_probability() -> None:
+    two = [candidate((1.0, 1.0, 0.0)), candidate((-3.0, 1.0, 0.0))]
+    for least, status in ((0.5, Status.OK), (0.5 + 1e-9, Status.AMBIGUOUS)):
+        robot = RobotFilter(FIELD, limits=RobotFilterLimits(min_probability=least))
+        robot.see(0.0, two)
+        assert robot.state().probability == 0.5
+        assert robot.state().status == status
+
+
+def test_state_within_a_motion_is_at_its_share() -> None:
+    """The path is a straight line in the frame of the start of the motion, as is the turn; the variance grows."""
+    robot = RobotFilter(FIELD, PoseEstimate(np.array([1.0, 2.0, 0.5]), np.zeros((3, 3))), time=3.0)
+    robot.move(5.0, (0.8, -0.4, 0.6), np.diag([4e-4, 0.0, 1e-4]))
+    found = robot.state(3.5)
+    c, s = math.cos(0.5), math.sin(0.5)
+    np.testing.assert_allclose(found.pose, [1.0 + 0.2 * c + 0.1 * s, 2.0 + 0.2 * s - 0.1 * c, 0.65], atol=1e-12)
+    assert found.time == 3.5
+    along = np.array([c, s, 0.0])
+    expected = 1e-4 * np.outer(along, along) + np.diag([0.0, 0.0, 0.25e-4])
+    np.testing.assert_allclose(found.covariance, expected, atol=1e-15)
+    assert robot.state(5.0).time == robot.state().time == 5.0
+    with pytest.raises(ValueError, match="time"):
+        robot.state(2.999)
+    robot.see(4.0, [])
+    with pytest.raises(ValueError, match="time"):
+        robot.state(3.999)
+    assert robot.state(4.0).time == 4.0

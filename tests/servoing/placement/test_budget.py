@@ -9,9 +9,10 @@ import pytest
 
 from gpuvision.formats.machine_file import read_machine
 from gpuvision.servoing.axis import Axis
+from gpuvision.servoing.delay import gain_limit
 from gpuvision.servoing.frames import Transform
 from gpuvision.servoing.margins import observer_matrix
-from gpuvision.servoing.placement.budget import model_tolerance, noise_gain, predict_budget
+from gpuvision.servoing.placement.budget import model_tolerance, noise_covariance, noise_gain, predict_budget
 from gpuvision.servoing.placement.control import Control, Settling
 from gpuvision.servoing.placement.machine import ThermalDrift
 from gpuvision.servoing.placement.placing import REMAINDER
@@ -159,3 +160,56 @@ def test_noise_of_an_unstable_loop_is_refused() -> None:
     for gain in (0.62, 0.0):
         with pytest.raises(ValueError, match="not stable"):
             noise_gain(2.0, gain)
+
+
+@pytest.mark.parametrize(("wait", "frames"), [(4e-3, 4), (4.2e-3, 5)])
+def test_servo_variance_of_a_fixed_wait_is_the_rest_of_the_response(wait: float, frames: int) -> None:
+    """A predictor leaves the loop without delay: the error of a frame is 0.6 of the one before."""
+    control = Control(observer="smith", gain=0.4)
+    machine = dataclasses.replace(
+        PRESET, control=control, settling=Settling(rule="fixed", wait=wait), axes=(Axis(),) * 3
+    )
+    zone = np.array([machine.tolerance.landing_zone] * 2 + [machine.tolerance.landing_angle])
+    found = predict_budget(machine, _plan()).sources["servo"]
+    np.testing.assert_allclose(found, np.diag((0.6**frames * zone) ** 2 / 3.0), rtol=1e-9, atol=1e-30)
+
+
+def test_tolerated_errors_of_a_loop_on_the_latest_pose_are_its_margins() -> None:
+    machine = dataclasses.replace(PRESET, control=Control(gain=0.2), axes=(Axis(lag=0.4e-3), Axis(lag=0.9e-3), Axis()))
+    delay = machine.delay.frames + 0.9  # the longest lag counts as a delay
+    tolerated = model_tolerance(machine, _plan())
+    assert tolerated is not None
+    assert tolerated.plant_gain == pytest.approx(gain_limit(delay) / 0.2, rel=1e-6)
+    # The phase at the crossover is -90 degrees less half a frame and the delay.
+    angle = 2.0 * math.asin(0.1)
+    assert tolerated.longer_delay == pytest.approx(1e-3 * ((math.pi / 2.0) / angle - 0.5 - delay), rel=0.02)
+
+
+def test_a_predictor_with_an_integral_part_has_no_tolerated_errors() -> None:
+    for control in (Control(observer="smith", controller="pi"), dataclasses.replace(KALMAN, controller="pi", gain=0.3)):
+        assert model_tolerance(dataclasses.replace(PRESET, control=control), _plan()) is None
+
+
+def test_corrections_of_a_kalman_filter_follow_its_recursion() -> None:
+    """Matrices that do not commute, three frames: the error of the last estimate, written out."""
+    rng = np.random.default_rng(7)
+    reported, noise = (each @ each.T for each in rng.normal(size=(2, 3, 3)))
+    sigma = (0.3, 0.5, 0.2)
+    machine = dataclasses.replace(
+        PRESET, control=Control(observer="kalman", gain=0.7, motion_sigma=sigma), axes=(Axis(),) * 3
+    )
+    covariance = reported
+    # Derivatives of the estimates and of the position by the noise of each frame.
+    by_noise = [np.eye(3) if each == 0 else np.zeros((3, 3)) for each in range(3)]
+    at = [np.zeros((3, 3)) for _ in range(3)]
+    for frame in range(3):
+        if frame:
+            prior = covariance + np.diag(sigma) ** 2
+            gain = prior @ np.linalg.inv(prior + reported)
+            covariance = prior - gain @ prior
+            by_noise = [(np.eye(3) - gain) @ each for each in by_noise]
+            by_noise[frame] = gain
+        # The head moves by 0.7 of the estimated error; the estimate contains the motion.
+        at = [here - 0.7 * (here + error) for here, error in zip(at, by_noise, strict=True)]
+    expected = sum(each @ noise @ each.T for each in at)
+    np.testing.assert_allclose(noise_covariance(machine, reported, noise, 3), expected, rtol=1e-9)

@@ -160,7 +160,7 @@ def _is_free(layers: tuple[VisibleLayer, ...], pad: Pad, radius: float, imaging:
     smoothing = math.hypot(fiducial_smoothing(imaging.blur_px), imaging.max_blur_px)
     # An edge 3.5 standard deviations of its gradient away shifts the contour by less than 0.01 px.
     inwards = 3.5 * smoothing * imaging.pixel if pad.hole > 0 else radius
-    if inwards > radius - (pad.hole / 2 + imaging.registration if pad.hole > 0 else 0.0):
+    if inwards > radius - pad.hole / 2:
         return False
     outwards, hidden = max(_clear(imaging), inwards if pad.hole > 0 else 0.0), 0
     spokes = 2 * SPOKES

@@ -52,9 +52,10 @@ def test_round_lands_are_marks(tmp_path: Path) -> None:
         ({"traces": ((7, 5, 9, 6),), "width": 0.25}, True),
         ({"traces": ((7, 5, 9, 6), (7, 5, 5, 5)), "width": 0.5}, False),
         ({"traces": ((5, 5.8, 9, 5.8),), "width": 0.4}, False),
-        # A hole that leaves a ring of 0.3 mm, and a hole that leaves a ring of 0.1 mm.
+        # Holes that leave a ring of 0.3 mm, of 0.1 mm, and nothing of the pad.
         ({"holes": ((7, 5, 0.4),)}, True),
         ({"holes": ((7, 5, 0.8),)}, False),
+        ({"holes": ((7, 5, 1.7),)}, False),
         # Another pad with which it may be confused.
         ({"pads": (*LANDS, (7.0, 5.25))}, False),
         ({"pads": (*LANDS, (7.0, 6.6))}, True),

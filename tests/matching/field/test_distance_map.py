@@ -27,8 +27,24 @@ def test_distances_are_those_to_the_nearest_line(device: Device) -> None:
         every += [reference.distance_to_arc(arc, np.stack([x, y], axis=-1)) for arc in field_map.field.arcs]
         of_nearest = np.take_along_axis(np.array(every), field_map.cells.nearest[None, ..., 0].astype(int), axis=0)[0]
         np.testing.assert_allclose(of_nearest, exact, atol=8e-6)
+        assert_candidates(field_map, np.array(every))
         level = 1023.0 * exact**2 / (field_map.scale**2 + exact**2)
         np.testing.assert_allclose(field_map.cells.level, level, atol=0.51)
+
+
+def assert_candidates(field_map: DistanceMap, every: np.ndarray) -> None:
+    """Assert that a cell holds the up to four lines that can be nearest to one of its points, the nearest one first."""
+    order = np.argsort(every, axis=0, kind="stable")[:5]
+    far = np.take_along_axis(every, order, axis=0)
+    # Of a point of the cell a distance differs by half the diagonal at most.
+    limit = far[0] + 1.42 * field_map.cell
+    nearest = np.where(far[:4] <= limit, order[:4], order[0])
+    expected = np.concatenate([nearest, np.repeat(order[:1], 4 - len(nearest), axis=0)])
+    # Rounding decides between lines that are equally far, and at the limit.
+    clear = (np.diff(far, axis=0) > 1e-4).all(axis=0) & (np.abs(far - limit) > 1e-4).all(axis=0)
+    assert clear.mean() > 0.3
+    found = np.moveaxis(field_map.cells.nearest, -1, 0)
+    np.testing.assert_array_equal(found[:, clear], expected[:, clear])
 
 
 def test_searched_positions_are_centred_on_the_field(device: Device) -> None:

@@ -205,6 +205,9 @@ def test_covariance_of_a_correction_by_a_lens() -> None:
     assert np.isfinite(found[0]).all()
     assert np.isinf(found[1]).all()
     assert correction_sigma(fit_of(lens, names, covariance), [[900.0, 300.0]], MEASURED) == [np.inf]
+    image = np.array([[[*lens.centre]] * 3, [[900.0, 300.0]] * 3])
+    found = correction_covariance(fit_of(lens, names, covariance), image, MEASURED)
+    np.testing.assert_array_equal(np.isinf(found).all(axis=(-1, -2)), [[False] * 3, [True] * 3])
     # No parameter with a finite variance above 0. A coefficient does not move the centre.
     for variance, expected in ((np.inf, [0.0, np.inf]), (0.0, [0.0, 0.0])):
         fit = fit_of(lens, ("k1",), np.array([[variance]]))

@@ -23,6 +23,13 @@ def test_rows_are_read(tmp_path: Path) -> None:
     assert found.measured[1] == 1.5e-3
 
 
+def test_numbers_up_to_a_million_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "loop.csv"
+    path.write_text(HEADER + "-1e6,1e6,-1e6\n1e6,-1e6,1e6\n")
+    found = read_loop_recording(path)
+    np.testing.assert_array_equal(found, [[-1e6, 1e6], [1e6, -1e6], [-1e6, 1e6]])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -36,6 +43,7 @@ def test_rows_are_read(tmp_path: Path) -> None:
         (HEADER + "0,0,0\n1,1e308,0\n", r"line 3: command is 1e\+308, expected a magnitude of at most 1e\+06 m or rad"),
         (HEADER + "0,0,0\n1,0,-1e7\n", r"line 3: measured is -1e\+07"),
         (HEADER + "0,0,0\n0.5,0,0\n0.5,0,0\n", r"line 4: time is 0\.5 after 0\.5, expected a later one"),
+        (HEADER + "0,0,0\n1,0,0\n2,0,0\n1.5,0,0\n", r"line 5: time is 1\.5 after 2, expected a later one"),
         ("", "the file is empty; expected the header time,command,measured"),
     ],
 )

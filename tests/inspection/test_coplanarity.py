@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import ndtri
 
 from gpuvision.inspection.apertures import BoardPlacement
 from gpuvision.inspection.coplanarity import _compare_tops, measure_coplanarity, seating_plane
@@ -175,6 +176,26 @@ def test_the_noise_of_narrow_leads_along_y(rng):
     found = measure_coplanarity(clean + rng.normal(0, 2e-6, clean.shape), grid, regions)
     assert found.noise == pytest.approx(2e-6, rel=0.25)  # 3 sigma of the median of about 300 differences
     assert (found.top_sigma > 0).all()
+
+
+def test_the_noise_is_the_spread_of_third_differences(rng):
+    """A loop over four cells in a row or column, whose ends are in the region; its variance is 20 of one height."""
+    regions, grid, clean = _narrow_leads(7)
+    z = clean + rng.normal(0, 2e-6, clean.shape)
+    z[grid.shape[0] - 40, 25:35] = np.nan
+    found = []
+    for each in regions:
+        (left, bottom), (right, top) = each.bounds
+        inside = np.logical_and(*np.meshgrid((left < grid.x) & (grid.x < right), (bottom < grid.y) & (grid.y < top)))
+        for row, column in np.argwhere(inside):
+            for cells in (np.s_[row, column : column + 4], np.s_[row : row + 4, column]):
+                if inside[cells][-1]:
+                    a, b, c, d = z[cells]
+                    found.append(d - 3 * c + 3 * b - a)
+    known = np.array(found)[np.isfinite(found)]
+    assert 500 < len(known) < len(found)
+    mad = np.median(np.abs(known - np.median(known)))
+    assert measure_coplanarity(z, grid, regions).noise == pytest.approx(mad / ndtri(0.75) / math.sqrt(20), rel=1e-9)
 
 
 def test_the_noise_of_tiny_regions_is_unknown(rng):

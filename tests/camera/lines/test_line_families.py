@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -51,6 +53,9 @@ def test_labels_make_group_lines(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(found[1][0], points[:3])
     with pytest.raises(ValueError, match=r"points have shape \(12, 2\) and labels \(11,\)"):
         group_lines(points, [0] * 11, [0] * 11)
+    for shape in ((12,), (12, 1), (12, 3), (12, 2, 1)):
+        with pytest.raises(ValueError, match=re.escape(f"points have shape {shape} and labels (12,)")):
+            group_lines(np.zeros(shape), [0] * 12, [0] * 12)
 
 
 def test_packed_lines_keep_what_is_finite(rng: np.random.Generator) -> None:
@@ -83,6 +88,8 @@ def test_packed_lines_keep_what_is_finite(rng: np.random.Generator) -> None:
         ([], "there are no lines"),
         ([[]], "there are no lines"),
         ([[np.zeros((4, 3))]], r"a line has shape \(4, 3\), expected \(points, 2\)"),
+        ([[np.zeros((4, 2)), np.zeros((4, 1))]], r"a line has shape \(4, 1\), expected \(points, 2\)"),
+        ([[np.zeros(4)]], r"a line has shape \(4,\), expected \(points, 2\)"),
         ([[np.arange(4.0).reshape(2, 2)]], "no line has three finite points"),
         ([[np.full((4, 2), np.nan)]], "no line has three finite points"),
         ([[np.ones((4, 2))]], "all points lie on one place"),
@@ -92,5 +99,9 @@ def test_packed_lines_keep_what_is_finite(rng: np.random.Generator) -> None:
 def test_what_says_nothing_is_refused(lines: list[list[np.ndarray]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         pack(lines)
-    with pytest.raises(ValueError, match=r"grid points have shape \(3, 2\)"):
-        grid_lines(np.zeros((3, 2)))
+
+
+@pytest.mark.parametrize("shape", [(3, 2), (3, 3, 1), (3, 3, 3), (3, 3, 2, 1)])
+def test_shape_of_a_grid(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"grid points have shape {shape}")):
+        grid_lines(np.zeros(shape))

@@ -396,8 +396,10 @@ def test_mirrored_images(rng):
     np.testing.assert_allclose(found(fit), expected, rtol=1e-5, atol=1e-7)
     assert any("mirrored" in each for each in fit.warnings)
     assert not any("mirrored" in each for each in plain.warnings)
-    with pytest.raises(ValueError, match=r"views \[3\] show the target from its other side"):
-        fit_camera([*views[:3], flipped[3], *views[4:]], made.size)
+    for unit in (1e-3, 1.0, 1e3):
+        mixed = [(unit * target, image) for target, image in (*views[:3], flipped[3], *views[4:])]
+        with pytest.raises(ValueError, match=r"views \[3\] show the target from its other side"):
+            fit_camera(mixed, made.size)
 
 
 def _lacking(views):
@@ -433,7 +435,8 @@ def test_what_the_views_lack(message, rng):
         ({"model": "k9"}, "unknown term"),
         ({"loss": "cauchy"}, "expected one of squared, huber, tukey"),
         ({"sigma": 0.0}, "above 0"),
-        ({"focal_length": -1.0}, "above 0"),
+        ({"focal_length": -1.0}, "focal_length is -1, expected a number above 0"),
+        ({"focal_length": 0.0}, "focal_length is 0, expected a number above 0"),
         ({"centre": (1.0, 2.0, 3.0)}, "shape"),
     ],
 )

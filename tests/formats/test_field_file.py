@@ -14,8 +14,8 @@ TEXT = """
 length = 4.0
 width = 2.0
 [[line]]
-from = [-2.0, 0.5]
-to = [2.0, 0.5]
+from = [-2.0, -0.25]
+to = [1.75, 0.5]
 [[arc]]
 centre = [0.5, 0.25]
 radius = 0.75
@@ -33,7 +33,7 @@ def write(folder: Path, text: str) -> Path:
 def test_a_file_is_read(tmp_path: Path) -> None:
     field = read_field(write(tmp_path, TEXT))
     assert (field.length, field.width) == (4.0, 2.0)
-    assert field.lines == ((-2.0, 0.5, 2.0, 0.5),)
+    assert field.lines == ((-2.0, -0.25, 1.75, 0.5),)
     assert field.arcs == ((0.5, 0.25, 0.75, math.pi / 2, math.pi),)
 
 
@@ -51,7 +51,7 @@ def test_those_that_come_with_the_package(name: str) -> None:
     [
         ("length = 4.0", "", "'length' is missing"),
         ("width = 2.0", "width = -2.0", "width is -2.0 m, expected a number"),
-        ("to = [2.0, 0.5]", "to = [2.0]", r"line\[0\].to is"),
+        ("to = [1.75, 0.5]", "to = [2.0]", r"line\[0\].to is"),
         ("radius", "radios", "is it 'arc"),
         ("end_degrees = 180.0", "end_degrees = 60.0", "start < end"),
     ],

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from gpuvision.formats.height_files import ImageScale, read_gocator, read_heights
+from gpuvision.formats.height_files import HeightMapFile, ImageScale, read_gocator, read_heights
 from gpuvision.formats.range_image import read_tiff, write_npz, write_png16, write_tiff
 from gpuvision.ranging.regrid import Grid
 
@@ -88,6 +88,70 @@ def test_profiles_of_a_gocator_without_their_intensity(write):
     z, grid = read_gocator(write(PROFILE))
     np.testing.assert_allclose(z, np.array([[0.4, 0.5, 0.6], [0.1, np.nan, 0.3]]) * 1e-3)
     np.testing.assert_allclose([grid.left, grid.top, grid.cell_x, grid.cell_y], [1e-3, 7.5e-3, 0.5e-3, 0.5e-3])
+
+
+def test_columns_of_profiles_in_another_order(write):
+    """The positions begin after the later one of Y and Axis; a height that is not there may be a dash."""
+    text = PROFILE.replace("Exposure,Y,Axis", "Axis,Exposure,Y")
+    for number in (7.0, 7.5):
+        for kind in "ZI":
+            text = text.replace(f"20,{number},{kind}", f"{kind},20,{number}")
+    plain, plain_grid = read_gocator(write(PROFILE))
+    z, grid = read_gocator(write(text.replace("0.1,,0.3", "0.1,-,0.3")))
+    np.testing.assert_array_equal(z, plain)
+    assert grid == plain_grid
+    for name in ("Y", "Axis"):
+        with pytest.raises(ValueError, match="its section Profile has no columns Y and Axis"):
+            read_gocator(write(PROFILE.replace(name, "Other")))
+
+
+def test_a_row_that_begins_like_a_section_is_none(write):
+    z, _ = read_gocator(write(SURFACE.format(section="Surface,1,2\nPart")))
+    np.testing.assert_allclose(z, EXPECTED, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(1, 4), (4, 1), (1, 2), (2, 1)])
+def test_one_row_or_column_has_square_cells(write, rows, columns):
+    x, y = -2.0 + 0.02 * np.arange(columns), 5.0 - 0.02 * np.arange(rows)
+    table = [["Y", *x], *([place, *np.full(columns, 0.5)] for place in y)]
+    text = HEAD + "Surface\nFrame\n0\n" + "\n".join(",".join(map(str, row)) for row in table) + "\nEnd\n"
+    z, grid = read_gocator(write(text))
+    np.testing.assert_array_equal(z, np.full((rows, columns), 0.5e-3))
+    np.testing.assert_allclose([grid.cell_x, grid.cell_y, grid.left, grid.top], [2e-5, 2e-5, -2e-3, 5e-3])
+    with pytest.raises(ValueError, match="1 rows of 1 heights, expected a height map"):
+        read_gocator(write(HEAD + "Surface\nFrame\n0\nY,1.0\n2.0,0.5\nEnd\n"))
+
+
+def test_positions_deviate_by_a_tenth_of_a_cell_at_most(tmp_path):
+    z = np.zeros((5, 6))
+    x, y = 1e-3 + 1e-4 * np.arange(6.0), 2e-3 - 1e-4 * np.arange(5.0)
+    for axis, positions in (("x", x), ("y", y)):
+        for part, is_even in ((0.098, True), (-0.098, True), (0.102, False), (-0.102, False)):
+            moved = positions.copy()
+            moved[2] += part * 1e-4  # the ends stay: so does the mean step
+            held = {"map_x": x, "map_y": y, "map_z": z} | {f"map_{axis}": moved}
+            write_npz(tmp_path / "map.npz", held, dict.fromkeys(held, "m"), overwrite=True)
+            if is_even:
+                assert read_heights(tmp_path / "map.npz").grid.cell_x == pytest.approx(1e-4)
+                continue
+            with pytest.raises(ValueError, match=f"positions in {axis} are not evenly spaced"):
+                read_heights(tmp_path / "map.npz")
+    for axis, positions in (("x", x[::-1]), ("y", y[::-1])):
+        held = {"map_x": x, "map_y": y, "map_z": z} | {f"map_{axis}": positions}
+        write_npz(tmp_path / "map.npz", held, dict.fromkeys(held, "m"), overwrite=True)
+        with pytest.raises(ValueError, match=f"positions in {axis} are not evenly spaced"):
+            read_heights(tmp_path / "map.npz")
+
+
+def test_noise_and_phase_of_a_height_together(tmp_path):
+    """The phase counts where it is known; without noise there is no sum."""
+    sigma = np.array([[3e-6, 5e-6], [1e-6, 8e-6]], np.float32)
+    phase = np.array([[4e-6, 12e-6], [np.nan, 15e-6]], np.float32)
+    found = HeightMapFile(np.zeros((2, 2)), GRID, sigma, phase).total_sigma
+    np.testing.assert_allclose(found, [[5e-6, 13e-6], [1e-6, 17e-6]], rtol=1e-6)
+    assert found.dtype == np.float32
+    assert HeightMapFile(np.zeros((2, 2)), GRID, sigma).total_sigma is sigma
+    assert HeightMapFile(np.zeros((2, 2)), GRID, None, phase).total_sigma is None
 
 
 @pytest.mark.parametrize(
@@ -192,6 +256,11 @@ def test_a_tiff_of_another_quantity_is_refused(tmp_path, rng):
         ({"map_x": np.full(4, np.nan)}, "a position of map_x or map_y is not a finite number"),
         ({"map_y": np.full(3, np.inf)}, "a position of map_x or map_y is not a finite number"),
         ({"map_x": np.zeros((4, 1))}, "map_z has shape"),
+        ({"map_y": np.zeros((3, 1))}, "map_z has shape"),
+        ({"map_z": np.zeros((3, 4, 1))}, "map_z has shape"),
+        ({"map_z": np.zeros((3, 5))}, "map_z has shape"),
+        ({"map_sigma": np.zeros((3, 5))}, "map_z has shape"),
+        ({"map_phase": np.zeros((2, 4))}, "map_z has shape"),
         ({"map_z": np.full(GRID.shape, "high")}, "map_z has the type <U4, expected real numbers"),
         ({"map_z": np.zeros(GRID.shape, complex)}, "map_z has the type complex128, expected real numbers"),
         ({"map_sigma": np.zeros(GRID.shape, bool)}, "map_sigma has the type bool, expected real numbers"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from importlib import resources
@@ -14,9 +15,12 @@ import tomli_w
 
 from gpuvision.camera.lens import Lens
 from gpuvision.formats.camera_file import write_lens
+from gpuvision.formats.cmos_sensor_file import read_cmos_sensor
 from gpuvision.formats.machine_file import MACHINES, named_files, read_machine
 from gpuvision.schema import DescriptionError, Section
+from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.placement.control import Control, Settling
+from gpuvision.servoing.placement.machine import PlacementCamera, ThermalDrift, Tolerance
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "machine_files.md"
 PRESET = tomllib.loads(
@@ -77,6 +81,54 @@ def test_all_keys_of_loop_and_settling_are_read(tmp_path: Path) -> None:
     assert read_machine("look_while_place").control.watchdog == 1.5
     fixed = read_machine(_written(tmp_path, PRESET | {"settling": {"rule": "fixed", "wait": 0.05}}))
     assert fixed.settling == Settling(rule="fixed", wait=0.05)
+
+
+def test_all_keys_of_camera_delay_tolerance_and_drift_are_read(tmp_path: Path) -> None:
+    camera = {"sensor": "pb1024", "window": [128, 256], "pixel": 2e-5, "exposure": 3e-4, "electrons": 5e3}
+    covariance = [[4e-13, 1e-13, 2e-11], [1e-13, 9e-13, 3e-11], [2e-11, 3e-11, 1e-8]]
+    tolerance = {"position": 2e-6, "angle": 3e-3, "landing_zone": 2e-4, "landing_angle": 4e-3, "max_time": 2.5}
+    drift = {"expansion": [1e-6, -2e-6], "temperature_sigma": 0.25}
+    described: dict[str, Any] = {
+        "camera": camera | {"blur_px": 0.75},
+        "calibration": {"pipette": [1e-3, -2e-3, 0.25], "pipette_covariance": covariance},
+        "delay": {"transfer": 2e-4, "landing": 0.03, "vision": 4e-4, "control": 3e-4, "drive": 5e-4},
+        "tolerance": tolerance | {"max_refused": 7},
+        "drift": drift,
+        "axes": {"x": {"speed": 0.5}, "theta": {"resonance": 40.0, "swing": 3e-4, "speed": 2.0}},
+    }
+    machine = read_machine(_written(tmp_path, PRESET | described))
+    assert machine.camera == PlacementCamera(
+        sensor=read_cmos_sensor("pb1024"), window=(128, 256), pixel=2e-5, exposure=3e-4, electrons=5e3, blur_px=0.75
+    )
+    assert machine.pipette_in_camera.pose.tolist() == [1e-3, -2e-3, 0.25]
+    np.testing.assert_allclose(machine.pipette_in_camera.pose_covariance, covariance, rtol=1e-9)
+    assert (machine.transfer, machine.landing) == (2e-4, 0.03)
+    assert machine.stages == {"vision": 4e-4, "control": 3e-4, "drive": 5e-4}
+    assert machine.tolerance == Tolerance(**tolerance, max_refused=7)
+    assert machine.drift == ThermalDrift(expansion=(1e-6, -2e-6), temperature_sigma=0.25)
+    assert machine.swing == (0.0, 0.0, 3e-4)
+    assert [each.speed for each in machine.axes] == [0.5, math.inf, 2.0]
+    assert machine.axes[2].resonance == pytest.approx(80.0 * math.pi)
+
+
+def test_tables_that_a_machine_need_not_have(tmp_path: Path) -> None:
+    """Axes without a limit, no delay, no drift, and the rule `Settling` has by default."""
+    least = {name: PRESET[name] for name in ("camera", "loop", "tolerance")}
+    machine = read_machine(_written(tmp_path, least | {"calibration": {"pipette": [0.0, 0.0, 0.0]}}))
+    assert (machine.axes, machine.swing) == ((Axis(),) * 3, (0.0, 0.0, 0.0))
+    assert (machine.transfer, machine.landing, dict(machine.stages)) == (0.0, 0.0, {})
+    assert (machine.drift, machine.settling) == (ThermalDrift(), Settling())
+    np.testing.assert_array_equal(machine.pipette_in_camera.pose_covariance, np.zeros((3, 3)))
+    limits = PRESET["tolerance"]
+    assert machine.tolerance == Tolerance(**limits)
+
+
+def test_files_that_a_machine_names(tmp_path: Path) -> None:
+    """A sensor and a lens beside the machine file; the sensors of the package are no files."""
+    own = PRESET["camera"] | {"sensor": "own.toml", "lens": "lens.toml"}
+    assert named_files(_written(tmp_path, PRESET | {"camera": own})) == (tmp_path / "own.toml", tmp_path / "lens.toml")
+    assert named_files(_written(tmp_path, PRESET)) == ()
+    assert named_files("look_while_place") == ()
 
 
 @pytest.mark.parametrize(

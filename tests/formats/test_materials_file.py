@@ -8,7 +8,7 @@ import pytest
 from gpuvision.formats.materials_file import read_materials
 from gpuvision.schema import DescriptionError
 from gpuvision.simulation.scene.material import Material
-from gpuvision.simulation.scene.reflectance import Ggx, Lambert, OrenNayar, Phong
+from gpuvision.simulation.scene.reflectance import Ggx, Lambert, OrenNayar, Phong, Ward
 
 GOOD = """
 [[material]]
@@ -35,6 +35,16 @@ albedo = 0.0
 model = "ggx"
 alpha = 0.1
 f0 = 0.9
+
+[[material]]
+albedo = 0.2
+roughness = 0.0
+gloss = {model = "ward", albedo = 0.3, alpha_x = 0.1, alpha_y = 0.4}
+
+[[material]]
+albedo = 1.0
+slope_sigma = 0.0
+mirror = 0.0
 """
 
 
@@ -51,6 +61,8 @@ def test_materials_come_in_the_order_of_the_file(tmp_path):
         Material(diffuse=OrenNayar.from_slope_sigma(albedo=0.5, sigma=0.3)),
         Material(diffuse=Lambert(albedo=0.1), mirror=0.6, name="pad"),
         Material(diffuse=Lambert(albedo=0.0), gloss=Ggx(alpha=0.1, f0=0.9)),
+        Material(diffuse=Lambert(albedo=0.2), gloss=Ward(albedo=0.3, alpha_x=0.1, alpha_y=0.4)),
+        Material(diffuse=Lambert(albedo=1.0)),
     )
 
 
@@ -65,6 +77,9 @@ def test_materials_come_in_the_order_of_the_file(tmp_path):
         ("[[material]]\nalbedo = 0.5\nroughness = 0.1\nslope_sigma = 0.1", "both roughness and slope_sigma"),
         ("[[material]]\nalbedo = 0.5\ngloss = {model = 'fong'}", "did you mean"),
         ("[[material]]\nalbedo = 0.5\ngloss = {model = 'ggx', alpha = 0, f0 = 1}", "Ggx.alpha is 0"),
+        ("[[material]]\nalbedo = 0.5\ngloss = {model = 'ggx', alpha = 0.1, f0 = 1, beta = 2}", r"gloss\.beta"),
+        ("[[material]]\nalbedo = 0.5\nroughness = 1.001", r"material\[0\]\.roughness is 1\.001"),
+        ("[[material]]\nalbedo = 0.5\nslope_sigma = 1.571", r"material\[0\]\.slope_sigma is 1\.571 rad"),
         ("[[material]]\nalbedo = 0.5\nmiror = 0.1", r"unknown key 'material\[0\].miror'"),
     ],
 )

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-import pyopencl as cl
+import itertools
 
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+
+from gpuvision.host.program import build
+from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.profiling import ceiling
 
 
@@ -39,3 +45,25 @@ def test_without_times_of_events_the_clock_of_the_host_measures_copies(device, m
     monkeypatch.setattr(ceiling, "mover", lambda *_: Event)
     (rate,) = ceiling.bandwidths(device).values()
     assert 0.0 < rate < float("inf")
+
+
+def test_the_kernels_compute_what_they_are_counted_for(device, rng):
+    """All reads enter the sum that is written, and all chains of multiply-adds the result."""
+    program = build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {})
+    reads, writes, items = 37, 8, 4
+    given = rng.integers(0, 9, (reads, 16)).astype(np.float32)
+    source, made = (cl.array.to_device(device.queue, each) for each in (given, np.zeros((writes, 16), np.float32)))
+    sizes = np.int64(reads), np.int64(writes)
+    program.move(device.queue, (items,), None, source.data, made.data, *sizes)
+    edges = reads * np.arange(items + 1) // items
+    shares = np.array([given[first:last].sum(axis=0) for first, last in itertools.pairwise(edges)])
+    np.testing.assert_array_equal(made.get(), np.repeat(shares, writes // items, axis=0))
+    program.move_items(device.queue, (items,), None, source.data, made.data, *sizes)
+    sums = [given.ravel()[item::items].sum() for item in range(items)]
+    np.testing.assert_array_equal(made.get().ravel(), np.resize(sums, 16 * writes))
+    chains = cl.array.zeros(device.queue, 32, np.float32)
+    program.compute(device.queue, (2,), None, chains.data, np.float32(0.25), np.float32(0.5), np.int32(3))
+    values = 0.25 + np.arange(8.0)
+    for _ in range(3):
+        values = 0.5 * values + 0.5
+    np.testing.assert_allclose(chains.get(), values.sum(), rtol=1e-6)

@@ -9,10 +9,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.special import eval_legendre
+from scipy.stats import chi2, f
 
 from gpuvision.camera.lines import lack_of_fit
-from gpuvision.camera.lines.line_families import grid_lines
+from gpuvision.camera.lines.line_families import grid_lines, pack
+from gpuvision.camera.lines.straightness import Parameters
 from gpuvision.camera.lines.vanishing_points import LensFit, fit_lens
+from gpuvision.camera.lines.variable_projection import minimise
 from gpuvision.camera.patterns.dots import find_dots
 from gpuvision.camera.patterns.line_pattern import find_lines
 from straight_lines import HALF, plane_grid, radial_lens
@@ -129,6 +133,86 @@ def test_covariance_adds_the_field_and_two_jackknives(monkeypatch: pytest.Monkey
     expected = white.copy()
     expected[np.ix_(kept, kept)] = (field + 43.0 * np.eye(3)) * np.outer(sizes, sizes)
     np.testing.assert_allclose(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("freedom", "count"), [(0, 0), (47, 0), (48, 6), (111, 6), (112, 14), (192, 24), (399, 36), (400, 50), (10**6, 66)]
+)
+def test_number_of_modes_of_the_field(rng: np.random.Generator, freedom: int, count: int) -> None:
+    """Degrees 2 to 7 have 6, 8, 10 ... modes: each needs 4 degrees of freedom, here of errors that count twice."""
+    packed = pack(grid_lines(plane_grid(rng, 20.0, rows=9, columns=8)))
+    found = minimise(packed, Parameters(np.empty(0), np.zeros(2), None))
+    smooth = lack_of_fit.smooth_residuals(packed, found, freedom, len(packed.x) // 2, None)
+    degrees = [n for n in range(2, 8) for _ in range(2 * (n + 1))]
+    np.testing.assert_array_equal(smooth.degree, degrees[:count])
+    assert smooth.columns.shape == smooth.seen.shape == (count, len(packed.x))
+
+
+def test_modes_are_products_of_legendre_polynomials(rng: np.random.Generator) -> None:
+    """Each moves the points across their straight lines, which follow: what is linear along a line is not left over."""
+    points = rng.uniform((0.0, 0.0), (900.0, 400.0), (12, 7, 2))
+    packed = pack([list(points)])
+    found = minimise(packed, Parameters(np.empty(0), np.zeros(2), None))
+    smooth = lack_of_fit.smooth_residuals(packed, found, 10**6, len(packed.x), None)
+    place = np.stack([packed.x, packed.y], axis=-1)
+    u, v = (place / packed.corner).T
+    shapes = [
+        np.sqrt((2 * power + 1) * (2 * (n - power) + 1)) * eval_legendre(power, u) * eval_legendre(n - power, v)
+        for n in range(2, 8)
+        for power in range(n + 1)
+    ]
+    expected = np.zeros((66, len(place)))
+    for line in range(12):
+        (inside,) = np.nonzero(packed.line == line)
+        along, normal = np.linalg.svd(place[inside] - place[inside].mean(axis=0))[2]
+        normal = normal * np.sign(normal @ (found.evaluation.nx[inside[0]], found.evaluation.ny[inside[0]]))
+        design = np.stack([np.ones(7), place[inside] @ along], axis=1)
+        for number, shape in enumerate(shapes):
+            for axis in (0, 1):
+                moved = shape[inside] * normal[axis]
+                fitted = design @ np.linalg.lstsq(design, moved, rcond=None)[0]
+                expected[2 * number + axis, inside] = moved - fitted
+    np.testing.assert_allclose(smooth.columns, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(smooth.seen, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("freedom", "variance"), [(20, None), (20, 0.3), (4, None), (3, None), (2, None)])
+def test_the_residuals_are_compared_with_the_modes_that_are_seen(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator, freedom: int, variance: float | None
+) -> None:
+    """A mode counts if lens and lines leave more than 1e-3 of its mean square of 1: here three of six."""
+    lens = rng.normal(size=(2, 30))
+    basis = np.linalg.qr(np.vstack([lens, rng.normal(size=(6, 30))]).T)[0].T
+    share = np.array([1.0, 0.3, 1.01e-3, 0.99e-3, 1e-5, 0.0])
+    turn = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    seen = turn @ (np.sqrt(30.0 * share)[:, None] * basis[2:])
+    columns = seen + rng.normal(size=(6, 2)) @ lens
+    residual = 0.1 * rng.normal(size=30) + basis[2:5].T @ [1.0, -0.5, 0.25]
+    evaluation = types.SimpleNamespace(residual=residual, cost=float(residual @ residual))
+    found: Any = types.SimpleNamespace(evaluation=evaluation)
+    asked = []
+    monkeypatch.setattr(lack_of_fit, "_lens_columns", lambda *_: lens)
+    monkeypatch.setattr(lack_of_fit, "_field", lambda *given: asked.append(given[2]) or (columns, np.full(6, 2)))
+    smooth = lack_of_fit.smooth_residuals(types.SimpleNamespace(unit=500.0), found, freedom, 12, variance)
+    assert asked == [freedom * 12 // 120]
+    np.testing.assert_allclose(smooth.seen, seen, atol=1e-9)
+    fitted = basis[2:5].T @ (basis[2:5] @ residual)
+    np.testing.assert_allclose(smooth.rest, residual - fitted, atol=1e-9)
+    gain, left = fitted @ fitted, max(freedom - 3, 1)
+    noise = (residual @ residual - gain) / left
+    assert smooth.variance == pytest.approx(noise)
+    lack = smooth.lack_of_fit
+    assert (lack.modes, lack.noise_px) == (3, pytest.approx(500.0 * np.sqrt(noise)))
+    surplus = max(gain - 3.0 * noise, 0.0) / 30.0
+    assert lack.rms_px == pytest.approx(500.0 * np.sqrt(surplus))
+    # Of 30 residuals 12 are independent.
+    if variance is not None:
+        assert lack.p_value == pytest.approx(chi2.sf(gain / 2.5 / variance, 3))
+    elif freedom > 3:
+        ratio = (gain / 3.0) / ((residual @ residual - gain) / (freedom - 3))
+        assert lack.p_value == pytest.approx(f.sf(ratio / 2.5, 3, (freedom - 3) / 2.5))
+    else:
+        assert lack.p_value == 1.0
 
 
 @pytest.mark.slow

@@ -16,6 +16,8 @@ from gpuvision.ranging.background import (
     ImageSubtracted,
     PairsSubtracted,
     PreviousSubtracted,
+    beside_line,
+    line_stands_still,
     line_threshold,
     median_background,
     noise_threshold,
@@ -169,3 +171,65 @@ def test_the_unlit_level_leaves_out_a_line() -> None:
     background[50:52] = 255.0
     background[:40] = 30.0
     assert unlit_level(background) == 30.0
+
+
+def test_samples_beside_the_line_are_an_eighth_of_the_profile_away() -> None:
+    """Profiles of 16 samples: the brightest one and two on each side are the line, up to the ends of the profile."""
+    profiles = np.ones((3, 16))
+    profiles[[0, 1, 2], [5, 0, 14]] = 9.0
+    expected = np.ones((3, 16), bool)
+    expected[0, 3:8] = expected[1, :3] = expected[2, 12:] = False
+    np.testing.assert_array_equal(beside_line(profiles), expected)
+    # A profile of one sample has nothing beside the line: all of it counts.
+    np.testing.assert_array_equal(beside_line([[3.0], [4.0]]), np.ones((2, 1), bool))
+
+
+def test_a_line_stands_still_if_the_median_takes_half_of_its_light() -> None:
+    """The peaks of a profile are 110 with the background 10: less than 50 without the median is a line in it."""
+    frames = np.full((4, 6, 9), 10.0)
+    frames[:, :, 4] = 110.0
+    light = np.zeros_like(frames)
+    for left, still in ((0.0, True), (49.5, True), (50.0, False), (100.0, False)):
+        light[:, :, 4] = left
+        assert line_stands_still(light, frames, 10.0) is still
+    # The median profile decides: some profiles without light change nothing.
+    light[:, :2] = 0.0
+    assert not line_stands_still(light, frames, 10.0)
+    light[:, :4] = 0.0
+    assert line_stands_still(light, frames, 10.0)
+
+
+def test_a_threshold_of_integers_is_the_next_whole_number() -> None:
+    """Values -2, 0 and 6 in equal shares: centre 0, and 2 x 2 by the dark side."""
+    values = np.repeat([-2.0, 0.0, 6.0], 100)
+    assert noise_threshold(values, integer=False) == 4.0
+    assert noise_threshold(values + 0.25, integer=True) == 5.0
+    assert noise_threshold(values - 9.0, integer=True) == 4.0
+    assert noise_threshold(values - 9.0, integer=False) == 0.0
+    # Without a dark side the bright side counts, too: 4.8 times the distance from the median to the 90 % quantile.
+    assert noise_threshold(np.repeat([0.0, 1.0, 3.0], 100), integer=False) == pytest.approx(1.0 + 4.8 * 2.0)
+    values[::7] = np.nan
+    assert noise_threshold(values, integer=False) == 4.0
+
+
+def test_a_large_background_is_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An even step would see only every second column; with an odd one both kinds of columns count."""
+    monkeypatch.setattr("gpuvision.ranging.background._LARGEST_SAMPLE_VALUES", 500)
+    for size, step in ((500, 1), (501, 3), (1000, 3), (1500, 3), (1501, 5)):
+        # Every step-th value is 7, the others are out of the sample.
+        values = np.full(size, 99.0)
+        values[::step] = 7.0
+        assert unlit_level(values.reshape(-1, 1)) == 7.0
+        values[(size - 1) // step * step] = 99.0
+        assert noise_threshold(values.reshape(1, -1), integer=False) == 7.0
+        values[::step] = 200.0
+        assert unlit_level(values) == 200.0
+
+
+def test_a_sample_of_a_large_recording_keeps_at_least_five_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At most the groups that the memory holds, with 6 bytes for each frame; but five where it holds fewer."""
+    frames = np.broadcast_to(np.arange(64, dtype=np.uint16)[:, None, None], (64, 1, 3))
+    # While the recording is read up to twice as many groups are kept.
+    for limit, group, least in ((6 * 2 * 8, 1, 8), (6 * 2 * 7, 1, 7), (6 * 2 * 6, 2, 5), (0, 1, 5), (10_000, 1, 16)):
+        monkeypatch.setattr("gpuvision.ranging.background._LARGEST_SAMPLE_BYTES", limit)
+        assert least <= len(sample_frames(ArraySource(frames), group=group).frames) < 2 * least

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -17,6 +18,7 @@ from gpuvision.ranging.merge_heights import (
     SECOND,
     UNCONFIRMED,
     MergeHeights,
+    common_differences,
     merge_height_maps,
 )
 from gpuvision.ranging.regrid import Grid, HeightMap
@@ -187,6 +189,46 @@ def test_maps_over_different_grids(device: Device) -> None:
     assert without.sigma is None
 
 
+@pytest.mark.double
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("shift", [(3, -2), (-3, 2), (1, 4)])
+def test_every_cell_keeps_its_place(device: Device, shift: tuple[int, int], order: int) -> None:
+    """Heights that are the number of the cell in one lattice, for maps in both orders; cells that are not square."""
+    columns, rows = shift
+    first = Grid(left=0.25, top=-0.5, cell_x=1e-3, cell_y=2e-3, columns=6, rows=4)
+    second = Grid(left=0.25 + columns * 1e-3, top=-0.5 - rows * 2e-3, cell_x=1e-3, cell_y=2e-3, columns=5, rows=7)
+    lattice = np.arange(400.0).reshape(20, 20)
+    one = lattice[8:12, 8:14].copy()
+    two = lattice[8 + rows : 15 + rows, 8 + columns : 13 + columns] + 1e-6
+    maps = [(height_map(one), first), (height_map(two), second)][::order]
+    merged, grid = merge_height_maps(maps[0], maps[1], tolerance=2e-6, device=device)
+    top, left = min(rows, 0), min(columns, 0)
+    bottom, right = max(4, rows + 7), max(6, columns + 5)
+    assert grid.shape == (bottom - top, right - left)
+    np.testing.assert_allclose([grid.left, grid.top], [0.25 + left * 1e-3, -0.5 - top * 2e-3], rtol=1e-12)
+    assert (grid.cell_x, grid.cell_y) == (1e-3, 2e-3)
+    places = lattice[8 + top : 8 + bottom, 8 + left : 8 + right]
+    has_one, has_two = np.isin(places, one), np.isin(places + 1e-6, two)
+    np.testing.assert_array_equal(merged.source & FIRST != 0, (has_one, has_two)[::order][0])
+    np.testing.assert_array_equal(merged.source & SECOND != 0, (has_one, has_two)[::order][1])
+    expected = np.where(has_one | has_two, places + 1e-6 * has_two / np.maximum(1, 1.0 * has_one + has_two), np.nan)
+    np.testing.assert_allclose(merged.z, expected, rtol=0, atol=1e-12)
+    differences = common_differences(maps[0], maps[1], merged, grid)
+    assert differences.shape == (np.count_nonzero(has_one & has_two),)
+    np.testing.assert_allclose(differences, order * 1e-6, rtol=1e-6)
+
+
+@pytest.mark.double
+def test_differences_include_the_cells_that_disagree(device: Device) -> None:
+    grid = Grid(left=0.0, top=0.0, cell_x=1e-3, cell_y=1e-3, columns=4, rows=1)
+    one, two = np.array([[1.0, 1.0, 1.0, np.nan]]), np.array([[1.25, 3.0, np.nan, 1.0]])
+    maps = (height_map(one), grid), (height_map(two), grid)
+    for disagreement, source in (("drop", DISAGREES), ("first", DISAGREES | FIRST), ("mean", DISAGREES | BOTH)):
+        merged, made = merge_height_maps(*maps, tolerance=0.5, disagreement=disagreement, device=device)
+        np.testing.assert_array_equal(merged.source, [[BOTH, source, FIRST, SECOND]])
+        np.testing.assert_array_equal(common_differences(*maps, merged, made), [0.25, 2.0])
+
+
 def test_maps_of_two_frames_are_refused_before_they_are_allocated() -> None:
     grid = Grid(left=0.0, top=0.0, cell_x=1e-5, cell_y=1e-5, columns=3, rows=3)
     far = Grid(left=1.0, top=1.0, cell_x=1e-5, cell_y=1e-5, columns=3, rows=3)
@@ -200,9 +242,35 @@ def test_maps_of_two_frames_are_refused_before_they_are_allocated() -> None:
 
 def test_grids_off_the_lattice_are_refused() -> None:
     grid = Grid(left=0.0, top=0.0, cell_x=1e-3, cell_y=1e-3, columns=3, rows=3)
-    wider = Grid(left=0.0, top=0.0, cell_x=2e-3, cell_y=1e-3, columns=3, rows=3)
-    shifted = Grid(left=0.4e-3, top=0.0, cell_x=1e-3, cell_y=1e-3, columns=3, rows=3)
     z = np.zeros((3, 3))
-    for other, message in ((wider, "0.001 and 0.002 m wide"), (shifted, "shifted by 0.4 and 0 cells")):
+    changes: tuple[tuple[dict[str, float], str], ...] = (
+        ({"cell_x": 2e-3}, "0.001 and 0.002 m wide"),
+        ({"cell_y": 3e-3}, "0.001 and 0.003 m wide"),
+        ({"left": 0.4e-3}, r"shifted by 0\.4 and 0 cells"),
+        ({"left": 2e-3, "top": -1.25e-3}, r"shifted by 2 and 1\.25 cells"),
+    )
+    for change, message in changes:
         with pytest.raises(ValueError, match=message):
-            merge_height_maps((height_map(z), grid), (height_map(z), other))
+            merge_height_maps((height_map(z), grid), (height_map(z), dataclasses.replace(grid, **change)))
+
+
+def test_a_lattice_is_common_up_to_rounding(device: Device) -> None:
+    """Cells differ by up to 1e-6 over the map, and grids are off the lattice by up to 1e-6 of their shift."""
+    z = np.zeros((5, 4), np.float32)
+    grid = Grid(left=0.0, top=0.0, cell_x=1.0, cell_y=1.0, columns=4, rows=5)
+
+    def is_common(**change: float) -> bool:
+        try:
+            merge_height_maps(
+                (height_map(z), grid), (height_map(z), dataclasses.replace(grid, **change)), device=device
+            )
+        except ValueError:
+            return False
+        return True
+
+    assert is_common(cell_x=1.0 + 0.9e-6 / 5)
+    assert not is_common(cell_y=1.0 + 1.1e-6 / 5)
+    assert is_common(left=0.9e-6)
+    assert not is_common(left=1.1e-6)
+    assert is_common(left=50.0, top=-3.0 - 0.9e-6 * 50)
+    assert not is_common(left=50.0, top=-3.0 - 1.1e-6 * 50)

@@ -10,7 +10,30 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gpuvision.ranging.encoder import EncoderStatistics, not_advancing
+from gpuvision.ranging.encoder import EncoderStatistics, not_advancing, unwrapped_counts
+
+
+@pytest.mark.parametrize(
+    ("counts", "bits", "unwrapped"),
+    [
+        ([250, 255, 3, 9, 252], 8, [250, 255, 259, 265, 252]),
+        ([0, 127, 255, 128], 8, [0, 127, 255, 128]),
+        ([-128, 127, -127, 100], 8, [-128, -129, -127, -156]),
+        ([65530, 4, 65529], 16, [65530, 65540, 65529]),
+        ([0, 7, 14, 5], 4, [0, 7, 14, 21]),
+    ],
+)
+def test_a_counter_that_wraps_around_goes_on(counts: list[int], bits: int, unwrapped: list[int]) -> None:
+    np.testing.assert_array_equal(unwrapped_counts(counts, bits), unwrapped)
+
+
+@pytest.mark.parametrize(("counts", "place"), [([0, 255, 256], 2), ([-129, 5], 0), ([1, -128, 300, 400], 2)])
+def test_a_count_beyond_its_bits_is_named(counts: list[int], place: int) -> None:
+    message = f"^the encoder: count {counts[place]} of profile {place} does not fit 8 bits$"
+    with pytest.raises(ValueError, match=message):
+        unwrapped_counts(counts, 8)
+    with pytest.raises(ValueError, match=f"belt: count {counts[place]} of"):
+        unwrapped_counts(counts, 8, "belt")
 
 
 def longest_monotone(values: list[float]) -> int:
@@ -66,8 +89,12 @@ def test_rounding_to_counts_is_jitter() -> None:
 
 def test_few_positions_have_no_jitter() -> None:
     one, two = (EncoderStatistics.from_positions(np.arange(float(n))) for n in (1, 2))
-    assert np.isnan([one.step_mean, one.jitter, two.jitter]).all()
-    assert two.step_mean == two.step_largest == 1.0
+    nothing = [one.step_mean, one.step_std, one.step_smallest, one.step_largest, one.jitter, two.jitter]
+    assert np.isnan(nothing).all()
+    assert (one.profiles, two.profiles, one.not_advancing) == (1, 2, 0)
+    assert two.step_mean == two.step_smallest == two.step_largest == 1.0
+    assert two.step_std == 0.0
+    assert EncoderStatistics.from_positions(np.array([0.0, 1.0, 4.0])).jitter == pytest.approx(2.0 / np.sqrt(6.0))
 
 
 def test_steps_of_few_positions() -> None:

@@ -80,13 +80,15 @@ def test_bend_is_found_and_tested(rng: np.random.Generator) -> None:
 
 
 def test_reflections_are_rejected(rng: np.random.Generator) -> None:
-    """A tenth of the readings 5 to 40 px off, and one view with a third of them."""
+    """A tenth of the readings 1 to 40 px off, ten standard deviations and more, and one view with a third of them."""
     lines = lines_of(TRUTH, rng)
     clean = fit_sheet(camera_of(TRUTH), lines)
     wrong = 0
     for number, (points, _, _) in enumerate(lines):
         chosen = rng.random(len(points)) < (0.33 if number == 0 else 0.1)
-        points[chosen, 1] -= rng.uniform(5.0, 40.0, np.count_nonzero(chosen))
+        points[chosen, 1] -= rng.uniform(1.0, 40.0, np.count_nonzero(chosen)) ** rng.choice(
+            [0.2, 1.0], np.count_nonzero(chosen)
+        )
         wrong += np.count_nonzero(chosen)
     found = fit_sheet(camera_of(TRUTH), lines)
     assert found.bend is None

@@ -61,6 +61,20 @@ def test_each_material_lies_where_the_layers_put_it() -> None:
     )
 
 
+def test_the_map_covers_its_region() -> None:
+    """Node (0, 0) is at the least x and y of a region that is not square; columns run along x."""
+    artwork = board_of(copper=(box(0.5, 0.5, 1.5, 1.5),))
+    found = ReflectanceMap.of(artwork, pixel=PIXEL, region=((0.31e-3, -0.2e-3), (0.91e-3, 0.7e-3)))
+    assert found.origin == (0.31e-3, -0.2e-3)
+    assert (found.pixel, found.blur_px) == (PIXEL, 0.5)
+    assert found.cell == pytest.approx(PIXEL / 4)
+    np.testing.assert_allclose(found.values.shape, (1 + 0.9e-3 / found.cell, 1 + 0.6e-3 / found.cell), atol=1.1)
+    dark, light = found.values[0, 0], found.values[-1, -1]
+    rows, columns = np.nonzero(found.values > 0.5 * (int(dark) + int(light)))
+    assert rows.min() == pytest.approx(0.7e-3 / found.cell, abs=1.0)
+    assert columns.min() == pytest.approx(0.19e-3 / found.cell, abs=1.0)
+
+
 def test_without_a_mask_all_copper_is_bare() -> None:
     found = ReflectanceMap.of(board_of(copper=(box(0.5, 0.5, 1.5, 1.5),)), pixel=PIXEL, reflectance=MATERIALS)
     assert (value_at(found, 1.0, 1.0), value_at(found, 0.2, 0.2)) == pytest.approx((0.8, 0.2), abs=1e-4)

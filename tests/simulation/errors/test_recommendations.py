@@ -168,6 +168,16 @@ def test_what_one_does_not_see_the_other_does(device: Device) -> None:
         )
     pair = attribute_pair_errors(*found, SensorFusion(tolerance=1e-6), max_gap=1.0)
     assert [pair[name].failed_fraction(1e-6) for name in ("first", "second", "both")] == [0.4, 0.2, 0.0]
+    # The sensor that reads alone gives its causes; what the other one does not have is no part of them.
+    both = pair["both"]
+    for name, part in both.causes.items():
+        expected = [pair[each].causes[name][k] for k, each in enumerate(["second"] * 2 + [""] * 2 + ["first"]) if each]
+        np.testing.assert_array_equal(part[[0, 1, 4]], expected)
+    np.testing.assert_allclose(np.sum(list(both.causes.values()), axis=0), both.error, atol=1e-12)
+    np.testing.assert_array_equal(both.reading.strength[:2], pair["second"].reading.strength[:2])
+    np.testing.assert_array_equal(both.reading.strength[4], pair["first"].reading.strength[4])
+    for name, part in both.power.items():
+        np.testing.assert_allclose(part, pair["first"].power[name] + pair["second"].power[name], rtol=1e-12)
     blind = found[0].without_flagged(Status.LOW_SIGNAL)
     no_surface = GroundTruth(np.full(5, np.nan), np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL))
     with pytest.raises(ValueError, match="give the positions"):

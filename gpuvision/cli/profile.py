@@ -102,6 +102,14 @@ def profile(
         float | None,
         typer.Option(help="With --growth: largest memory of inputs and outputs [MiB]. Default: 256.", min=0.001),
     ] = None,
+    contract: Annotated[
+        bool,
+        typer.Option(
+            "--contract",
+            help="Compare the results of all devices with float64 and with each other, by the stated limits, instead "
+            "of measuring times.",
+        ),
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure operations against their peers: NumPy, Numba, OpenCV.
@@ -118,6 +126,11 @@ def profile(
     item, the shortest time, and the rates of the largest size. It also states two numbers of items: where a call takes
     twice the shortest time, and where inputs and outputs exceed the largest cache.
 
+    With --contract no times are measured. Each public operation runs on a corpus of seeded inputs on each device. The
+    table shows the largest difference from float64 and between devices, as a fraction of the limit that the operation
+    states. Integer results are equal. Samples whose decision lies within rounding of a threshold are counted as
+    undecided and not compared. The exit code is 1 if a limit is broken.
+
     With --offline nothing is measured: the kernels are compiled for GPUs by Clang and NVIDIA's ptxas. The table shows
     the registers, stack, spilled registers and local memory of each kernel. The exit code is 1 if a kernel does not
     compile, calls a function without a body, spills more registers than the limit, or takes more than 5 KiB of stack
@@ -127,20 +140,28 @@ def profile(
         from gpuvision.cli.profile_offline import profile_offline
 
         measures = {"device": device or None, "seconds": seconds, "minutes": minutes, "quick": quick, "plots": plots}
-        reject_unused("with --offline", **measures, html=html, growth=growth, memory_mib=memory_mib, **{"from": stored})
+        measures |= {"html": html, "growth": growth, "memory_mib": memory_mib, "contract": contract, "from": stored}
+        reject_unused("with --offline", **measures)
         profile_offline(offline, operations or (), as_json, one_build=one_build, overwrite=overwrite)
         return
     reject_unused("without --offline", one_build=one_build)
     pictures = _Pictures(plots, html, overwrite)
     if stored is not None:
         settings = {"device": device or None, "seconds": seconds, "minutes": minutes, "quick": quick, "json": as_json}
-        reject_unused("with --from", **settings, growth=growth, memory_mib=memory_mib)
+        reject_unused("with --from", **settings, growth=growth, memory_mib=memory_mib, contract=contract)
         if operations:
             raise ValueError("OPERATION has no effect with --from; leave it out")
         pictures.write_stored(stored)
         return
     if importlib.util.find_spec("numba") is None:
         raise GpuVisionError("the peer numba is missing; install it: pip install 'gpuvision[profile]'")
+    if contract:
+        from gpuvision.cli.profile_contract import profile_contract
+
+        measures = {"seconds": seconds, "minutes": minutes, "quick": quick, "plots": plots, "html": html}
+        reject_unused("with --contract", **measures, growth=growth, memory_mib=memory_mib)
+        profile_contract(operations or (), device or (), as_json, overwrite=overwrite)
+        return
     if growth:
         from gpuvision.cli.profile_growth import profile_growth
 

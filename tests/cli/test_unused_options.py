@@ -41,6 +41,10 @@ from gpuvision.cli.main import application
             for option, value in (("--rate", "9"), ("--json", "-"), ("--ply", "valid"))
         ),
         (("select", "g", "--region", "0,0,1cm,1cm", "--scale", "25um", "--out", "d", "--device", "pocl"), "--device"),
+        (("profile", "psd", "--contract", "--quick"), "--quick"),
+        (("profile", "psd", "--contract", "--growth"), "--growth"),
+        (("profile", "--offline", "sm_90", "--contract"), "--contract"),
+        (("profile", "--from", "points.npy", "--plots", "d", "--contract"), "--contract"),
         (("locate-robot", "points.npy", "--field", "robocup_msl", "--scale", "1cm"), "--scale"),
         (("locate-robot", "points.npy", "--field", "robocup_msl", "--camera", "c.toml"), "--camera"),
         (("locate-robot", "points.npy", "--field", "robocup_msl", "--line-width", "5cm"), "--line-width"),

@@ -9,11 +9,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from gpuvision.host import Device, RecordingError, StreamError
 from gpuvision.host.batch import Batch
 from gpuvision.host.pipeline import Pipeline, PipelineLimits
+from gpuvision.host.ring import SharedSlot, Slot, StagedSlot
 from gpuvision.host.sources import ArraySource, IteratedSource
 from gpuvision.ranging.psd import PsdReadout
 from streams import READOUT, Gated, currents_of, numbers, producer_ended
@@ -175,3 +177,49 @@ def test_the_device_is_free_after_the_stream(device: Device) -> None:
     gc.collect()
     assert memory() is None  # although the stream object still exists, for its report
     assert stream.report().frames == 3
+
+
+def test_an_error_while_the_consumer_waits_for_the_device_ends_the_loop(
+    memory: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = SharedSlot if memory["zero_copy"] else StagedSlot
+    wait = kind.wait
+
+    def failing(slot: Slot[Any]) -> None:
+        wait(slot)
+        if slot.number == 2:
+            raise cl.RuntimeError("clWaitForEvents failed: EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST")
+
+    monkeypatch.setattr(kind, "wait", failing)
+    stream = Pipeline(currents_of(9), READOUT, batch=2, **memory)
+    with stream:
+        assert next(stream).number == 0
+        with pytest.raises(StreamError, match=r"stopped at frame 2 \(operation\): ") as caught:
+            next(stream)
+        assert caught.value.__cause__ is not None
+        with pytest.raises(StopIteration):
+            next(stream)
+    assert stream.report().frames == 2
+
+
+def test_a_stream_that_ended_stays_at_its_end(device: Device) -> None:
+    with Pipeline(currents_of(3), READOUT, device=device, batch=2) as stream:
+        assert numbers(list(stream)) == [0, 2]
+        assert list(stream) == []
+        with pytest.raises(StopIteration):
+            next(stream)
+
+
+def test_a_source_is_closed_if_its_stream_cannot_start(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise MemoryError("no queue")
+
+    monkeypatch.setattr("gpuvision.host.pipeline.queues_of", refuse)
+    source = Gated(3)
+    stream = Pipeline(source, READOUT, device=device)
+    with pytest.raises(MemoryError, match="no queue"), stream:
+        pass
+    assert source.closed
+    with pytest.raises(StreamError, match="runs once"), stream:
+        pass
+    stream.close()  # nothing is left to close

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -145,3 +146,104 @@ def test_a_traced_sequence_gives_the_same_result(memory: dict[str, Any], tmp_pat
     with Trace(tmp_path / "trace.json"):
         result = Chain()(FRAME, device=memory["device"])
     check(result, FRAME)
+
+
+OTHER = np.arange(300, 400, dtype=np.int32)[::-1].copy()
+
+
+class Noted:
+    """Bound stage that notes how it is called."""
+
+    def __init__(self, bound: Any, notes: list[Any]) -> None:
+        self.bound, self.outputs, self.notes = bound, bound.outputs, notes
+
+    def __call__(self, *frames: Any, out: Any, wait_for: Any = None) -> Any:
+        self.notes.append((frames, out, wait_for, self.bound(*frames, out=out, wait_for=wait_for)))
+        return self.notes[-1][-1]
+
+
+@pytest.mark.parametrize("with_out", [False, True])
+@pytest.mark.parametrize("with_frame", [False, True])
+def test_arrays_of_the_caller(device: Device, with_frame: bool, with_out: bool) -> None:
+    """They take the place of the arrays of the sequence, which stay as they are."""
+    bound: Any = Chain().bind(device, FRAME.shape, FRAME.dtype)
+    bound.inputs[0].set(FRAME)
+    own = [each for each in bound.outputs if each is not None]
+    for each in own:
+        each.set(np.full_like(FRAME, -7))
+    given = device.empty(FRAME.shape, FRAME.dtype)
+    given.set(OTHER)
+    last, parity, first = (device.empty(FRAME.shape, FRAME.dtype) for _ in range(3))
+    out = Chained(last, None, parity, first) if with_out else None
+    notes: list[Any] = []
+    bound._bounds = tuple(Noted(each, notes) for each in bound._bounds)
+    if with_frame or with_out:
+        event = bound(*[given] * with_frame, out=out, wait_for=["gate"][:0])
+        event.wait()
+        (frames, results, gate, begun), (_, _, later, ended) = notes
+        assert (frames[0] is given, later, event is ended, bound.begun is begun) == (with_frame, None, True, True)
+        assert gate == []
+        assert (results.scaled is first, results.parity is parity) == (with_out, with_out)
+        written = Chained(*(None if each is None else each.get() for each in (out or bound.outputs)))
+        check(written, OTHER if with_frame else FRAME)
+        if with_out:
+            assert all(np.all(each.get() == -7) for each in own)
+    else:
+        bound._bounds = tuple(each.bound for each in bound._bounds)
+        check(Chained(*(None if each is None else each.get() for each in bound.run())), FRAME)
+
+
+def test_wrong_arrays_of_the_caller_are_refused(device: Device) -> None:
+    bound = Chain().bind(device, FRAME.shape, FRAME.dtype)
+    with pytest.raises(TypeError, match="Chain: expected 1 input arrays, got 2"):
+        bound(*bound.inputs, *bound.inputs)
+    last, _, parity, _ = bound.outputs
+    with pytest.raises(ValueError, match=r"out\.first is missing"):
+        bound(out=Chained(last, None, parity, None))
+    with pytest.raises(TypeError, match="a sequence has several launches; use enqueue_arguments of each of its stages"):
+        _ = bound.enqueue_arguments
+
+
+@dataclass(frozen=True)
+class Wrong(Chain):
+    """Sequence whose second stage takes arrays that do not fit or are not computed."""
+
+    takes: tuple[str, ...] = ()
+
+    def layout(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Layout:
+        found = super().layout(device, shape, dtype)
+        stages = [found.stages[0], found.stages[1], Stage("again", Scale(), self.takes)]
+        return Layout(found.inputs, stages, found.outputs)
+
+
+@pytest.mark.parametrize(
+    ("takes", "message"),
+    [
+        (("triple.parity",), "stage 'again' takes 'triple.parity', which no earlier stage computes"),
+        (("frame", "frame"), r"stage 'again' expects .*int32.*, is given .*int32.*int32"),
+    ],
+)
+def test_a_stage_that_takes_what_does_not_fit_is_refused(device: Device, takes: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Wrong(takes).specs(device, FRAME.shape, FRAME.dtype)
+
+
+def test_memory_of_all_stages_is_counted(device: Device) -> None:
+    """Four arrays of 100 integers: frame, two of the first stage, one of the second one."""
+    assert Chain().specs(device, FRAME.shape, FRAME.dtype).nbytes == 4 * 400
+
+
+def test_calls_of_a_traced_sequence_are_recorded(device: Device, tmp_path: Path) -> None:
+    with Trace(tmp_path / "trace.json"):
+        bound = Chain().bind(device, FRAME.shape, FRAME.dtype, queue=device.new_queue(profiling=True))
+        bound.run()
+        bound().wait()
+        bound.on_host([FRAME])
+    events = json.loads((tmp_path / "trace.json").read_text())["traceEvents"]
+    names = [each["name"] for each in events if each["ph"] == "X" and "Chain" in json.dumps(each)]
+    assert {name: names.count(name) for name in names} == {
+        "bind": 1,
+        "launch sequence": 3,
+        "launch and wait": 1,
+        "run": 1,
+    }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import json
 import math
 from pathlib import Path
@@ -16,8 +16,10 @@ pytest.importorskip("numba", reason="the extra 'profile' is not installed")
 
 from typer.testing import CliRunner
 
+from gpuvision.cli import curves as command
 from gpuvision.cli.main import application
-from gpuvision.profiling import curves
+from gpuvision.host.errors import GpuVisionError
+from gpuvision.profiling import curves, harness
 from gpuvision.profiling.curves import curve, plot
 
 NUMBERS = st.lists(st.tuples(*[st.integers(0, 4).map(float)] * 3), min_size=1, max_size=8)
@@ -148,3 +150,59 @@ def test_the_command_writes_points_and_pictures(device, tmp_path):
     assert {point["operation"] for point in report["points"]} == {"pose"}
     assert any(point["best"] for point in report["points"])
     assert (tmp_path / "plots" / "curve-pose.png").exists()
+
+
+def points_of(setting):
+    """Return two settings of psd on dim light and one on bright light."""
+    return [
+        curve.Point("psd", data, {"least": least}, "pocl", seconds, 1e-5, 1e-4, unit, 1.25e-6, 2.6e-6, 3e-6, lost, best)
+        for data, least, seconds, unit, lost, best in setting
+    ]
+
+
+SETTINGS = (
+    ("dim", 1, 1.5e-5, "m", 0.25, True),
+    ("dim", 2, 2.5e-5, "m", 0.0, False),
+    ("bright", 1, 3.5e-5, "px", 1, True),
+)
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_the_command_shows_or_prints_what_was_measured(written, tmp_path, monkeypatch):
+    calls = []
+
+    def measure(operations, devices, *, seconds, progress):
+        progress("measures")
+        calls.append((operations, devices, seconds))
+        return points_of(SETTINGS)
+
+    monkeypatch.setattr(curve, "measure_curves", measure)
+    monkeypatch.setattr(harness, "describe_machine", lambda devices: {"devices": devices})
+    monkeypatch.setattr(command, "devices_of", lambda labels: labels or ["all"])
+    plots = tmp_path / "plots"
+    chosen = ["psd", "--device", "pocl", "--json", "-"] if written else []
+    ran = CliRunner().invoke(application(), ["curves", *chosen, "--seconds", "0.5", "--plots", str(plots)])
+    assert ran.exit_code == 0, ran.output
+    assert calls == [(["psd"], ["pocl"], 0.5) if written else (curve.OPERATIONS, ["all"], 0.5)]
+    assert ran.stderr.splitlines() == ["measures", f"look at {plots / 'curve-psd.png'}"]
+    assert (plots / "curve-psd.png").exists()
+    if written:
+        points = [each.to_dict() for each in points_of(SETTINGS)]
+        assert json.loads(ran.stdout) == {"machine": {"devices": ["pocl"]}, "points": points}
+        return
+    lines = [line.strip() for line in ran.stdout.splitlines() if line.strip(" ─")]
+    heading = ["setting", "time", "[µs]", "rms", "p95", "lost", "best"]
+    assert lines[0] == "psd, dim, pocl"
+    assert [line.split() for line in lines[1:4]] == [
+        heading,
+        ["least", "1", "15", "1.25e-06", "m", "2.6e-06", "25.0%", "*"],
+        ["least", "2", "25", "1.25e-06", "m", "2.6e-06", "0.0%"],
+    ]
+    assert lines[4] == "psd, bright, pocl"
+    assert [line.split() for line in lines[5:]] == [heading, ["35", "1.25e-06", "px", "2.6e-06", "100.0%", "*"]]
+
+
+def test_a_missing_package_is_named(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(GpuVisionError, match="the package numba is missing; install it: pip install"):
+        CliRunner().invoke(application(), ["curves", "psd"], catch_exceptions=False)

@@ -14,8 +14,9 @@ pytest.importorskip("numba", reason="the extra 'profile' is not installed")
 
 from typer.testing import CliRunner
 
+from gpuvision.cli import profile_growth
 from gpuvision.cli.main import application
-from gpuvision.profiling import growth
+from gpuvision.profiling import growth, harness
 from gpuvision.profiling.growth_plot import draw_growth
 
 
@@ -154,3 +155,64 @@ def test_the_command_measures_and_writes(
 def test_what_does_not_fit_is_refused(args: list[str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         CliRunner().invoke(application(), ["profile", *args], catch_exceptions=False)
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Request of the command, and the curves that it gets: two points of psd, a failure, one unsteady probe."""
+    calls: dict[str, Any] = {}
+
+    def measure(operations: Any, devices: Any, *, memory: int, progress: Any) -> growth.Growth:
+        progress("measures")
+        calls.update(operations=operations, devices=devices, memory=memory)
+        return calls["growth"]
+
+    probes = [harness.Probe("psd", "pocl", 1.0, 1.0, True), harness.Probe("line", "pocl", 1.0, 0.5, False)]
+    failures = [harness.Failure("pose", "pocl", "no memory", "")]
+    calls["growth"] = growth.Growth(curve(1.0, 4.0), probes, {"pocl": 160}, {}, failures)
+    monkeypatch.setattr(growth, "measure_growth", measure)
+    monkeypatch.setattr(profile_growth, "devices_of", lambda labels: list(labels))
+    return calls
+
+
+def test_the_command_reports_curves_and_what_is_not_valid(measured: dict[str, Any], tmp_path: Any) -> None:
+    args = ["profile", "psd", "--growth", "--memory-mib", "0.75", "--device", "pocl", "--plots", str(tmp_path / "p")]
+    ran = CliRunner().invoke(application(), [*args, "--json", str(tmp_path / "g.json")], catch_exceptions=False)
+    found = measured["growth"]
+    assert (measured["operations"], measured["devices"], measured["memory"]) == (["psd"], ["pocl"], 3 * 2**18)
+    assert ran.exit_code == 1
+    assert ran.stdout == "\n".join([*found.lines(), ""])
+    assert ran.stderr.splitlines() == [
+        "measures",
+        f"look at {tmp_path / 'p' / 'sizes.png'}",
+        "not valid: the machine changed its speed during line on pocl",
+        "not measured: pose on pocl: no memory",
+    ]
+    assert (tmp_path / "p" / "sizes.png").stat().st_size > 0
+    assert (tmp_path / "g.json").read_text() == found.to_json()
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [({}, 1), ({"failures": []}, 1), ({"probes": []}, 1), ({"failures": [], "probes": []}, 0)],
+)
+def test_the_exit_code_says_whether_all_is_valid(measured: dict[str, Any], changes: dict[str, Any], code: int) -> None:
+    measured["growth"] = dataclasses.replace(measured["growth"], **changes)
+    ran = CliRunner().invoke(application(), ["profile", "psd", "--growth", "--json", "-"], catch_exceptions=False)
+    assert ran.exit_code == code
+    assert ran.stdout == measured["growth"].to_json()  # without other text
+    assert measured["growth"].lines()[0] in ran.stderr.splitlines()
+    assert ("not valid" in ran.stderr) == ("probes" not in changes)
+    assert ("not measured" in ran.stderr) == ("failures" not in changes)
+
+
+def test_nothing_measured_is_said(measured: dict[str, Any], tmp_path: Any) -> None:
+    measured["growth"] = growth.Growth([], [], {}, {})
+    args = ["profile", "psd", "--growth", "--memory-mib", "0.001", "--plots", str(tmp_path / "p")]
+    ran = CliRunner().invoke(application(), args, catch_exceptions=False)
+    assert ran.exit_code == 1
+    assert ran.stderr.splitlines() == [
+        "measures",
+        "nothing measured: no operation has a size within 0.001 MiB, or all failed",
+    ]
+    assert not (tmp_path / "p" / "sizes.png").exists()

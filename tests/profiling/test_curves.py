@@ -179,6 +179,7 @@ def test_the_command_shows_or_prints_what_was_measured(written, tmp_path, monkey
     monkeypatch.setattr(curve, "measure_curves", measure)
     monkeypatch.setattr(harness, "describe_machine", lambda devices: {"devices": devices})
     monkeypatch.setattr(command, "devices_of", lambda labels: labels or ["all"])
+    monkeypatch.setattr(plot, "write_png", lambda figure, path: path.touch())
     plots = tmp_path / "plots"
     chosen = ["psd", "--device", "pocl", "--json", "-"] if written else []
     ran = CliRunner().invoke(application(), ["curves", *chosen, "--seconds", "0.5", "--plots", str(plots)])

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from gpuvision.cli import profile_growth
 from gpuvision.cli.main import application
-from gpuvision.profiling import growth, harness
+from gpuvision.profiling import growth, growth_plot, harness
 from gpuvision.profiling.growth_plot import draw_growth
 
 
@@ -172,6 +172,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     calls["growth"] = growth.Growth(curve(1.0, 4.0), probes, {"pocl": 160}, {}, failures)
     monkeypatch.setattr(growth, "measure_growth", measure)
     monkeypatch.setattr(profile_growth, "devices_of", lambda labels: list(labels))
+    monkeypatch.setattr(growth_plot, "write_png", lambda figure, path: path.touch())
     return calls
 
 
@@ -188,7 +189,7 @@ def test_the_command_reports_curves_and_what_is_not_valid(measured: dict[str, An
         "not valid: the machine changed its speed during line on pocl",
         "not measured: pose on pocl: no memory",
     ]
-    assert (tmp_path / "p" / "sizes.png").stat().st_size > 0
+    assert (tmp_path / "p" / "sizes.png").exists()
     assert (tmp_path / "g.json").read_text() == found.to_json()
 
 

@@ -7,21 +7,21 @@ readout that truly meets the tolerance, among all that were tried (exhaustive se
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.accuracy.plan import PlanError
 from gpuvision.host import ArraySource, Device, PacedSource, Pipeline, plan_stream, to_numpy
+from gpuvision.profiling.plan_outcomes import Outcome, cost_of, run_jobs
 from gpuvision.ranging.line import LineReadout
 from gpuvision.reference.line import pixel_gaussian
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.planning_scan import plan_scan
-from gpuvision.workflows.scan_plan import PlanError, ReadoutTrial, ScanPlan, ScanPlanLimits, usable_trials
+from gpuvision.workflows.scan_plan import ScanPlan, ScanPlanLimits, usable_trials
 from gpuvision.workflows.scanning import measure_points, range_readout
 
 Float64 = npt.NDArray[np.float64]
@@ -55,34 +55,6 @@ class Job(NamedTuple):
     rate: float
 
 
-class Outcome(NamedTuple):
-    """Plan of a job, measured against truth.
-
-    Attributes
-    ----------
-    plan : ScanPlan or None
-        None where the planner refused.
-    tolerance, error : float
-        Asked and true root mean square error of the heights [m]; the latter NaN without a plan.
-    possible : bool
-        Whether a readout truly meets the tolerance.
-    cost : float
-        Time of the chosen readout over the time of the fastest one that truly meets the tolerance; NaN if none does.
-    rate : float or None
-        Asked rate [frames/s]; None without a plan of a stream.
-    lost : int
-        Frames that the stream lost at this rate.
-    """
-
-    plan: ScanPlan | None
-    tolerance: float
-    error: float
-    possible: bool
-    cost: float
-    rate: float | None = None
-    lost: int = 0
-
-
 def random_job(rng: np.random.Generator) -> Job:
     """Draw a line from 1 to 4 px wide, its light and noise, a tolerance and a rate."""
     sensor = Sensor.load("camera_line")
@@ -106,21 +78,23 @@ def random_job(rng: np.random.Generator) -> Job:
     return Job(sensor, frames, true, math.exp(rng.uniform(math.log(0.7), math.log(6.0))), rng.uniform(0.05, 0.6))
 
 
-def judge(job: Job, device: Device, limits: ScanPlanLimits = ScanPlanLimits()) -> Outcome:
-    """Plan a job and measure the plan against truth."""
+def judge(rng: np.random.Generator, device: Device, limits: ScanPlanLimits = ScanPlanLimits()) -> Outcome:
+    """Plan a random job and measure the plan against truth."""
+    job = random_job(rng)
     # A first plan that any readout meets gives the times and errors that the asked values are multiples of.
     free = plan_scan(job.frames, job.sensor, tolerance=1.0, device=device)
     usable = usable_trials(free.trials, limits)
     tolerance = job.tolerance * min(each.error for each in usable)
     rate = job.rate / free.trials[0].seconds
     errors = {each.readout: true_error(job, each.readout, device) for each in usable}
-    meeting = [each for each in usable if errors[each.readout] <= tolerance]
+    meeting = {readout for readout, error in errors.items() if error <= tolerance}
     try:
         plan = plan_scan(job.frames, job.sensor, tolerance=tolerance, rate=rate, device=device, limits=limits)
     except PlanError:
-        return Outcome(None, tolerance, math.nan, bool(meeting), math.nan)
+        return Outcome(None, tolerance, possible=bool(meeting))
     error = true_error(job, plan.chosen.readout, device)
-    return Outcome(plan, tolerance, error, bool(meeting), _cost(plan, meeting), rate, _lost(job, plan, rate))
+    cost = cost_of(plan, [each for each in plan.trials if each.readout in meeting])
+    return Outcome(plan, tolerance, error, bool(meeting), cost, not _lost(job, plan, rate))
 
 
 def true_error(job: Job, readout: LineReadout, device: Device) -> float:
@@ -142,13 +116,6 @@ def _true_heights(job: Job, device: Device) -> Float64:
     v = np.broadcast_to(axes.sample_origin + axes.sample_pitch * np.arange(_COLUMNS), u.shape)
     sheet = dataclasses.replace(readout.triangulation, precision="double")
     return np.asarray(to_numpy(sheet(u, np.ascontiguousarray(v), device=device).h), np.float64)
-
-
-def _cost(plan: ScanPlan, meeting: Sequence[ReadoutTrial]) -> float:
-    """Return the time of the chosen readout over the fastest one's, by the times of the plan."""
-    times = {each.readout: each.seconds for each in plan.trials}
-    best = min((times[each.readout] for each in meeting if each.readout in times), default=math.nan)
-    return plan.chosen.seconds / best
 
 
 def _lost(job: Job, plan: ScanPlan, rate: float) -> int:
@@ -173,42 +140,5 @@ def _lost(job: Job, plan: ScanPlan, rate: float) -> int:
     return stream.report().dropped
 
 
-def summary(outcomes: Sequence[Outcome]) -> str:
-    """Return the shares of plans that hold, in lines of text."""
-    made = [each for each in outcomes if each.plan is not None]
-    refused = [each for each in outcomes if each.plan is None]
-    costs = np.array([each.cost for each in made if math.isfinite(each.cost)])
-    cheap, largest = int(np.sum(costs <= 1.5)), costs.max(initial=0.0)
-    accurate = sum(each.error <= each.tolerance for each in made)
-    return "\n".join(
-        [
-            f"{len(outcomes)} jobs: {len(made)} plans, {len(refused)} refused",
-            f"error within the tolerance: {accurate} of {len(made)}",
-            f"no frame lost at the rate: {sum(not each.lost for each in made)} of {len(made)}",
-            f"cost at most 1.5 times the best: {cheap} of {len(costs)}, largest {largest:.2f}",
-            f"refused although a readout truly meets the tolerance: {sum(each.possible for each in refused)}",
-        ]
-    )
-
-
-def main() -> int:
-    """Run the command."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[2])
-    parser.add_argument("--jobs", type=int, default=200, help="number of random jobs")
-    parser.add_argument("--seed", type=int, default=1, help="of the jobs")
-    parser.add_argument("--device", help="label of a device; default: the best one")
-    given = parser.parse_args()
-    device = Device.best() if given.device is None else Device.named(given.device)
-    rng = np.random.default_rng(given.seed)
-    outcomes = []
-    for number in range(given.jobs):
-        outcomes.append(judge(random_job(rng), device))
-        last = outcomes[-1]
-        chosen = "refused" if last.plan is None else last.plan.chosen.name
-        print(f"{number}: {chosen}, {1e6 * last.error:.3g} of {1e6 * last.tolerance:.3g} um, cost {last.cost:.2f}")
-    print(summary(outcomes))
-    return 0
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_jobs(judge, (__doc__ or "").partition("\n\n")[2]))

@@ -193,6 +193,7 @@ FLOORS = (
     ("simulation.clustering",),
     ("simulation",),
     ("servoing",),
+    ("accuracy",),
     ("formats", "plots"),
     ("sensor",),
     ("workflows",),

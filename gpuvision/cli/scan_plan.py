@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpuvision.cli.arguments import echo, prints_report, progress_bar, quantities, write_report
+from gpuvision.cli.arguments import progress_bar, quantities
+from gpuvision.cli.plan_output import claim_plan, report_plan, show_refused
 
 if TYPE_CHECKING:
     from gpuvision.host import Device
@@ -37,19 +38,11 @@ def write_plan(
 ) -> None:
     """Plan a scan, print the plan, and write its picture and report."""
     from gpuvision.host import Device
-    from gpuvision.host.outputs import Outputs
-    from gpuvision.workflows.scan_plan import PLAN_FILE, PlanError, ScanPlanLimits, readout_table
 
     if tolerance is None:
         raise ValueError("--plan needs --tolerance, the largest error of the heights, such as 20um")
-    outputs = Outputs("plan", inputs=inputs, overwrite=overwrite)
-    outputs.claim_folder(out, (PLAN_FILE,))
-    outputs.claim(as_json)
-    try:
+    outputs = claim_plan(out, as_json, inputs, overwrite=overwrite)
+    with show_refused():
         plan = make_plan(recording, sensor, tolerance, rate, None if device is None else Device.named(device))
-    except PlanError as refusal:
-        echo(readout_table(refusal.trials, ScanPlanLimits()), err=True)
-        raise
     plan.write(out, overwrite=overwrite)
-    write_report(as_json, plan.to_dict(), outputs)
-    echo(f"{plan.table()}\n{plan}\nlook at {out / PLAN_FILE}", err=prints_report(as_json))
+    report_plan(plan, out, as_json, outputs)

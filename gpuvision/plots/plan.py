@@ -20,7 +20,7 @@ class PlannedSetting(NamedTuple):
     name : str
         Text beside the point.
     seconds : float
-        Time for a frame [s].
+        Time for a unit of work, such as a frame [s].
     error : float
         Predicted error [m].
     chosen : bool
@@ -34,7 +34,13 @@ class PlannedSetting(NamedTuple):
 
 
 def draw_plan(
-    path: str | os.PathLike[str], settings: Sequence[PlannedSetting], tolerance: float, *, title: str = ""
+    path: str | os.PathLike[str],
+    settings: Sequence[PlannedSetting],
+    tolerance: float,
+    *,
+    error_of: str = "the heights",
+    unit: str = "frame",
+    title: str = "",
 ) -> None:
     """Draw the error of each setting over its time, with the tolerance as a line, as PNG.
 
@@ -46,6 +52,10 @@ def draw_plan(
         Settings with an error.
     tolerance : float
         Largest error [m].
+    error_of : str
+        Result whose error is drawn, for the label of the axis. Default ``"the heights"``.
+    unit : str
+        Unit of work whose time is drawn, for the label of the axis. Default ``"frame"``.
     title : str
         Title of the picture.
     """
@@ -59,7 +69,7 @@ def draw_plan(
             *place, "o", color=colour, markersize=8 if each.chosen else 5, label="chosen" if each.chosen else None
         )
         axes.annotate(each.name, place, xytext=(6, 4), textcoords="offset points", fontsize=8, color=colour)
-    axes.set(xlabel="time per frame [us]", ylabel="predicted error of the heights [um]", xscale="log", yscale="log")
+    axes.set(xlabel=f"time per {unit} [us]", ylabel=f"predicted error of {error_of} [um]", xscale="log", yscale="log")
     axes.set_title(title, fontsize=10, loc="left")
     axes.grid(which="both", alpha=0.2)
     axes.legend(fontsize=8, frameon=False)

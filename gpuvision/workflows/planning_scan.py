@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import statistics
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.accuracy.plan import PlanError, fastest_within
+from gpuvision.accuracy.trial import at_least, median_times, micrometres
 from gpuvision.host import ArraySource, Device, Plan, StreamError, plan_stream, to_numpy
 from gpuvision.normal_distribution import MAD_TO_SIGMA
 from gpuvision.ranging.background import sample_frames
@@ -24,15 +24,7 @@ from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.validation import finite
 from gpuvision.workflows.opened_recording import open_for_scan
-from gpuvision.workflows.scan_plan import (
-    PlanError,
-    ReadoutTrial,
-    ScanPlan,
-    ScanPlanLimits,
-    at_least,
-    micrometres,
-    usable_trials,
-)
+from gpuvision.workflows.scan_plan import ReadoutTrial, ScanPlan, ScanPlanLimits, usable_trials
 from gpuvision.workflows.scanning import measure_points, range_readout
 
 Array = npt.NDArray[Any]
@@ -44,7 +36,6 @@ _HALF_WIDTHS = (1.2, 2.0)  # of the windows, over half the width of the line: no
 _UNKNOWN_LENGTH = 1 << 40  # frames of a recording that does not tell: its stream has no end
 _QUIET = 1.5  # times the least noise of a readout, up to which its scatter shows the texture. Chosen
 _EDGE = 8.0  # robust standard deviations of the second differences of heights. Chosen: noise stays below
-_ROUNDS = 7  # of the timing, of which the median counts. Chosen: pauses of a shared machine hit a few
 
 
 class _Sample(NamedTuple):
@@ -200,7 +191,7 @@ def _times(sensor: Sensor, readouts: Sequence[LineReadout], sample: _Sample, dev
     for readout in readouts:
         operation = range_readout(dataclasses.replace(sensor, readout=readout))
         calls.append(operation.bind(device, frames.shape, frames.dtype, inputs=(frames,)).run)
-    return [each / len(sample.frames) for each in _median_times(calls)]
+    return [each / len(sample.frames) for each in median_times(calls)]
 
 
 def _half_width(sensor: Sensor, sample: _Sample, device: Device) -> float:
@@ -302,17 +293,6 @@ def _rms(sigma: Array | None) -> float:
     return math.sqrt(float(np.mean(known**2))) if known.size else 0.0
 
 
-def _median_times(calls: Sequence[Callable[[], object]]) -> list[float]:
-    """Return the median time of each call [s]; the calls take turns."""
-    times: list[list[float]] = [[] for _ in calls]
-    for _ in range(_ROUNDS):
-        for taken, call in zip(times, calls, strict=True):
-            start = time.perf_counter()
-            call()
-            taken.append(time.perf_counter() - start)
-    return [statistics.median(each) for each in times]
-
-
 def _chosen(trials: Sequence[ReadoutTrial], tolerance: float, limits: ScanPlanLimits) -> ReadoutTrial:
     """Return the fastest usable readout that meets the tolerance.
 
@@ -323,18 +303,9 @@ def _chosen(trials: Sequence[ReadoutTrial], tolerance: float, limits: ScanPlanLi
     """
     usable = usable_trials(trials, limits)
     if not usable:
-        raise PlanError("no readout gives a point with a predicted error; look at `gpuvision scan --preview`", trials)
-    met = [each for each in usable if limits.margin * each.error <= tolerance]
-    if met:
-        return min(met, key=lambda each: each.seconds)
-    best = min(usable, key=lambda each: each.error)
-    raise PlanError(
-        f"no readout meets an error of {micrometres(tolerance)}; the most accurate, {best.name}, is predicted "
-        f"{micrometres(best.error)} (random {micrometres(best.random)}, phase {micrometres(best.phase)}, calibration "
-        f"{micrometres(best.systematic)}, unexplained {micrometres(best.unexplained)}): ask for "
-        f"{at_least(limits.margin * best.error)} or more",
-        trials,
-    )
+        message = "no readout gives a point with a predicted error; look at `gpuvision scan --preview`"
+        raise PlanError(message, trials, usable)
+    return fastest_within(trials, usable, tolerance, limits.margin, "readout")
 
 
 def _with_precision(
@@ -390,7 +361,8 @@ def _plan_stream(
         return planned(chosen)
     except StreamError as error:
         slow = error
-    quicker = [each for each in usable_trials(trials, limits) if each.seconds < chosen.seconds]
+    usable = usable_trials(trials, limits)
+    quicker = [each for each in usable if each.seconds < chosen.seconds]
     for each in sorted(quicker, key=lambda each: each.error):
         try:
             planned(each)
@@ -400,6 +372,7 @@ def _plan_stream(
             f"{chosen.name} meets the tolerance and is too slow: {slow}; at this rate {each.name} keeps up with a "
             f"predicted error of {micrometres(each.error)}: ask for {at_least(limits.margin * each.error)} or more",
             trials,
+            usable,
         ) from slow
     others = f", as all {len(quicker)} faster ones" if quicker else ", and no usable readout is faster"
-    raise PlanError(f"{chosen.name} meets the tolerance and is too slow{others}: {slow}", trials) from slow
+    raise PlanError(f"{chosen.name} meets the tolerance and is too slow{others}: {slow}", trials, usable) from slow

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
-from gpuvision.host import GpuVisionError, Plan
-from gpuvision.host.outputs import Outputs
-from gpuvision.plots.plan import PlannedSetting, draw_plan
+from gpuvision.accuracy.plan import AccuracyPlan
+from gpuvision.accuracy.trial import millionths
+from gpuvision.host import Plan
 from gpuvision.ranging.line import LineReadout
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.validation import finite
+from gpuvision.workflows.plan_files import write_plan
 
-_SMALL_GAIN = (
-    0.95  # a smaller gain in time or error is no reason to change a setting. Chosen: the scatter of the timing
-)
 _LEGEND = """errors of the heights in um; other: scatter that the noise does not explain
 - loses too many samples, or its window is narrower than the line"""
-PLAN_FILE = "plan.png"
-"""Name of the file that `ScanPlan.write` writes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,40 +80,43 @@ class ReadoutTrial(NamedTuple):
         size = {"fir": f" {readout.fir_length}", "windowed": f" {readout.window}", "ml": f" {readout.window}"}
         return f"{readout.method}{size.get(readout.method, '')}{' double' if readout.precision == 'double' else ''}"
 
+    @property
+    def error_parts(self) -> dict[str, float]:
+        """Parts of the error by name [m]."""
+        values = (self.random, self.phase, self.systematic, self.unexplained)
+        return dict(zip(("random", "phase", "calibration", "unexplained"), values, strict=True))
+
+    @property
+    def legend(self) -> str:
+        """Explanation of the columns."""
+        return _LEGEND
+
+    def cells(self) -> dict[str, str]:
+        """Return the texts of a row of a table by the headings of their columns; the name is the first."""
+        headings = ("us/frame", "error", "random", "phase", "calibr.", "other")
+        numbers = map(millionths, (self.seconds, self.error, *self.error_parts.values()))
+        return {"readout": self.name, **dict(zip(headings, numbers, strict=True)), "lost": f"{self.lost:.1%}"}
+
     def to_dict(self) -> dict[str, Any]:
         """Return the columns by name, for JSON."""
         numbers = {name: getattr(self, name) for name in self._fields if name != "readout"}
         return {"readout": self.name, **numbers}
 
 
-class PlanError(GpuVisionError):
-    """No readout meets tolerance and rate; the message gives the nearest feasible values.
-
-    Attributes
-    ----------
-    trials : tuple of ReadoutTrial
-        The readouts that were tried, fastest first.
-    """
-
-    def __init__(self, message: str, trials: Sequence[ReadoutTrial]) -> None:
-        super().__init__(message)
-        self.trials = tuple(trials)
-
-
 @dataclass(frozen=True, kw_only=True)
-class ScanPlan:
+class ScanPlan(AccuracyPlan[ReadoutTrial]):
     """Plan of a scan. ``scan(recording, plan.sensor, ...)`` carries it out; ``str(plan)`` states it in one line.
 
     Attributes
     ----------
-    sensor : Sensor
-        The sensor with the chosen readout, and with the estimated threshold if its file asks for one.
     chosen : ReadoutTrial
         Fastest readout that meets the tolerance.
     trials : tuple of ReadoutTrial
         All readouts that were tried, fastest first.
     tolerance : float
         Asked error of the heights [m].
+    sensor : Sensor
+        The sensor with the chosen readout, and with the estimated threshold if its file asks for one.
     rounding : float or None
         Root mean square difference between the heights of the chosen readout and of the same one in double precision,
         over the sample [m]; None on a device without doubles.
@@ -128,29 +126,26 @@ class ScanPlan:
         Limits of the plan.
     """
 
+    kind: ClassVar[str] = "readout"
+
     sensor: Sensor
-    chosen: ReadoutTrial
-    trials: tuple[ReadoutTrial, ...]
-    tolerance: float
     rounding: float | None
     stream: Plan | None
     limits: ScanPlanLimits
 
     @property
-    def faster(self) -> ReadoutTrial | None:
-        """Most accurate readout that is faster by 5 % or more: what a larger tolerance allows. None if none is."""
-        quicker = [each for each in self._usable() if each.seconds < _SMALL_GAIN * self.chosen.seconds]
-        return min(quicker, key=lambda each: each.error, default=None)
+    def margin(self) -> float:
+        """Least ratio of the tolerance to the predicted error."""
+        return self.limits.margin
 
     @property
-    def finer(self) -> ReadoutTrial | None:
-        """Fastest readout that is more accurate by 5 % or more: what a longer time allows. None if none is."""
-        finer = [each for each in self._usable() if each.error < _SMALL_GAIN * self.chosen.error]
-        return min(finer, key=lambda each: each.seconds, default=None)
+    def usable(self) -> list[ReadoutTrial]:
+        """Readouts that may be chosen."""
+        return usable_trials(self.trials, self.limits)
 
-    def table(self) -> str:
-        """Return the tried readouts as a table, fastest first; a star marks the chosen one."""
-        return readout_table(self.trials, self.limits, self.chosen)
+    def is_chosen(self, trial: ReadoutTrial) -> bool:
+        """Return whether a readout is the chosen one, which may have another precision."""
+        return trial.readout == replace(self.chosen.readout, precision=trial.readout.precision)
 
     def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
         """Write ``plan.png``, the predicted errors over the times, into a folder, which is created if it is missing.
@@ -169,47 +164,20 @@ class ScanPlan:
         OSError
             The folder cannot be written.
         """
-        settings = [
-            PlannedSetting(each.name, each.seconds, each.error, _same(each, self.chosen)) for each in self._usable()
-        ]
-        with Outputs("plan", overwrite=overwrite).folder(folder) as inside:
-            draw_plan(inside / PLAN_FILE, settings, self.tolerance, title=self.sensor.name or "Plan")
+        write_plan(self, folder, error_of="the heights", title=self.sensor.name or "Plan", overwrite=overwrite)
 
-    def _usable(self) -> list[ReadoutTrial]:
-        return usable_trials(self.trials, self.limits)
-
-    def __str__(self) -> str:
-        parts = [
-            f"{self.chosen.name}: predicted error {micrometres(self.chosen.error)} of {micrometres(self.tolerance)}, "
-            f"{_millionths(self.chosen.seconds)} us per frame"
-        ]
-        if self.faster is None:
-            parts.append("no usable readout is faster")
-        else:
-            wanted = at_least(self.limits.margin * self.faster.error)
-            parts.append(f"a tolerance of {wanted} would allow {self._relative('faster')}")
-        if self.finer is not None:
-            parts.append(f"{at_least(self.limits.margin * self.finer.error)} takes {self._relative('finer')}")
+    def sentences(self) -> list[str]:
+        """Return error and time of the chosen readout, other tolerances, rounding, and the stream."""
+        parts = super().sentences()
         if self.rounding is None:
             parts.append("rounding is not checked, because the device has no doubles")
-        if self.stream is not None:
-            parts.append(str(self.stream))
-        return "; ".join(parts)
-
-    def _relative(self, name: str) -> str:
-        other: ReadoutTrial = getattr(self, name)
-        return f"{other.name} at {other.seconds / self.chosen.seconds:.2g} times the time"
+        return parts if self.stream is None else [*parts, str(self.stream)]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as dictionaries, lists and numbers for JSON."""
-        return {
-            "chosen": self.chosen.to_dict(),
-            "tolerance": self.tolerance,
+        return super().to_dict() | {
             "rounding": self.rounding,
-            "faster": None if self.faster is None else self.faster.to_dict(),
-            "finer": None if self.finer is None else self.finer.to_dict(),
             "stream": None if self.stream is None else self.stream.to_dict(),
-            "trials": [each.to_dict() for each in self.trials],
             "limits": asdict(self.limits),
         }
 
@@ -219,37 +187,3 @@ def usable_trials(trials: Sequence[ReadoutTrial], limits: ScanPlanLimits) -> lis
     known = [each for each in trials if each.error > 0.0]
     fewest = min((each.lost for each in known), default=0.0)
     return [each for each in known if each.lost <= fewest + limits.max_lost]
-
-
-def readout_table(trials: Sequence[ReadoutTrial], limits: ScanPlanLimits, chosen: ReadoutTrial | None = None) -> str:
-    """Return readouts with their times and errors as a table; a star marks the chosen one."""
-    lines = [
-        f"  {'readout':<16}{'us/frame':>9}{'error':>9}{'random':>9}{'phase':>9}{'calibr.':>9}{'other':>9}{'lost':>8}"
-    ]
-    usable = usable_trials(trials, limits)
-    for each in trials:
-        numbers = (each.seconds, each.error, each.random, each.phase, each.systematic, each.unexplained)
-        mark = "*" if chosen is not None and _same(each, chosen) else " " if each in usable else "-"
-        lines.append(f"{mark} {each.name:<16}{''.join(f'{_millionths(one):>9}' for one in numbers)}{each.lost:8.1%}")
-    return "\n".join([*lines, _LEGEND])
-
-
-def at_least(length: float) -> str:
-    """Return a length [m] in micrometres, rounded up: a tolerance that the length meets."""
-    step = 10.0 ** (math.floor(math.log10(1e6 * length)) - 2)
-    return f"{math.ceil(1e6 * length / step * (1.0 - 1e-12)) * step:.6g} um"
-
-
-def micrometres(length: float) -> str:
-    """Return a length [m] in micrometres, with three digits or in full."""
-    return f"{_millionths(length)} um"
-
-
-def _millionths(value: float) -> str:
-    scaled = 1e6 * value
-    return f"{scaled:.0f}" if scaled >= 1000.0 else f"{scaled:.3g}"
-
-
-def _same(trial: ReadoutTrial, chosen: ReadoutTrial) -> bool:
-    """Return whether a readout is the chosen one, which may have another precision."""
-    return trial.readout == replace(chosen.readout, precision=trial.readout.precision)

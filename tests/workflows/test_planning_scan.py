@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gpuvision.accuracy.plan import PlanError
+from gpuvision.accuracy.trial import at_least
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.planning import PlanLimits, plan_stream
 from gpuvision.host.sources import ArraySource
@@ -18,7 +20,7 @@ from gpuvision.reference.line import pixel_gaussian
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows import planning_scan
 from gpuvision.workflows.planning_scan import plan_scan
-from gpuvision.workflows.scan_plan import PlanError, ReadoutTrial, ScanPlan, ScanPlanLimits, at_least, usable_trials
+from gpuvision.workflows.scan_plan import ReadoutTrial, ScanPlan, ScanPlanLimits, usable_trials
 from gpuvision.workflows.scanning import scan
 
 READ_NOISE, GAIN = 1.5, 0.1
@@ -39,7 +41,7 @@ def few_readouts(monkeypatch: pytest.MonkeyPatch) -> None:
         lambda sensor, *_: [dataclasses.replace(sensor.readout, **change) for change in FEW],
     )
     # A busy machine must not change their order.
-    monkeypatch.setattr(planning_scan, "_median_times", lambda calls: [1e-4, 2e-4, 9e-4][: len(calls)])
+    monkeypatch.setattr(planning_scan, "median_times", lambda calls: [1e-4, 2e-4, 9e-4][: len(calls)])
 
 
 def noisy_camera(**changes: Any) -> Sensor:
@@ -226,7 +228,7 @@ def test_a_window_narrower_than_the_line_is_not_chosen(
         "_readouts",
         lambda sensor, _: [dataclasses.replace(sensor.readout, window=window) for window in (3, 6)],
     )
-    monkeypatch.setattr(planning_scan, "_median_times", lambda calls: [1e-4, 2e-4][: len(calls)])
+    monkeypatch.setattr(planning_scan, "median_times", lambda calls: [1e-4, 2e-4][: len(calls)])
     plan = plan_scan(recording(rng, 3), noisy_camera(), tolerance=1.0, device=device)
     assert plan.chosen.readout.window == 6
     assert [each.readout.window for each in plan.trials] == [3, 6]

@@ -1,0 +1,1 @@
+"""Plans of jobs: the fastest of the settings that meet a tolerance."""

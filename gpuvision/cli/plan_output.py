@@ -1,0 +1,63 @@
+"""Output of ``--plan``: the table of the settings that were tried, the picture of the plan, and its report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gpuvision.cli.arguments import echo, prints_report, write_report
+
+if TYPE_CHECKING:
+    from gpuvision.accuracy.plan import AccuracyPlan
+    from gpuvision.host.outputs import Outputs
+
+
+def claim_plan(
+    out: Path | None, as_json: Path | None, inputs: Sequence[str | Path], *, overwrite: bool, more: Sequence[str] = ()
+) -> Outputs:
+    """Check that the files of a plan may be written, before it is made.
+
+    Parameters
+    ----------
+    out : Path or None
+        Folder of the picture; None: no picture.
+    as_json : Path or None
+        File of the report.
+    inputs : sequence of str or Path
+        Files that are read.
+    overwrite : bool
+        Whether a file may be replaced that no earlier plan wrote.
+    more : sequence of str
+        Names of other files in the folder. Default: none.
+    """
+    from gpuvision.host.outputs import Outputs
+    from gpuvision.workflows.plan_files import PLAN_FILE
+
+    outputs = Outputs("plan", inputs=inputs, overwrite=overwrite)
+    if out is not None:
+        outputs.claim_folder(out, (PLAN_FILE, *more))
+    outputs.claim(as_json)
+    return outputs
+
+
+@contextmanager
+def show_refused() -> Iterator[None]:
+    """Print the settings that were tried if a plan is refused."""
+    from gpuvision.accuracy.plan import PlanError
+
+    try:
+        yield
+    except PlanError as refusal:
+        echo(refusal.table(), err=True)
+        raise
+
+
+def report_plan(plan: AccuracyPlan[Any], out: Path | None, as_json: Path | None, outputs: Outputs) -> None:
+    """Print a plan, whose picture is in the folder `out`, and write its report."""
+    from gpuvision.workflows.plan_files import PLAN_FILE
+
+    write_report(as_json, plan.to_dict(), outputs)
+    shown = () if out is None else (f"look at {out / PLAN_FILE}",)
+    echo("\n".join([plan.table(), str(plan), *shown]), err=prints_report(as_json))

@@ -1,0 +1,89 @@
+"""Plans of random jobs against truth: the outcome of a job, and the shares of plans that hold."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpuvision.accuracy.plan import AccuracyPlan
+from gpuvision.host import Device
+
+
+class Outcome(NamedTuple):
+    """Plan of a job, measured against truth.
+
+    Attributes
+    ----------
+    plan : AccuracyPlan or None
+        None where the planner refused.
+    tolerance, error : float
+        Asked and true root mean square error [m]; the latter NaN without a plan.
+    possible : bool
+        Whether a setting truly meets the tolerance.
+    cost : float
+        Time of the chosen setting over the time of the fastest one that truly meets the tolerance; NaN if none does.
+    keeps_up : bool
+        Whether the chosen setting kept up with the asked rate.
+    """
+
+    plan: AccuracyPlan[Any] | None
+    tolerance: float
+    error: float = math.nan
+    possible: bool = False
+    cost: float = math.nan
+    keeps_up: bool = True
+
+
+def cost_of(plan: AccuracyPlan[Any], meeting: Sequence[Any]) -> float:
+    """Return the time of the chosen setting over the fastest one's of some trials of the plan; NaN without one."""
+    return float(plan.chosen.seconds / min((each.seconds for each in meeting), default=math.nan))
+
+
+def summary(outcomes: Sequence[Outcome]) -> str:
+    """Return the shares of plans that hold, in lines of text."""
+    made = [each for each in outcomes if each.plan is not None]
+    refused = [each for each in outcomes if each.plan is None]
+    costs = np.array([each.cost for each in made if math.isfinite(each.cost)])
+    cheap, largest = int(np.sum(costs <= 1.5)), costs.max(initial=0.0)
+    ratios = np.array([each.error / each.tolerance for each in made])
+    return "\n".join(
+        [
+            f"{len(outcomes)} jobs: {len(made)} plans, {len(refused)} refused",
+            f"error within the tolerance: {int(np.sum(ratios <= 1.0))} of {len(made)}, largest "
+            f"{ratios.max(initial=0.0):.2f} tolerances",
+            f"kept up with the rate: {sum(each.keeps_up for each in made)} of {len(made)}",
+            f"cost at most 1.5 times the best: {cheap} of {len(costs)}, largest {largest:.2f}",
+            f"refused although a setting truly meets the tolerance: {sum(each.possible for each in refused)}",
+        ]
+    )
+
+
+def run_jobs(judge: Callable[[np.random.Generator, Device], Outcome], description: str) -> int:
+    """Run the command of a script: plan random jobs, print each and the summary.
+
+    Parameters
+    ----------
+    judge : callable
+        Draws a job and measures its plan against truth.
+    description : str
+        Help text of the command.
+    """
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--jobs", type=int, default=200, help="number of random jobs")
+    parser.add_argument("--seed", type=int, default=1, help="of the jobs")
+    parser.add_argument("--device", help="label of a device; default: the best one")
+    given = parser.parse_args()
+    device = Device.best() if given.device is None else Device.named(given.device)
+    outcomes = []
+    for number in range(given.jobs):
+        outcomes.append(judge(np.random.default_rng((given.seed, number)), device))
+        last = outcomes[-1]
+        chosen = "refused" if last.plan is None else last.plan.chosen.name
+        times = f"cost {last.cost:.2f}, {'kept up' if last.keeps_up else 'too slow'}"
+        print(f"{number}: {chosen}, {1e6 * last.error:.3g} of {1e6 * last.tolerance:.3g} um, {times}", flush=True)
+    print(summary(outcomes))
+    return 0

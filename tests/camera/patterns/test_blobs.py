@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import ndtri
 
-from gpuvision.camera.patterns.blobs import BlobLimits, estimate_scale, find_blobs, find_pattern_blobs, is_typical_area
+from gpuvision.camera.patterns.blobs import (
+    BlobLimits,
+    _noise,
+    estimate_scale,
+    find_blobs,
+    find_pattern_blobs,
+    is_typical_area,
+)
 
 LIMITS = BlobLimits(min_contrast=0.0)
 WINDOW = 12.0
@@ -68,6 +76,15 @@ def test_typical_areas() -> None:
     area = np.array([4.0, 4.001, 10.0, 10.0, 10.0, 24.999, 25.0])
     assert is_typical_area(area, BlobLimits()).tolist() == [False, True, True, True, True, True, False]
     assert is_typical_area(np.array([]), BlobLimits()).shape == (0,)
+
+
+def test_noise_is_the_lower_quartile_of_second_differences(rng: np.random.Generator) -> None:
+    """Of normal numbers it is 0.3186 sigma times the root of 6, of 1 - 2 + 1; along rows only."""
+    image = rng.normal(0.0, 3.0, (7, 40)).astype(np.float32)
+    steps = [abs(row[k - 1] - 2.0 * row[k] + row[k + 1]) for row in image.astype(float) for k in range(1, 39)]
+    assert ndtri(0.625) == pytest.approx(0.3186, abs=1e-4)
+    assert _noise(image) == pytest.approx(np.quantile(steps, 0.25) / ndtri(0.625) / np.sqrt(6.0), rel=1e-3)
+    assert _noise(image[:, :2]) == 0.0
 
 
 def test_contrast_needed() -> None:

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from gpuvision.camera.patterns.grid_polynomial import agrees_with_grid
-from gpuvision.camera.patterns.lattice import index_grid, index_patches
+from gpuvision.camera.patterns.lattice import (
+    LatticePatch,
+    _without_overlap,
+    estimate_local_steps,
+    index_grid,
+    index_patches,
+)
 from target_images import view
 
 
@@ -72,6 +79,49 @@ def test_every_point_has_its_place(
     grid[grid >= len(names)] = -1
     assert np.count_nonzero(grid >= 0) > 0.9 * len(names)
     assert _consistent(grid, names)
+
+
+@pytest.mark.parametrize(
+    ("neighbours", "steps"),
+    [
+        # Half the difference of two opposite steps, 0.82 and 1 long, from the shorter one; their sum is 0.18 long.
+        ([(-0.82, 0.0), (1.0, 0.0), (0.0, 2.0), (0.0, -2.02)], [(-0.91, 0.0), (0.0, 2.01)]),
+        # The sum of the shorter pair, 0.22, is more than a quarter of 0.78, less than a quarter of 1.
+        ([(-0.78, 0.0), (1.0, 0.0), (0.0, 2.0), (0.0, -2.02)], [(0.89, 0.0), (0.0, 2.01)]),
+        # Of 0.26 it is too much for both.
+        ([(-0.74, 0.0), (1.0, 0.0), (0.0, 2.0), (0.0, -2.02)], None),
+        # Two directions span the lattice if the sine of their angle is above 0.4.
+        ([(1.0, 0.0), (-1.01, 0.0), (1.82, 0.82), (-1.83, -0.82)], [(1.005, 0.0), (1.825, 0.82)]),
+        ([(1.0, 0.0), (-1.01, 0.0), (1.84, 0.79), (-1.85, -0.79)], None),
+    ],
+)
+def test_steps_at_a_point(neighbours: list[tuple[float, float]], steps: list[tuple[float, float]] | None) -> None:
+    points = np.add([(0.0, 0.0), *neighbours], (7.0, -3.0))
+    found = estimate_local_steps(points, cKDTree(points))[0]
+    np.testing.assert_allclose(found, np.full((2, 2), np.nan) if steps is None else steps, atol=1e-12)
+
+
+def test_steps_lead_to_neighbours_of_the_opposite_orientation() -> None:
+    """The nearest neighbours have the same orientation, and the scalar product -0.5 is not enough."""
+    points = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (2, 2), (-2, -2), (2, -2.5), (-2, 2.5)], float)
+    opposite = np.array([[1.0, 0.0]] * 5 + [[-1.0, 0.0]] * 4)
+    found = estimate_local_steps(points, cKDTree(points), opposite)[0]
+    np.testing.assert_allclose(np.abs(found), [[2.0, 2.0], [2.0, 2.5]])
+    for product, is_found in ((-0.51, True), (-0.49, False)):
+        opposite[5:] = product, np.sqrt(1.0 - product**2)
+        assert np.isfinite(estimate_local_steps(points, cKDTree(points), opposite)[0]).all() == is_found
+
+
+def test_smaller_patches_lose_the_points_of_larger_ones() -> None:
+    nodes = np.stack([np.arange(9), 2 * np.arange(9)], axis=1)
+    large = LatticePatch(np.arange(9), nodes)
+    overlapping = LatticePatch(np.arange(5, 13), nodes[:8])
+    few = LatticePatch(np.arange(10, 15), nodes[:5])
+    found = _without_overlap([few, overlapping, large], 4)
+    assert [each.members.tolist() for each in found] == [list(range(9)), [9, 10, 11, 12]]
+    assert found[1].nodes.tolist() == nodes[4:8].tolist()
+    assert [len(each.members) for each in _without_overlap([few, overlapping, large], 2)] == [9, 4, 2]
+    assert [len(each.members) for each in _without_overlap([few, overlapping, large], 5)] == [9, 5]
 
 
 @pytest.mark.parametrize("turn", [-170, -80, -44, 0, 44, 100])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import ndtri
 
 from gpuvision.camera.patterns.grid_polynomial import GridPolynomial, agrees_with_grid
 from gpuvision.camera.patterns.pattern import estimate_localisation_noise, finder_image, nan_median, trim_empty_border
@@ -53,6 +54,29 @@ def test_noise_is_found_whatever_the_lens(
     points += rng.normal(0.0, 0.1, points.shape)
     points[rng.random((rows, columns)) < 0.05] = np.nan
     assert estimate_localisation_noise(points) == pytest.approx(0.1, rel=within)
+
+
+def test_noise_is_the_least_of_the_differences_of_the_third_to_the_sixth_order(rng: np.random.Generator) -> None:
+    """Sums with binomial coefficients along rows and columns, by loops; an order needs twelve of them."""
+    points = rng.normal(0.0, 0.1, (4, 6, 2)) + np.stack(np.meshgrid(np.arange(6.0), np.arange(4.0)), axis=-1) ** 3.5
+    points[1, 2, 0] = np.nan
+    estimates = []
+    for order in range(3, 7):
+        terms = [(-1) ** k * math.comb(order, k) for k in range(order + 1)]
+        sums = [
+            sum(term * line[start + k] for k, term in enumerate(terms))
+            for axis in (0, 1)
+            for line in np.moveaxis(points, axis, 0).reshape(points.shape[axis], -1).T
+            for start in range(len(line) - order)
+        ]
+        known = np.abs([each for each in sums if np.isfinite(each)])
+        if len(known) >= 12:
+            estimates.append(np.median(known) / ndtri(0.75) / math.sqrt(math.comb(2 * order, order)))
+    assert len(estimates) == 2
+    assert estimate_localisation_noise(points) == pytest.approx(min(estimates), rel=1e-9)
+    line = rng.normal(size=(1, 9, 2))
+    assert math.isfinite(estimate_localisation_noise(line))
+    assert math.isnan(estimate_localisation_noise(line[:, :8]))
 
 
 def test_noise_of_too_few_points_is_not_a_number() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-LIST = "build/order.txt"  # node identifiers, one a line
+LIST = "build/order.txt"  # node identifiers or test files, one a line
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)  # after the tier's selection, which depends on the order
@@ -15,4 +15,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> Iterator[None]:
     """Sort the tests."""
     yield
     place = {name: number for number, name in enumerate(Path(LIST).read_text().splitlines())}
-    items.sort(key=lambda item: place.get(item.nodeid, len(place)))
+
+    def place_of(item: pytest.Item) -> int:
+        return place.get(item.nodeid, place.get(item.nodeid.partition("::")[0], len(place)))
+
+    items.sort(key=place_of)

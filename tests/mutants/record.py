@@ -57,19 +57,21 @@ def tests_of(fault: Fault, budget: float) -> list[str]:
 
     Python files have tests that read the source, too. They take a few seconds and come before the test files.
     The recorded tests run the lines of the fault and take up to `budget` seconds together. Lines that run only at
-    import have no recorded tests; for them, take all tests that run any line of the file. For a kernel, take the test
-    file of its name, the files that include it, and the tests of the operations that launch it; for a header of many
-    kernels, at most `_MAX_FILES` files, the first file of each operation before the second ones.
+    import have no recorded tests; for them, take all tests that run any line of the file. For a kernel, take the files
+    that include it, which compile only its functions, before the recorded tests; then the test file of its name, and
+    the tests of the operations that launch it; for a header of many kernels, at most `_MAX_FILES` files, the first file
+    of each operation before the second ones.
     """
     path = ROOT / fault.file
     is_code = path.suffix == ".py"
     places = [(path, fault.lines(path.read_text()))] if is_code else list(_launches(fault.file))
     own = [] if is_code else [str(file.relative_to(ROOT)) for file in _tests() if file.name == f"test_{path.stem}.py"]
     # Tests that compile a program of their own with the kernel file.
-    own += [str(file.relative_to(ROOT)) for file, text in _tests().items() if f'"{_in_folder(fault.file)}"' in text]
+    include = f'#include "{_in_folder(fault.file)}"'
+    direct = [str(file.relative_to(ROOT)) for file, text in _tests().items() if include in text]
     by_operation = itertools.zip_longest(*dict.fromkeys(_test_files(file) for file, _ in places))
     others = [file for files in by_operation for file in files if file is not None]
-    files = list(dict.fromkeys([*own, *others]))[:_MAX_FILES]
+    files = list(dict.fromkeys([*own, *direct, *others]))[:_MAX_FILES]
     chosen: list[str] = []
     if budget:
         names = {name for file, lines in places for name in _contexts(file, lines)}
@@ -79,7 +81,7 @@ def tests_of(fault: Fault, budget: float) -> list[str]:
             total += times[_key(name)]
             if total <= budget:
                 chosen.append(name)
-    return [*chosen, *(_TESTS_OF_TEXTS if is_code else ()), *files]
+    return list(dict.fromkeys([*direct, *chosen, *(_TESTS_OF_TEXTS if is_code else ()), *files]))
 
 
 @cache

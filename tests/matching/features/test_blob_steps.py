@@ -27,8 +27,11 @@ SPOKES, PADDED, REACH, OVERLAP = 24, 32, 3.0, 14.0
 RATIO = {"ring": 0.6, "square": 0.6, "cross": 0.35}
 SHAPES = pytest.mark.parametrize("shape", ["ring", "square", "cross"])
 SOURCE = """
+#include "blob/blob_edges.h"
 #include "blob/blob_fit.h"
 #include "blob/blob_grey.h"
+#include "blob/blob_match.h"
+#include "blob/blob_model.h"
 #include "blob/blob_start.h"
 #define PUT(value) out[to++] = (value)
 #define PUT_SHAPE(of) PUT((of).x), PUT((of).y), PUT((of).size), PUT((of).angle)

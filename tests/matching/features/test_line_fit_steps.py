@@ -56,6 +56,7 @@ kernel void ranks(global const real *given, const int count, global real *made) 
 """
 LINES = """
 #include "line_fit/line_fit.h"
+#include "common/least_squares.h"
 #define PUT(value) out[to++] = (value)
 #define PUT_LINE(of) PUT((of).x), PUT((of).y), PUT((of).c), PUT((of).s)
 

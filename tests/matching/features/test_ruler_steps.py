@@ -21,6 +21,7 @@ from gpuvision.reference import ruler as reference
 
 SOURCE = """
 #include "ruler/ruler.h"
+#include "ruler/ruler_refine.h"
 #define PUT(value) out[to++] = (value)
 
 kernel void ruler_steps(global const real *given, constant real *table, global real *made) {

@@ -245,6 +245,12 @@ def test_cone_of_the_lines_that_a_block_may_show(device: Device, rng: np.random.
         rows.append(block_row(middle, radius, axis, half, False))
         given.append([*(apex + start), *(apex + end), *(middle + way)])
         depths.append(deepest(start, end, on, whole))
+    # Wide cones leave no line out, in any direction: of the normals, of both together, and of a lens in the ball.
+    for radius, half, far in ((0.1, 0.8, 1.0), (0.5, 0.6, 0.8), (0.5, 0.1, 0.4)):
+        for start in (unit(rng), -unit(rng)):
+            rows.append(block_row(np.zeros(3), radius, np.array([0.0, 0.0, 1.0]), half, False))
+            given.append([*(3.0 * start), *(-start), 0.0, 0.0, far])
+            depths.append(np.inf)
     blocks, inputs, depth = (np.array(each, np.float32) for each in (rows, given, depths))
     made = run(
         device, program_of(device, tmp_path).cones, len(rows), inputs, blocks, np.zeros((len(rows), 2), np.int32)

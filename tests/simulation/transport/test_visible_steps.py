@@ -19,6 +19,7 @@ Reals = NDArray[np.float64]
 # Faults that test too many boxes, or merge intervals late, change only the time of the whole search.
 SOURCE = """
 #include "occluded_irradiance/segment_view.h"
+#include "occluded_irradiance/visible.h"
 #define PUT(value) out[to++] = (value)
 
 kernel void intervals(global const real *given, const int each, global const real *windows, global real *made) {

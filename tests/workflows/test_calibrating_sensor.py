@@ -339,6 +339,56 @@ def test_settings_are_checked_before_the_images_are_read(
 
 
 @pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"pattern": "lines", "step": 1e-3}, "pattern 'lines' gives no poses of the target; use 'dots' or"),
+        ({}, "give either transport views, which measure the step, or the step"),
+        ({"transport": True, "step": 1e-3}, "give either transport views, which measure the step, or the step"),
+        ({"step": 0.0}, "step is 0.0, expected metres per profile, not 0"),
+        ({"step": math.inf}, "step is inf, expected metres per profile, not 0"),
+        ({"step": 1e-3, "block": (0.0, 1e-3)}, "a block needs transport views"),
+        ({"step": 1e-3, "camera": "c.toml", "model": "k1"}, "a camera file replaces the calibration of the camera"),
+        ({"step": 1e-3, "camera": "c.toml", "focal_length": 900.0}, "a camera file replaces the calibration"),
+        ({"step": 1e-3, "camera": "c.toml", "loss": "tukey"}, "a camera file replaces the calibration"),
+        ({"transport": True, "points": "p.csv", "block": (0.0, 1e-3)}, "known points replace laser images and the"),
+        ({"step": 1e-3, "points": "p.csv", "laser": True}, "known points replace laser images and the block"),
+    ],
+)
+def test_settings_that_miss_each_other_are_refused(settings: dict[str, Any], said: str, tmp_path: Path) -> None:
+    for folder in ("targets", "laser"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a1.png").write_bytes(b"")
+    given = dict(settings)
+    if given.pop("transport", False):
+        given["transport"] = TransportViews(folder=tmp_path, profiles_between=1.0)
+    if "block" in given:
+        given["block"] = BlockViews(folder=tmp_path, heights=given["block"])
+    if given.pop("laser", False):
+        given["laser"] = tmp_path / "laser"
+    with pytest.raises(ValueError, match=said):
+        calibrate_sensor([tmp_path / "targets" / "a1.png"], pitch=PITCH, **given)
+
+
+def test_readings_on_a_block_have_the_heights_of_their_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A target without a laser image shows no line."""
+    images: Any = SimpleNamespace(targets=[Path("a"), Path("b"), Path("c")], lasers=[Path("A"), None, Path("C")])
+    monkeypatch.setattr(calibrating_sensor, "image_light", lambda *given: given)
+
+    def read_block(light: Any, laser: Path, steps: int, *, along: str, device: Any) -> Any:
+        assert light == (Path(laser.name.lower()), laser, "red")
+        assert (steps, along, device) == (3, "rows", "a device")
+        return f"line of {laser}", np.array([2, 0, 1])
+
+    monkeypatch.setattr(calibrating_sensor, "read_block", read_block)
+    block = BlockViews(folder=Path("x"), heights=(1e-3, 0.0, 5e-3))
+    device: Any = "a device"
+    found = calibrating_sensor._other_lines(images, block, "rows", "red", device)
+    assert [line for line, _ in found] == ["line of A", "line of C"]
+    for _, heights in found:
+        np.testing.assert_array_equal(heights, [5e-3, 1e-3, 0.0])
+
+
+@pytest.mark.parametrize(
     ("options", "said"),
     [
         (("--sensor",), "--sensor needs --pitch"),

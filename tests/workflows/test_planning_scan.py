@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from gpuvision.host.sources import ArraySource
 from gpuvision.ranging.line import LineReadout
 from gpuvision.reference.line import pixel_gaussian
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.workflows import planning_scan
+from gpuvision.workflows import planning_scan, scanning
 from gpuvision.workflows.planning_scan import plan_scan
 from gpuvision.workflows.scan_plan import ReadoutTrial, ScanPlan, ScanPlanLimits, usable_trials
 from gpuvision.workflows.scanning import scan
@@ -156,6 +157,76 @@ def test_limits_are_checked(limits: dict[str, float], message: str) -> None:
 @pytest.mark.parametrize(("half", "windows"), [(0.8, [3]), (4.2, [8, 12]), (8.0, [12, 24]), (300.0, [180])])
 def test_windows_hold_the_line(half: float, windows: list[int]) -> None:
     assert planning_scan._windows(half) == windows
+
+
+def test_readouts_that_are_tried() -> None:
+    """The sensor's readout first; each other one once, with the settings of the sensor."""
+    sensor = noisy_camera(window=8)
+    found = planning_scan._readouts(sensor, 4.2)
+    given: Any = sensor.readout
+    settings = [(each.method, each.window, each.fir_length) for each in found]
+    window, length = given.window, given.fir_length
+    assert settings == [
+        ("windowed", 8, length),
+        ("windowed", 12, length),
+        ("gauss3", window, length),
+        ("fir", window, 4),
+        ("fir", window, 8),
+        ("ml", 8, length),
+        ("ml", 12, length),
+    ]
+    assert all((each.threshold, each.read_noise, each.gain) == (20, READ_NOISE, GAIN) for each in found)
+    assert found[0] == given
+
+
+@pytest.mark.parametrize(("largest", "takes_double"), [(5.0 * (1 + 1e-6), False), (5.0 * (1 - 1e-6), True)])
+def test_precision_is_double_where_rounding_would_exceed_the_error(
+    largest: float, takes_double: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Heights of 1 m and of 5 m in double precision differ by 4 m; with the error of 3 m that is 5 m."""
+
+    def points(sensor: Sensor, sample: Any, device: Any) -> Any:
+        readout: Any = sensor.readout
+        z = 5.0 if readout.precision == "double" else 1.0
+        return SimpleNamespace(z=np.array([z, z, np.nan])), None
+
+    monkeypatch.setattr(planning_scan, "_points", points)
+    monkeypatch.setattr(planning_scan, "_times", lambda sensor, readouts, *_: [0.25 * len(readouts)])
+    chosen = trial("ml", 1.0, 3.0)
+    device: Any = SimpleNamespace(has_double=True)
+    sample: Any = None
+    found, rounding = planning_scan._with_precision(chosen, noisy_camera(), sample, device, largest)
+    assert rounding == pytest.approx(4.0)
+    readout = dataclasses.replace(chosen.readout, precision="double")
+    assert found == (chosen._replace(readout=readout, seconds=0.25) if takes_double else chosen)
+    device.has_double = False
+    assert planning_scan._with_precision(chosen, noisy_camera(), sample, device, 0.0) == (chosen, None)
+
+
+def test_a_plan_with_a_stream_states_it() -> None:
+    class Stream:
+        def __str__(self) -> str:
+            return "in batches of 4"
+
+        def to_dict(self) -> dict[str, int]:
+            return {"batch": 4}
+
+    stream: Any = Stream()
+    plan = dataclasses.replace(plan_of(TRIALS[1]), stream=stream, rounding=0.5)
+    assert str(plan).endswith("4.4e+06 um takes ml 8 at 4 times the time; in batches of 4")
+    report = plan.to_dict()
+    assert (report["stream"], report["rounding"], report["tolerance"]) == ({"batch": 4}, 0.5, 6.0)
+    assert report["limits"] == {"margin": 1.1, "max_lost": 0.01, "rate_margin": 1.25}
+
+
+def test_a_plan_is_for_one_device() -> None:
+    device: Any
+    plan: Any
+    device, plan = SimpleNamespace(label="b"), SimpleNamespace(rate=10.0, device=SimpleNamespace(label="a"))
+    with pytest.raises(ValueError, match="stream_plan is for a, and b is asked for; leave out device"):
+        scanning._check_plan(plan, 10.0, device)
+    scanning._check_plan(plan, 10.0, plan.device)
+    scanning._check_plan(plan, 10.0, None)
 
 
 def test_scatter_beyond_the_texture_of_the_surface_is_an_error() -> None:

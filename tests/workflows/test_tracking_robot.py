@@ -17,9 +17,11 @@ from gpuvision.cli import main as cli
 from gpuvision.formats.field_file import read_field
 from gpuvision.host import ArraySource, Device
 from gpuvision.host.errors import RecordingError
+from gpuvision.host.sources import Source
 from gpuvision.matching.field.odometry import PoseEstimate, predict
 from gpuvision.matching.field.robot_filter import RobotState
 from gpuvision.status import Status
+from gpuvision.workflows import tracking_robot
 from gpuvision.workflows.tracking_robot import MotionUncertainty, RobotTrack, _motion, read_odometry, track_robot
 
 SCALE, SHAPE, WIDE = 0.04, (300, 330), 0.125
@@ -233,3 +235,43 @@ def test_report_and_summary_of_a_track(device: Device) -> None:
     assert none.summary() == "2 frames, 2 of them refused; last state NO_DATA\nno pose at the last frame"
     assert none.problem() == "no pose in 2 frames: too dark"
     assert RobotTrack(states=(lost,), refused={}, field=field, device=device).problem() == "no pose in 1 frames"
+
+
+class Views(Source):
+    """Views of a bare carpet; the source does not know its length."""
+
+    def __init__(self, count: int) -> None:
+        self.shape, self.dtype = SHAPE, np.dtype(np.uint8)
+        self.left, self.closed = count, False
+
+    def wait(self) -> bool:
+        return self.left > 0
+
+    def read_into(self, out: np.ndarray, arrived: np.ndarray) -> int:
+        out[:] = 50
+        self.left -= 1
+        return 1
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.mark.parametrize(
+    ("frames", "motions", "error", "message"),
+    [
+        (3, 1, ValueError, "the odometry has 1 motions, fewer than between the frames"),
+        (2, 2, ValueError, "the odometry has 2 motions, expected 1 between 2 frames"),
+        (0, None, RecordingError, "the recording has no frame"),
+    ],
+)
+def test_a_source_of_unknown_length_is_compared_with_the_odometry(
+    frames: int, motions: int | None, error: type[Exception], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tracking_robot, "scan_floor", lambda frame, **_: None)
+    located = SimpleNamespace(reason="no line", candidates=())
+    monkeypatch.setattr(tracking_robot, "locate_robot", lambda *_, **__: located)
+    source = Views(frames)
+    odometry = None if motions is None else np.tile(MOTION, (motions, 1))
+    with pytest.raises(error, match=message):
+        track_robot(source, read_field("robocup_msl"), rate=10.0, odometry=odometry)
+    assert source.closed

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -248,6 +250,60 @@ def test_a_picture_that_comes_too_late_shifts_no_other(tmp_path: Path) -> None:
     assert decoder.damaged() == frozenset(range(5, 12))
     good = np.delete(np.arange(COUNT), 5)
     np.testing.assert_array_equal(np.array(frames)[good], clean[good])
+
+
+def test_lost_pictures_before_the_first_one_show_it(tmp_path: Path) -> None:
+    """They count as damaged; the first picture itself does not."""
+    path = written(tmp_path / "video.mov", frames=frames_of_a_line()[:5])
+    clean = read(path)[0]
+
+    class Late(video.VideoDecoder):
+        def _decode_packets(self) -> Any:
+            yield from ((None, True), (None, True))
+            yield from super()._decode_packets()
+
+    decoder, frames = Late(path), []
+    while decoder.wait():
+        frames.append(cv2.cvtColor(decoder.read(), cv2.COLOR_BGR2GRAY))
+    decoder.close()
+    np.testing.assert_array_equal(frames, clean[[0, 0, 0, 1, 2, 3, 4]])
+    assert decoder.damaged() == frozenset({0, 1})
+
+
+@pytest.mark.parametrize(("pictures", "doubtful"), [(3, False), (4, True), (5, True)])
+def test_broken_images_count_unless_most_are_broken(pictures: int, doubtful: bool) -> None:
+    decoder: Any = object.__new__(video.VideoDecoder)
+    decoder._broken_jpegs, decoder._damaged, decoder._number = {1, 2}, {7}, pictures
+    assert decoder.damaged() == ({1, 2, 7} if doubtful else {7})
+
+
+@pytest.mark.parametrize(
+    ("of_stream", "of_file", "rate", "length"),
+    [
+        (49, None, 25.0, 49),  # 49 / 25 s
+        (None, 1_980_000, 25.0, 50),  # us: 49.5 pictures
+        (None, 1_979_000, 25.0, 49),
+        (None, None, 25.0, 0),
+        (49, None, None, 0),
+    ],
+)
+def test_length_by_duration_and_rate(
+    of_stream: int | None, of_file: int | None, rate: float | None, length: int
+) -> None:
+    decoder: Any = object.__new__(video.VideoDecoder)
+    decoder.rate, decoder._container = rate, SimpleNamespace(duration=of_file)
+    stream = SimpleNamespace(duration=of_stream, time_base=Fraction(1, 25))
+    assert decoder._announced(stream) == length
+    without_unit = SimpleNamespace(duration=49, time_base=None)
+    assert decoder._announced(without_unit) == (0 if of_file is None else length)
+
+
+def test_discarded_entries_of_an_index_do_not_count() -> None:
+    decoder: Any = object.__new__(video.VideoDecoder)
+    entries = [SimpleNamespace(is_discard=each) for each in (True, False, False)]
+    for name, frames, expected in (("mov,mp4,m4a", 3, 2), ("avi", 3, 3), ("mov,mp4,m4a", 0, 0)):
+        decoder._container = SimpleNamespace(format=SimpleNamespace(name=name))
+        assert decoder._displayed(SimpleNamespace(frames=frames, index_entries=entries)) == expected
 
 
 def _clear_packet(path: Path, number: int) -> None:

@@ -112,6 +112,46 @@ def test_a_block_is_read_along_either_axis(along: Any, monkeypatch: pytest.Monke
         read_block(images, Path("lit.png"), 3, along=along, device=None)
 
 
+@pytest.mark.parametrize(
+    ("target", "laser", "expected"),
+    [
+        ("t/pose7.png", "l/pose7.png", True),
+        ("t/pose7.png", "l/pose7_laser.png", True),
+        ("t/pose7.png", "t/pose7_laser.png", True),
+        ("t/cam2_7.png", "l/laser3_07.png", True),  # the last numbers, whose zeros in front do not count
+        ("t/cam2_7.png", "l/laser7_2.png", False),
+        ("t/cam7_2.png", "l/laser7_3.png", False),
+        ("t/cam2_7.png", "t/laser3_7_laser.png", False),  # in one folder the names must be the same
+        ("t/seven.png", "l/laser7.png", False),
+        ("t/pose7.png", "l/seven.png", False),
+    ],
+)
+def test_pairs_by_name_or_by_last_number(target: str, laser: str, expected: bool) -> None:
+    assert laser_images._is_pair(Path(target), Path(laser)) is expected
+
+
+def test_the_line_runs_along_its_longer_axis() -> None:
+    """Light below a quarter of the largest, and light off the target, do not count; equal spreads are columns."""
+
+    def light(*places: tuple[int, int, float]) -> LightImage:
+        image = np.zeros((40, 60), np.float32)
+        for row, column, level in places:
+            image[row, column] = level
+        inside = np.ones(image.shape, bool)
+        inside[:, 50:] = False
+        return LightImage(image, inside, np.zeros(image.shape, bool))
+
+    wide, tall = [(20, 10, 80.0), (20, 24, 80.0)], [(10, 20, 80.0), (24, 20, 80.0)]
+    assert line_direction([light(*wide)]) == "columns"
+    assert line_direction([light(*tall)]) == "rows"
+    assert line_direction([light(*wide), light(*tall)]) == "columns"
+    assert line_direction([light(*wide), light((8, 20, 80.0), (24, 20, 80.0))]) == "rows"
+    assert line_direction([light(*tall, (17, 0, 19.0), (17, 49, 19.0))]) == "rows"
+    assert line_direction([light(*tall, (17, 0, 21.0), (17, 49, 21.0))]) == "columns"
+    assert line_direction([light(*tall, (17, 50, 80.0), (17, 59, 80.0))]) == "rows"
+    assert line_direction([light(), light(*tall)]) == "rows"
+
+
 def test_three_images_of_each_kind_give_the_direction(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the target and of the block; places of the block without a laser image do not count."""
     monkeypatch.setattr(calibrating_sensor, "target_light", lambda *given: given)

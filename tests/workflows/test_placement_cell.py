@@ -85,6 +85,39 @@ def test_vibration_is_identified_in_twelve_periods_of_the_slowest_resonance(monk
     assert cell.machine.settling.rule == "vibration"
     assert cell.machine.settling.frequency == (30.0, 20.0, 0.0)
     assert cell.machine.settling.damping == (0.02, 0.03, 0.0)
+    monkeypatch.setattr(cell, "_steer", lambda *_: (SimpleNamespace(released=False, reason="no pose"), None))
+    with pytest.raises(ValueError, match="the vibration of the head cannot be identified: no pose"):
+        cell.identify(np.zeros(3))
+
+
+@pytest.mark.parametrize(("landing", "first"), [(None, 0), (object(), 3)])
+def test_a_head_at_rest_is_measured_at_the_target(landing: object, first: int) -> None:
+    """The coarse registration of 2.5 frames comes first; poses with a flag do not count."""
+    target, true = np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0])
+    machine: Any = SimpleNamespace(
+        landing=2.5e-3, rate=1000.0, period=1e-3, pipette_in_camera=SimpleNamespace(pose=true)
+    )
+    followed: list[Any] = []
+    times: list[float] = []
+
+    class Sensor:
+        def reset(self) -> None:
+            times.append(-1.0)
+
+        def __call__(self, time: float) -> list[Any]:
+            times.append(time)
+            good = SimpleNamespace(pose=target + len(times), status=0)
+            return [good, SimpleNamespace(pose=target, status=1)]
+
+    cell: Any = object.__new__(PlacementCell)
+    cell.machine, cell._plan, cell._sensor = machine, SimpleNamespace(target=target, landing=landing), Sensor()
+    cell._camera = SimpleNamespace(follow=lambda *given: followed.append(given))
+    error = cell.rest(4)
+    ((pose, camera),) = followed
+    np.testing.assert_array_equal(pose(np.zeros(2)), [target, target])
+    assert camera is true
+    assert times == pytest.approx([-1.0, *(1e-3 * frame for frame in range(first + 4))])
+    np.testing.assert_allclose(error, np.repeat(np.arange(2.0, first + 6)[:, None], 3, axis=1))
 
 
 def test_reach_is_the_largest_error_in_a_period_after_the_contact(monkeypatch: pytest.MonkeyPatch) -> None:

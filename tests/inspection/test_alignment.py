@@ -9,9 +9,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gpuvision.inspection.alignment import _fit_rigid, align_apertures
+from gpuvision.inspection.alignment import (
+    _coarse_heights,
+    _fit_rigid,
+    _pattern,
+    _peaks,
+    _turned,
+    align_apertures,
+)
 from gpuvision.inspection.apertures import BoardPlacement
 from gpuvision.inspection.paste import PasteSettings
+from gpuvision.ranging.regrid import Grid
 from paste_maps import Cap, board_grid, circle, paste_map, rectangle
 
 SETTINGS = PasteSettings(stencil=120e-6)
@@ -132,6 +140,85 @@ def test_memory_does_not_grow_with_the_search_range(rng):
         tracemalloc.stop()
         assert abs(found.placement.theta) < 1e-3
     assert peaks[1] < peaks[0] + 5e6
+
+
+def test_coarse_heights_are_means_above_the_board(rng):
+    """Blocks of 2 x 5 cells, of the cells with a height; the rest of the rows and columns is left out."""
+    grid = Grid(left=1e-3, top=2e-3, cell_x=10e-6, cell_y=25e-6, columns=103, rows=61)
+    z = 1e-3 + rng.normal(0, 1e-6, grid.shape)
+    z[20:24, 40:60] += 80e-6
+    z[rng.random(grid.shape) < 0.1] = np.nan
+    z[30:32, 50:55] = np.nan  # a block without a height
+    apertures = [rectangle(str(k), (1.3e-3, 1.5e-3), (200e-6, 200e-6)) for k in range(3)]
+    coarse, above = _coarse_heights(z, grid, apertures)
+    # A quarter of the aperture is 50 um: 2 rows of 25 um, 5 columns of 10 um.
+    assert (coarse.rows, coarse.columns) == above.shape == (30, 20)
+    np.testing.assert_allclose([coarse.cell_x, coarse.cell_y], 50e-6)
+    np.testing.assert_allclose([coarse.left, coarse.top], [1e-3 + 20e-6, 2e-3 - 12.5e-6])
+    blocks = [[z[2 * r : 2 * r + 2, 5 * c : 5 * c + 5] for c in range(20)] for r in range(30)]
+    known = np.array([[np.isfinite(each).any() for each in row] for row in blocks])
+    means = np.array([[np.nanmean(each) if np.isfinite(each).any() else np.nan for each in row] for row in blocks])
+    assert np.count_nonzero(~known) == 1
+    filled = np.where(known, means, np.median(means[known]))
+    # The board is the median over five apertures, an odd number of cells: 20 of 50 um and one.
+    padded = np.pad(filled, 10, mode="edge")
+    board = np.array([[np.median(padded[r : r + 21, c : c + 21]) for c in range(20)] for r in range(30)])
+    raised = np.where(known, filled - board, 0.0)
+    np.testing.assert_allclose(above, np.clip(raised, 0.0, np.percentile(raised, 99)), atol=1e-12)
+    assert above.max() > 50e-6
+    flat, zero = _coarse_heights(np.full(grid.shape, 1e-3), grid, apertures)
+    assert flat == coarse
+    np.testing.assert_array_equal(zero, 0.0)
+
+
+def test_the_coarse_grid_is_limited_by_its_length_and_by_the_cells():
+    """1024 cells along the longer side at most, and no finer than the heights."""
+    for grid, aperture, size in (
+        (Grid(left=0.0, top=0.0, cell_x=1e-5, cell_y=1e-5, columns=4096, rows=8), 20e-6, (1024, 2)),
+        (Grid(left=0.0, top=0.0, cell_x=1e-5, cell_y=1e-5, columns=8, rows=4096), 20e-6, (2, 1024)),
+        (Grid(left=0.0, top=0.0, cell_x=1e-5, cell_y=3e-5, columns=30, rows=9), 20e-6, (10, 9)),
+    ):
+        coarse, _ = _coarse_heights(np.zeros(grid.shape), grid, [rectangle("1", (0.0, 0.0), (aperture, aperture))])
+        assert (coarse.columns, coarse.rows) == size
+
+
+def test_peaks_of_a_correlation():
+    """The second peak is more than half an aperture away from the first one; signs are those of the shifts."""
+    grid = Grid(left=0.0, top=0.0, cell_x=1e-5, cell_y=2e-5, columns=8, rows=6)
+    rows, columns = np.array([0, 1, 2, -3, -2, -1])[:, None], np.array([0, 1, 2, 3, -4, -3, -2, -1])[None, :]
+    for size, second in ((1e-5, 0.4), (9.9e-5, 0.4), (10.1e-5, 0.3), (15.9e-5, 0.3), (16.1e-5, 0.0)):
+        correlation = np.zeros((6, 8))
+        correlation[4, 6] = 0.9  # rows -2, columns -2
+        correlation[4, 2] = 0.5  # two cells of the longer side away, 4e-5 m: near for any size
+        correlation[4, 3] = 0.4  # 5e-5 m
+        correlation[2, 6] = 0.3  # 8e-5 m
+        assert _peaks(correlation, rows, columns, grid, size) == (-2, -2, second), size
+    correlation[:] = -0.2
+    correlation[0, 3] = -0.1
+    assert _peaks(correlation, rows, columns, grid, 1e-5) == (0, 3, 0.0)
+
+
+def test_a_placement_turns_about_a_point():
+    placement, point = BoardPlacement(x=3e-3, y=-1e-3, theta=0.4, side="bottom"), np.array([2e-3, 5e-3])
+    turned = _turned(placement, point, 0.25)
+    np.testing.assert_allclose(turned.to_map(point), placement.to_map(point), rtol=1e-12)
+    assert (turned.theta, turned.side) == (pytest.approx(0.65), "bottom")
+
+
+def test_the_pattern_is_1_in_apertures():
+    """Also where apertures overlap, and beyond the grid."""
+    grid = Grid(left=0.0, top=90e-6, cell_x=10e-6, cell_y=10e-6, columns=12, rows=10)
+    apertures = [
+        rectangle("1", (25e-6, 65e-6), (30e-6, 20e-6)),
+        rectangle("2", (35e-6, 65e-6), (30e-6, 20e-6)),
+        rectangle("3", (110e-6, 10e-6), (40e-6, 60e-6)),
+        rectangle("4", (300e-6, 10e-6), (40e-6, 60e-6)),
+    ]
+    x, y = np.meshgrid(grid.x, grid.y)
+    expected = (np.abs(x - 30e-6) < 20e-6) & (np.abs(y - 65e-6) < 10e-6)
+    expected |= (np.abs(x - 110e-6) < 20e-6) & (np.abs(y - 10e-6) < 30e-6)
+    assert np.count_nonzero(expected) == 8 + 12
+    np.testing.assert_array_equal(_pattern(grid, apertures, BoardPlacement(x=0.0, y=0.0, theta=0.0)), expected)
 
 
 def test_a_rotation_beyond_pi_is_pi(monkeypatch):

@@ -235,7 +235,7 @@ def _second_stage(
         values[free] += step
         if np.all(np.abs(step) <= _CONVERGED * np.abs(values[free])):
             break
-    variance = unit**2 * np.diag(np.linalg.pinv(scaled.T @ scaled, rcond=1e-15, hermitian=True))
+    variance = unit**2 * np.diag(np.linalg.pinv(scaled.T @ scaled, rcond=1e-15))
     residual_variance = max(float(np.sum(error**2)) / max(error.size - len(free), 1), _MIN_NOISE_PX**2)
     deviation = math.sqrt(residual_variance * variance[0]) if focal_length is None else 0.0
     return values, deviation, math.sqrt(float(np.mean(np.sum(error**2, axis=1)))), rotation

@@ -89,6 +89,13 @@ def test_straight_lines_have_no_centre(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(centre_from_curvature(pack([[np.arange(8.0).reshape(4, 2)]])), 0.0)
 
 
+def test_a_line_without_any_curvature_is_left_out() -> None:
+    along = np.linspace(-1.0, 1.0, 9)
+    flat = [[np.stack([along, np.full(9, offset)], axis=1) for offset in (-0.5, 0.5)]]
+    with np.errstate(all="raise"):
+        np.testing.assert_array_equal(centre_from_curvature(pack(flat)), 0.0)
+
+
 def test_points_from_intersections(rng: np.random.Generator) -> None:
     ideal = plane_grid(rng, 40.0)
     packed = pack(grid_lines(ideal))

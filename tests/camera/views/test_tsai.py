@@ -74,6 +74,34 @@ def test_five_points_determine_the_alignment(count):
     assert min(np.abs(each - rotation).max() for each in alignment.rotations) < 1e-8
 
 
+@pytest.mark.parametrize(("count", "distorted"), [(5, True), (9, False), (108, True)])
+def test_the_deviation_is_that_of_the_second_stage(count, distorted):
+    """Of f, the distance and k1: their derivatives by differences; spare coordinates count, and 0.01 px at least."""
+    rotation, translation = POSES["oblique"]
+    for noise in (0.0, 0.5):
+        target, image = _view(rotation, np.array(translation), kappa=1e-8, noise=noise)
+        chosen = np.array([0, 11, 50, 96, 107, 31, 62, 20, 85, *range(12, 20)])[:count] if count < 108 else slice(None)
+        target, image = target[chosen], image[chosen]
+        fit = fit_tsai(target, image, CENTRE, distorted=distorted)
+        offset = image - CENTRE
+        square = np.sum(offset**2, axis=1, keepdims=True)
+        placed = target @ fit.pose.rotation.T + fit.pose.translation
+
+        def errors(f, distance, kappa, offset=offset, square=square, placed=placed):
+            ideal = f * placed[:, :2] / (placed[:, 2:] + distance)
+            return (offset * (1.0 + kappa * square) - ideal).ravel()
+
+        known = (fit.focal_length, 0.0, fit.lens.k1 if distorted else 0.0)
+        steps = np.diag([1e-2, 1e-6, 1e-13])[: 3 if distorted else 2]
+        slopes = [(errors(*(known + h)) - errors(*(known - h))) / (2.0 * h.max()) for h in steps]
+        scale = np.linalg.norm(slopes, axis=1)
+        inverse = np.linalg.inv((slopes / scale[:, None]) @ (slopes / scale[:, None]).T)[0, 0] / scale[0] ** 2
+        rest = errors(*known)
+        variance = max(rest @ rest / (len(rest) - len(steps)), 1e-4)
+        assert fit.focal_length_sigma == pytest.approx(np.sqrt(variance * inverse), rel=1e-4)
+        assert fit.rms_px == pytest.approx(np.sqrt(2.0 * np.mean(rest**2)), abs=1e-9)
+
+
 def test_noise_moves_the_focal_length_by_its_deviation():
     rotation, translation = POSES["oblique"]
     errors, deviations = [], []

@@ -85,6 +85,33 @@ def test_clipped_parts_are_those_that_the_sensor_images(lens: str, rng: np.rando
     assert 0.2 * share.size * count < kept < 0.8 * share.size * count
 
 
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_ends_of_clipped_parts_are_the_limits_of_the_image(lens: str, rng: np.random.Generator) -> None:
+    """A millionth of the segment inside an end has an image, a millionth outside has none; other ends stay as given."""
+    view, ends = sensor_view(tilt=0.2, distortion=LENSES[lens]), segments(rng, 60)
+    count = len(ends)
+    start, end = rng.uniform(0.0, 0.3, count), rng.uniform(0.7, 1.0, count)
+    parts = (
+        LineProjector(view)
+        .project(ends, TRANSPORT)
+        .clip_to_view(Parts(np.arange(count), start, end, rng.random(count) < 0.5))
+    )
+    clipped = 0
+    for segment, first, last, _ in zip(*parts, strict=True):
+        assert first == start[segment] or first > start[segment] + 1e-9
+        assert last == end[segment] or last < end[segment] - 1e-9
+        for place, given, inwards in ((first, start[segment], 1e-6), (last, end[segment], -1e-6)):
+            inside, outside = np.isfinite(images(view, ends[segment], place + np.array([inwards, -inwards]))).all(
+                axis=1
+            )
+            assert inside
+            assert not outside or place == given
+            clipped += place != given
+    assert clipped > 10
+    kept = (parts.start == start[parts.segment]) & (parts.end == end[parts.segment])
+    assert kept.sum() > 10
+
+
 @pytest.mark.parametrize(
     ("lens", "axis"),
     [

@@ -134,6 +134,46 @@ def test_a_lens_sees_objects_where_its_equation_says() -> None:
     assert np.isnan(high.x).tolist() == [[False, False, True]]
 
 
+@pytest.mark.parametrize("principal_point_px", [None, (0.5, 3.0)])
+def test_pixels_lie_around_the_optical_axis(principal_point_px: tuple[float, float] | None) -> None:
+    """Columns along g, rows along the direction, from the middle of the frame by default; flags of the peak stay."""
+    frame = np.arange(12.0).reshape(3, 4)
+    status = np.zeros((3, 4), np.uint8)
+    status[1, 2] = Status.SATURATED
+    move = StraightTransport(
+        g_axis=(1.0, 0.25, 0.0), h_axis=(0.5, 0.0, 2.0), direction=(0.0, -0.6, 0.8), origin=(0.1, -0.2, 0.3)
+    )
+    stack = confocal(principal_point_px=principal_point_px)
+    points = stack.points(FocusPeak(frame, np.ones((3, 4), np.float32), status), move, ANYWHERE, np.float64)
+    column, row = principal_point_px or (1.5, 1.0)
+    for r, c in np.ndindex(3, 4):
+        height = 1e-3 + 20e-6 * frame[r, c]
+        place = np.array(move.origin) + height * np.array(move.h_axis)
+        place += 5e-6 * ((c - column) * np.array(move.g_axis) + (r - row) * np.array(move.direction))
+        np.testing.assert_allclose([points.x[r, c], points.y[r, c], points.z[r, c]], place, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(points.status, status)
+
+
+def test_points_on_the_limits_are_inside() -> None:
+    frame = np.array([[0.0, 1.0, 2.0, 3.0]])
+    peak = FocusPeak(frame, np.ones((1, 4), np.float32), np.array([[0, 0, 0, Status.SATURATED]], np.uint8))
+    stage = StageFocus(start=-1.0, step=1.0, pixel_size=0.5)
+    stack = FocusStack(geometry=stage, principal_point_px=(0.0, 0.0))
+    everywhere = (-math.inf, math.inf)
+    out = int(Status.OUT_OF_RANGE)
+    for limits, expected in (
+        ((everywhere, everywhere, (0.0, 1.0)), [out, 0, 0, out | int(Status.SATURATED)]),
+        (((0.5, 1.0), everywhere, everywhere), [out, 0, 0, out | int(Status.SATURATED)]),
+        ((everywhere, (0.0, 0.0), everywhere), [0, 0, 0, int(Status.SATURATED)]),
+        ((everywhere, (1e-300, 1.0), everywhere), [out, out, out, out | int(Status.SATURATED)]),
+    ):
+        points = stack.points(peak, StraightTransport(), limits)
+        assert points.status.tolist() == [expected]
+        for each in (points.x, points.y, points.z):
+            np.testing.assert_array_equal(np.isnan(each[0]), [(flag & out) != 0 for flag in expected])
+            assert each.dtype == np.float32
+
+
 def test_a_short_stack_is_refused() -> None:
     with pytest.raises(ValueError, match="the focus stack has 2 frames, expected at least 3"):
         found(confocal(), gaussians(np.ones((2, 2)), 2))
@@ -148,6 +188,15 @@ def test_a_short_stack_is_refused() -> None:
         (lambda: confocal(neighbours=0), r"neighbours"),
         (lambda: confocal(window=-1), r"window"),
         (lambda: confocal(threshold=-1.0), r"threshold is -1"),
+        (lambda: confocal(threshold=-1e-9), r"threshold is -1e-09, expected 0 or more"),
+        (lambda: confocal(ambiguity=0.0), r"ambiguity is 0\.0, expected a number above 0 and at most 1"),
+        (lambda: confocal(ambiguity=1.0 + 1e-9), r"ambiguity is 1\.000000001"),
+        (lambda: confocal(read_noise=0.0), r"read_noise is 0\.0, expected a number above 0"),
+        (lambda: confocal(read_noise=1.0, gain=-1e-9), r"gain"),
+        (lambda: confocal().noise(np.ones((3, 3))), r"read_noise is None"),
+        (lambda: LensFocus(focal_length=0.05, first=0.05, spacing=1, pixel_pitch=1, stand_off=1), r"first is 0\.05 m"),
+        (lambda: LensFocus(focal_length=0.05, first=1, spacing=0, pixel_pitch=1, stand_off=1), r"spacing is 0"),
+        (lambda: LensFocus(focal_length=0.05, first=1, spacing=1, pixel_pitch=1, stand_off=-1), r"stand_off is -1"),
         (lambda: confocal(ambiguity=1.5), r"ambiguity is 1\.5"),
         (lambda: FocusStack(geometry=STAGE, measure="contrast"), r"measure is 'contrast', expected one of laplacian"),
     ],
@@ -155,3 +204,15 @@ def test_a_short_stack_is_refused() -> None:
 def test_refusals(make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_numbers_on_their_limits_are_taken() -> None:
+    stack = confocal(threshold=0.0, ambiguity=1.0, window=0, neighbours=1, read_noise=1e-9, gain=0.0)
+    # Equal maxima, one after the other: the second one is as strong as the first.
+    frames = np.tile(gaussians(np.full((1, 1), 3.0), 7), (2, 1, 1))
+    assert found(stack, frames).status.tolist() == [[Status.AMBIGUOUS]]
+    assert StageFocus(start=0.0, step=-1e-9, pixel_size=1e-9).step == -1e-9
+    # A measure equal to the threshold is too low, and a level equal to the limit is saturated.
+    assert found(confocal(threshold=100.0), frames).status.tolist() == [[Status.LOW_SIGNAL]]
+    assert found(confocal(threshold=99.9, saturation=100.0), frames).status.tolist() == [[Status.SATURATED]]
+    assert found(confocal(saturation=100.1), frames).status.tolist() == [[Status.OK]]

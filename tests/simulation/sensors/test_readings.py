@@ -13,6 +13,7 @@ from gpuvision.host import Device
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.simulation.sensors.readings import (
     AMBIENT,
+    PATHS,
     UNIFORM,
     AlignmentLimits,
     GroundTruth,
@@ -20,11 +21,14 @@ from gpuvision.simulation.sensors.readings import (
     check_sample_axes,
     height_secant,
     height_slope,
+    profile_generators,
     sheet_point,
     stack_profiles,
+    strongest_points,
     total_exposure,
 )
 from gpuvision.simulation.sensors.sensor_view import Exposure
+from gpuvision.status import Status
 from lights import LENGTH, PITCH, gaussian, psd_view
 from sensor_views import sensor_view
 
@@ -97,6 +101,83 @@ def test_light_of_profiles() -> None:
             stack_profiles(wrong)
     with pytest.raises(ValueError, match="different shapes"):
         total_exposure({"direct": spots[0], "multi-bounce": block["multi-bounce"]})
+
+
+def test_paths_are_known() -> None:
+    view = psd_view()
+    spot = gaussian(view, [0.0], 1e-6, 1e-4)
+    with pytest.raises(
+        ValueError, match=r"unknown path 'glow', expected some of direct, specular, .*, ambient, direct, u"
+    ):
+        total_exposure({"direct": spot, "glow": spot})
+    with pytest.raises(ValueError, match="expected light of one path or more; paths are direct, specular"):
+        total_exposure({})
+    with pytest.raises(ValueError, match=r"one path or more out of direct, .*, got none"):
+        add_ambient(view, {}, 1.0)
+    with pytest.raises(ValueError, match=r"multi-bounce, got \['ambient'\]"):
+        add_ambient(view, {AMBIENT: spot}, 1.0)
+    # Only the hypothetical variants: nothing is received.
+    assert not total_exposure({UNIFORM: spot}).power.any()
+    assert list(add_ambient(view, {"direct": spot}, 0.0)) == ["direct"]
+
+
+def test_three_paths_are_summed_and_kept() -> None:
+    view = psd_view()
+    light = {name: gaussian(view, [k * 5e-4], 1e-6 * (k + 1), 1e-4) for k, name in enumerate(PATHS)}
+    before = {name: each.power.copy() for name, each in light.items()}
+    total = total_exposure(light)
+    np.testing.assert_allclose(total.total(), 15e-6, rtol=1e-12)
+    np.testing.assert_allclose(total.moment, sum(each.moment for each in light.values()), rtol=1e-12)
+    for name, power in before.items():
+        np.testing.assert_array_equal(light[name].power, power)
+
+
+def test_ambient_light_is_uniform_along_u() -> None:
+    """Bins of unequal width get light in proportion to it, and no moment about their middles."""
+    view = sensor_view(u_edges=[-3e-3, -2e-3, 1e-3, 1.5e-3])
+    dark = view.dark()
+    made = add_ambient(view, {"direct": dark}, 4.5)[AMBIENT]
+    np.testing.assert_allclose(made.power, np.tile([1.0, 3.0, 0.5], (view.samples, 1)), rtol=1e-12)
+    assert not made.moment.any()
+    np.testing.assert_allclose(add_ambient(view, {"direct": dark}, 2.0)[AMBIENT].total(), 2.0, rtol=1e-12)
+
+
+def test_noise_depends_on_the_seed_and_the_number_of_the_profile() -> None:
+    first = [each.random() for each in profile_generators(7, 3, (2, 3))]
+    assert len(set(first)) == 6
+    assert [each.random() for each in profile_generators(7, 5, (4,))] == first[2:6]
+    assert profile_generators(8, 3, (1,))[0].random() not in first
+    assert first[0] == np.random.default_rng([7, 3]).random()
+
+
+def test_the_brightest_place_is_the_truth_of_a_sample() -> None:
+    """Places on the sensor before places in view; others on the sensor count if they are farther than rounding."""
+    sample = np.array([0, 0, 0, 1, 1, 2, 2, 4, 4])
+    places = np.array(
+        [
+            [1.0, 8.0],
+            [2.0, 7.0],
+            [1.0, 8.0],
+            [3.0, 1.0],
+            [3.0 + 0.7e-3, 1.0],
+            [4.0, 2.0],
+            [5.0, 3.0],
+            [6.0, 1.0],
+            [7.0, 1.5],
+        ]
+    )
+    on = np.array([True, True, True, True, True, False, True, False, False])
+    in_view = np.array([True, True, True, True, True, True, True, True, False])
+    light = np.array([5.0, 9.0, 1.0, 2.0, 1.0, 8.0, 1.0, 1.0, 9.0])
+    found = strongest_points(5, sample, places, on, in_view, light, same=1e-4)
+    np.testing.assert_array_equal(found.g, [2.0, 3.0, 5.0, np.nan, 6.0])
+    np.testing.assert_array_equal(found.h, [7.0, 1.0, 3.0, np.nan, 1.0])
+    assert found.status.tolist() == [Status.AMBIGUOUS, 0, 0, Status.LOW_SIGNAL, Status.OUT_OF_RANGE]
+    close = strongest_points(5, sample, places, on, in_view, light, same=0.8e-4)
+    assert close.status.tolist() == [Status.AMBIGUOUS, Status.AMBIGUOUS, 0, Status.LOW_SIGNAL, Status.OUT_OF_RANGE]
+    nothing = strongest_points(2, *(each[:0] for each in (sample, places, on, in_view, light)), same=1e-4)
+    assert nothing.status.tolist() == [Status.LOW_SIGNAL] * 2
+    assert np.isnan([nothing.g, nothing.h]).all()
 
 
 def test_a_path_of_another_shape_is_named() -> None:

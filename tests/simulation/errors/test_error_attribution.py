@@ -65,6 +65,10 @@ def test_secondary_light(method: str, device: Device) -> None:
     np.testing.assert_allclose(found.error, slope * moved, rtol=1e-9 if device.has_double else 1e-3)
     np.testing.assert_allclose(found.causes["secondary"], found.error, rtol=1e-6 if device.has_double else 1e-5)
     assert (found.dominant_cause() == list(found.causes).index("secondary")).all()
+    # An error of exactly the least one has no dominant cause.
+    for number, error in enumerate(np.abs(found.error).tolist()):
+        assert found.dominant_cause(error)[number] == -1
+        assert found.dominant_cause(np.nextafter(error, 0.0))[number] == list(found.causes).index("secondary")
     check_sum(found)
 
 

@@ -149,6 +149,9 @@ def test_a_part_seen_by_two(level: GroundTruth, device: Device) -> None:
     assert np.isfinite(flagged.error).tolist() == [False, False, True, False, False]
     assert flagged.summary(1e-6)["missing"] == 4
     mean = attribute_pair_errors(*found, SensorFusion(rule="mean"), max_gap=1.0, g=PLACES)["both"]
+    for each in (flagged, mean):
+        np.testing.assert_allclose(np.sum(list(each.causes.values()), axis=0), each.error, atol=1e-12)
+    np.testing.assert_allclose(mean.causes["occlusion"][3:], 0.5 * found[1].causes["occlusion"][3:], rtol=1e-3)
     np.testing.assert_allclose(mean.causes["occlusion"][:2], 0.5 * found[0].causes["occlusion"][:2], rtol=1e-3)
 
 

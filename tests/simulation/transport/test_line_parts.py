@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
+from gpuvision.ranging.sheet_motion import StraightTransport
+from gpuvision.ranging.triangulation import Triangulation
+from gpuvision.simulation.sensors.sensor_view import SensorView
 from gpuvision.simulation.transport.illumination import LitLine
 from gpuvision.simulation.transport.line_parts import (
     LineProjector,
@@ -139,7 +144,7 @@ def test_each_part_is_in_one_bin(lens: Lens | None, axis: int, rng: np.random.Ge
     places = lines.image_points(parts.segment, np.stack([parts.start, parts.end]))[..., axis]
     middle = lines.image_points(parts.segment, 0.5 * (parts.start + parts.end))[:, axis]
     number = np.searchsorted(edges, middle) - 1
-    rounding = (1e-12 if lens is None else 1e-6) * (edges[-1] - edges[0])
+    rounding = (1e-12 if lens is None else 1e-8) * (edges[-1] - edges[0])
     assert np.all((places >= edges[number] - rounding) & (places <= edges[number + 1] + rounding))
     is_cut = ~np.isin(np.stack([parts.start, parts.end]), np.concatenate([whole.start, whole.end]))
     assert is_cut.sum() > 50
@@ -154,6 +159,60 @@ def test_each_part_is_in_one_bin(lens: Lens | None, axis: int, rng: np.random.Ge
         cut = np.concatenate([parts.start[mine], parts.end[mine], [2.0]])
         near = np.abs(share[:, None] - cut).min(axis=1) < 1e-6
         np.testing.assert_array_equal(inside[~near], expected[~near])
+
+
+def camera_view() -> SensorView:
+    """Return the view of a camera with distortion, 160 mm from the sheet; rows are u, columns v."""
+    lens = np.array([0.01, 0.08, 0.14])
+    z = -lens / np.linalg.norm(lens)
+    x = np.array([1.0, 0.0, 0.0]) - z[0] * z
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    camera = Camera(
+        matrix=((900.0, 0.0, 60.0), (0.0, 880.0, 35.0), (0.0, 0.0, 1.0)),
+        distortion=(-0.6, 0.3, 0.01, -0.02, *(0.0,) * 10),
+    )
+    triangulation = Triangulation.from_camera(
+        camera, rotation, -rotation @ lens, along="columns", region=((0.0, 89.0), (0.0, 159.0))
+    )
+    return SensorView(
+        triangulation=triangulation,
+        transport=StraightTransport(),
+        lens=lens,
+        u_edges=np.linspace(-0.5, 89.5, 10),
+        v_edges=np.linspace(-0.5, 159.5, 6),
+    )
+
+
+def test_a_camera_images_the_points_around_its_sensor(rng: np.random.Generator) -> None:
+    """All points on the sensor are in the parts; none is beyond 1.01 of the circle around the undistorted sensor."""
+    view = camera_view()
+    edges = np.stack(np.meshgrid(view.u_edges[[0, -1]], np.linspace(-0.5, 159.5, 65)), axis=-1).reshape(-1, 2)
+    more = np.stack(np.meshgrid(np.linspace(-0.5, 89.5, 65), view.v_edges[[0, -1]]), axis=-1).reshape(-1, 2)
+    border = view.triangulation.distortion.undistort(np.concatenate([edges, more]))
+    centre = 0.5 * (border.min(axis=0) + border.max(axis=0))
+    radius = 1.01 * np.linalg.norm(border - centre, axis=1).max()
+    ends = segments(rng, 40, (8e-3, 0.03))
+    count = len(ends)
+    lines = LineProjector(view).project(ends, TRANSPORT)
+    parts = lines.clip_to_view(Parts(np.arange(count), np.zeros(count), np.ones(count), np.ones(count, bool)))
+    share = (np.arange(200) + 0.5) / 200
+    straight = replace(view, triangulation=replace(view.triangulation, camera=None))
+    seen = kept = clipped = 0
+    for number in range(count):
+        mine = parts.segment == number
+        place = images(view, ends[number], share)
+        inside = ((share[:, None] > parts.start[mine]) & (share[:, None] < parts.end[mine])).any(axis=1)
+        low, high = np.array([view.u_edges[0], view.v_edges[0]]), np.array([view.u_edges[-1], view.v_edges[-1]])
+        on_sensor = ((place > low) & (place < high)).all(axis=1)
+        assert inside[on_sensor].all()
+        distance = np.linalg.norm(images(straight, ends[number], share) - centre, axis=1)
+        near = np.abs(distance - radius) < 1e-3 * radius
+        np.testing.assert_array_equal(inside[~near], (distance < radius)[~near])
+        shown = np.full(on_sensor.sum(), number)
+        np.testing.assert_allclose(lines.image_points(shown, share[on_sensor]), place[on_sensor], rtol=0, atol=1e-6)
+        seen, kept, clipped = seen + on_sensor.sum(), kept + inside.sum(), clipped + np.count_nonzero(~inside)
+    assert min(seen, kept - seen, clipped) > 200
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -72,6 +72,17 @@ def test_a_corner_in_a_sheet_is_behind_it() -> None:
     np.testing.assert_array_equal(index.cuts(0.25).ends[0], [[1.0, 0.0], [0.0, 0.5]])
 
 
+@pytest.mark.parametrize("bend", [None, BentSheet(terms=(0.5, 0.0, 0.25), pinhole=(0.0, 0.1, 0.3))])
+def test_triangles_without_area_or_with_nan_are_not_cut(bend: BentSheet | None) -> None:
+    good = np.array([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [0.0, 1e-3, 1e-4]])
+    line = np.array([[0.0, 0.0, 0.0], [1e-3, 1e-3, 0.0], [3e-3, 3e-3, 0.0]])
+    unknown = np.array([[0.0, 0.0, 0.0], [1e-3, 1e-3, 0.0], [3e-3, np.nan, 0.0]])
+    index = SheetIndex.of(Scene(np.stack([line, good, unknown])), StraightTransport(bend=bend))
+    assert set(index.triangle) == {1}
+    assert set(index.cuts([0.25e-3, 0.5e-3]).triangle) == {1}
+    assert set(index.material) == {0}
+
+
 FLAT = StraightTransport(g_axis=(1.0, 0.0, 0.0), h_axis=(0.0, 0.0, 1.0), direction=(0.0, 1.0, 0.0))
 
 

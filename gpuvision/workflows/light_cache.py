@@ -37,6 +37,8 @@ PROFILES_PER_BLOCK = 16
 # Length beyond either end of a PSD strip in which the light is computed that the end cuts off, as a fraction of the
 # strip. Chosen: far more than the width of a light spot; the computing time grows with it.
 _END_FRACTION = 0.25
+# Time in which a Dask scheduler must accept the connection: Dask tries again until then. Chosen.
+_CONNECTION_TIMEOUT = "10s"
 
 Float64 = npt.NDArray[np.float64]
 Progress = Callable[[int, int | None], object]
@@ -264,7 +266,7 @@ def _compute_on_dask(task: SimulationTask, numbers: list[int], address: str) -> 
     except ImportError:
         raise ImportError("a scheduler needs Dask: pip install 'gpuvision[cluster]'") from None
     dask: Any = distributed
-    with dask.Client(address, timeout="10s", set_as_default=False) as client, client.as_current():
+    with dask.Client(address, timeout=_CONNECTION_TIMEOUT, set_as_default=False) as client, client.as_current():
         everywhere = client.scatter(task, broadcast=True)
         # A block that is requested twice is computed twice; the second file replaces an equal one.
         futures = {

@@ -357,8 +357,8 @@ def test_a_rate_gives_the_plan_of_its_stream(device: Device, rng: np.random.Gene
     assert plan.stream.rate == 10.0
     assert plan.stream.batch == 1
     assert plan.stream.ring == 7  # for 5 frames of a stall of 0.5 s, the source and the consumer
-    done = scan(frames, plan.sensor, device=device, rate=10.0, stream_plan=plan.stream, policy="block")
-    assert len(done.frame_numbers) == len(frames)
+    done = scan(frames[:3], plan.sensor, device=device, rate=10.0, stream_plan=plan.stream, policy="block")
+    assert len(done.frame_numbers) == 3
     with pytest.raises(ValueError, match="stream_plan is for 10 frames/s, and no rate is asked for"):
         scan(frames, plan.sensor, stream_plan=plan.stream)
     with pytest.raises(ValueError, match="stream_plan is for 10 frames/s, and 20 frames/s are asked for"):

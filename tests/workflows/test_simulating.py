@@ -29,7 +29,7 @@ from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.sensors.readings import PATHS
-from gpuvision.workflows import simulating
+from gpuvision.workflows import light_cache, simulating
 from gpuvision.workflows.light_cache import (
     PROFILES_PER_BLOCK,
     LightStore,
@@ -274,6 +274,7 @@ def test_the_command(
     assert command(monkeypatch, *words, "--no-noise", "--mask", "best") == 0
     assert json.loads((out / "report.json").read_text())["computed_blocks"] == 0
     capsys.readouterr()
+    monkeypatch.setattr(light_cache, "_CONNECTION_TIMEOUT", "0.2s")  # of a scheduler that is not there
     for wrong, line in [
         (["--paths", "direct,sideways"], "unknown path 'sideways'"),
         (["--paths", ""], "lack 'direct'"),

@@ -94,7 +94,7 @@ def test_edges_alone(device: Device, radius: float, blur: float, snr: float, rng
 
 def test_better_than_its_centre_of_gravity(device: Device, rng: np.random.Generator) -> None:
     """The centre of gravity is an independent second estimate with at least 1.5 times the deviation."""
-    operation = operation_for(10.0, 1.0, 25.0)
+    operation = operation_for(10.0, 1.0, 25.0, smoothing_px=1.5, spokes=32)  # a build of test_blob.py
     image = 50.0 + CONTRAST * reference.disc((48, 48), 23.7, 24.2, 10.0, 1.0)
     matched, heavy = [], []
     for _ in range(100):

@@ -168,10 +168,10 @@ def test_a_large_board(device: Device, variant: Any, rng: np.random.Generator) -
 
 @pytest.mark.parametrize("variant", ["work_item"])
 def test_odd_numbers_of_rulers_stay_within_the_outputs(device: Device, variant: Any, rng: np.random.Generator) -> None:
-    """7 lines of 3 rulers: groups of four rulers, the last one with a single ruler."""
+    """9 lines of 5 rulers: groups of four rulers, the last one with a single ruler; capacities as of other tests."""
     normal, point, along = artwork()
-    placed = place_rulers(normal[:7], point[:7], along[:7, ::2], MATRIX)
-    fix = replace(operation(variant), lines=7, rulers_per_line=3)
+    placed = place_rulers(normal[:9], point[:9], along[:9, :5], MATRIX)
+    fix = replace(operation(variant), lines=9, rulers_per_line=5)
     image = picture(rng)
     result = fix(image, *placed, device=device)
     assert result.status == Status.OK

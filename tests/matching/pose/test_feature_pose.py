@@ -115,6 +115,16 @@ def length_of(bound: BoundFeatures) -> int:
     return bound.operation.ruler.length
 
 
+@pytest.mark.parametrize("kind", ["rulers", "fiducials"])
+def test_one_kind_of_features_is_enough(
+    kind: str, features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
+) -> None:
+    image, true = seen
+    found = bind(only(features, kind), device)(image, NEAR)
+    assert found.status == 0
+    assert_near(found.pose, true, 5 * np.sqrt(np.diag(found.covariance)))
+
+
 @pytest.mark.double
 def test_pose_is_that_of_the_operations_one_by_one(
     features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
@@ -318,16 +328,6 @@ def test_a_radius_at_the_tolerance_is_the_fiducials(features: FeatureSet, device
     measured = (np.zeros((count, 2), np.float32), sizes, covariance, np.zeros(count, np.uint8))
     found = operation(pose, np.zeros(2, np.float32), *measured, np.zeros((count, 3), np.float32), device=device)
     np.testing.assert_array_equal(found.feature_status, [0, 0, 0, Status.AMBIGUOUS, Status.AMBIGUOUS])
-
-
-@pytest.mark.parametrize("kind", ["rulers", "fiducials"])
-def test_one_kind_of_features_is_enough(
-    kind: str, features: FeatureSet, seen: tuple[np.ndarray, np.ndarray], device: Device
-) -> None:
-    image, true = seen
-    found = bind(only(features, kind), device)(image, NEAR)
-    assert found.status == 0
-    assert_near(found.pose, true, 5 * np.sqrt(np.diag(found.covariance)))
 
 
 @pytest.mark.parametrize("count", [3, 8])

@@ -74,8 +74,9 @@ def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
         np.testing.assert_allclose(ours.irradiance, exact, rtol=2e-5, atol=1e-6 * exact.max())
 
 
-def test_a_device_without_doubles_takes_receivers_in_double(device: Device) -> None:
-    single = copy.copy(device)
+@pytest.mark.parametrize("vectors", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_device_without_doubles_takes_receivers_in_double(device: Device, vectors: bool) -> None:
+    single = copy.copy(device) if vectors else device.without_vectors()
     single.has_double = single.has_fast_double = False
     triangles, segments = boxes(np.random.default_rng(0), 12)
     receivers = strips(triangles, 6, 50)

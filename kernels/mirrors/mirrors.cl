@@ -185,8 +185,9 @@ INLINE masks may_show(Vector point, Fixed lens, global const MirrorBlock *block)
     if (block->one_sided > 0 && facing < -(block->sine + sine + SLACK)) return mask_of((reals)(real)0 > (reals)(real)0);
     const Vector q = moved(point, middle, -1);
     const reals far = dot_of(q, q), room = far - radius * radius, zero = (real)0;
-    // Cones with half angles beyond 90 degrees do not exclude any point.
-    if (!(sine < (real)1 && block->cosine_of_twice > (real)0 && cos_all > (real)0)) return mask_of(far >= zero);
+    // Cones with half angles of 90 degrees or more do not exclude any point. The cosine is 0 or less, or NaN, also where
+    // the normals alone have such a cone, and where the lens is in the ball.
+    if (!(cos_all > (real)0)) return mask_of(far >= zero);
     const real up = (real)2 * facing;
     const Fixed on = {up * axis.x - cx * per, up * axis.y - cy * per, up * axis.z - cz * per};
     const reals least = cos_all * sqrt(room > zero ? room : zero) - (reals)(sin_all * radius);
@@ -348,7 +349,7 @@ INLINE masks may_show_part(Vector start, Vector way, Fixed lens, global const Mi
     const real cos_all = block->cosine_of_twice * cosine - block->sine_of_twice * sine;
     const real sin_all = block->sine_of_twice * cosine + block->cosine_of_twice * sine;
     const reals zero = (real)0, one = (real)1;
-    if (!(sine < (real)1 && block->cosine_of_twice > (real)0 && cos_all > (real)0)) return mask_of(way.x - way.x <= zero);
+    if (!(cos_all > (real)0)) return mask_of(way.x - way.x <= zero);
     const real up = (real)2 * per * (cx * axis.x + cy * axis.y + cz * axis.z), back = radius / sin_all;
     const Fixed on = {up * axis.x - cx * per, up * axis.y - cy * per, up * axis.z - cz * per};
     const Vector from = {start.x - (middle.x - back * on.x), start.y - (middle.y - back * on.y),

@@ -191,7 +191,7 @@ def test_cone_of_the_points_that_a_block_may_show(device: Device, rng: np.random
         expected.append(is_shown)
 
     for _ in range(60):
-        middle, axis, radius, half = rng.normal(0.0, 0.5, 3), unit(rng), rng.uniform(0.05, 0.3), rng.uniform(0.05, 0.5)
+        middle, axis, radius, half = rng.normal(0.0, 0.5, 3), unit(rng), rng.uniform(0.05, 0.3), rng.uniform(0.05, 0.7)
         lens_way = rng.uniform(0.5, 2.0) * turned(axis, rng.uniform(0.0, 1.3), rng)
         lens, far = middle + lens_way, np.linalg.norm(lens_way)
         on = reflected(lens_way / far, axis)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.camera.image import estimate_pixel_noise
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.matching.features.ruler import RulerEdges
@@ -18,6 +19,8 @@ from gpuvision.matching.field.line_detection import (
     _rays,
     _room,
     _Run,
+    _runs,
+    _scan_lines,
     _ScanLines,
     default_threshold,
     end_margin_px,
@@ -161,3 +164,70 @@ def test_stripes_are_those_between_the_ends_of_their_scan_lines() -> None:
     np.testing.assert_allclose(found.half, [[1.8, 2.4], [1.8, 2.4], [-4.5, 0.0]], atol=1e-6)
     np.testing.assert_allclose(found.sigma, [0.01, 0.02, 0.05])
     np.testing.assert_allclose(found.spacing, [6.0, 6.0, 9.0])
+
+
+# 1.2 m above the floor, tilted by 35 degrees, at (0.3, -0.2) m of the robot, turned by 0.4 rad.
+CAMERA = MountedCamera(
+    height=1.2, tilt=math.radians(35.0), focal_px=150.0, centre_px=(99.5, 74.5), position=(0.3, -0.2), heading=0.4
+)
+
+
+def test_scan_lines_are_rays_from_below_the_camera_and_lines_across_them() -> None:
+    """Within a range of 3 m; rays are spaced evenly in their angle below the camera, as are the lines across."""
+    shape, lines = (150, 200), 7
+    found = _scan_lines(CAMERA, shape, lines, 3.0)
+    assert found.shape == (21, 512, 2)
+    c, s = math.cos(0.4), math.sin(0.4)
+    away = found - CAMERA.position
+    ahead, left = away @ (c, s), away @ (-s, c)
+    # What the image shows of the floor, on a dense grid.
+    grid = np.stack(np.meshgrid(np.linspace(0, 199, 64), np.linspace(0, 149, 64)), axis=-1)
+    on_floor = CAMERA.to_floor(grid).reshape(-1, 2) - CAMERA.position
+    on_floor = on_floor[np.hypot(*on_floor.T) <= 3.0]
+    far = np.hypot(*on_floor.T)
+    bearing = np.arctan2(on_floor @ (-s, c), on_floor @ (c, s))
+    rays = slice(0, lines)
+    turns = np.linspace(bearing.min(), bearing.max(), 7)
+    np.testing.assert_allclose(np.arctan2(left[rays], ahead[rays]), np.tile(turns[:, None], 512), atol=1e-12)
+    below = np.arctan(np.hypot(ahead, left)[rays] / 1.2)
+    ends = np.arctan(np.array([far.min(), far.max()]) / 1.2)
+    np.testing.assert_allclose(below, np.tile(np.linspace(*ends, 512), (7, 1)))
+    across = slice(lines, None)
+    ends = np.arctan(np.array([(on_floor @ (c, s)).min(), (on_floor @ (c, s)).max()]) / 1.2)
+    np.testing.assert_allclose(ahead[across], np.tile(1.2 * np.tan(np.linspace(*ends, 14))[:, None], 512), atol=1e-12)
+    wide = on_floor @ (-s, c)
+    np.testing.assert_allclose(left[across], np.tile(np.linspace(wide.min(), wide.max(), 512), (14, 1)), atol=1e-12)
+    assert _scan_lines(CAMERA, shape, lines, 0.01).shape == (0, 512, 2)
+
+
+def test_scan_lines_are_cut_where_the_width_doubles_and_at_the_border() -> None:
+    """Each part has one octave of the width of a line across it, inside a border of 3 px."""
+    shape, line_width = (150, 200), 0.1
+    floors = _scan_lines(CAMERA, shape, 5, 3.0)
+    runs = _runs(CAMERA, floors, shape, line_width)
+    pixels = CAMERA.to_pixels(floors)
+    steps, moves = np.gradient(pixels, axis=1), np.gradient(floors, axis=1)
+    width = line_width * np.linalg.norm(steps, axis=-1) / np.linalg.norm(moves, axis=-1)
+    expected: list[Any] = []
+    for line in range(len(floors)):
+        column, row = pixels[line].T
+        inside = (column >= 3) & (column <= 196) & (row >= 3) & (row <= 146)
+        pairs = zip(width[line], inside, strict=True)
+        kinds = [math.floor(math.log2(w / 3.0)) if i and w >= 3.0 else -1 for w, i in pairs]
+        first = 0
+        for at in range(1, 513):
+            if at < 512 and kinds[at] == kinds[first]:
+                continue
+            if kinds[first] >= 0 and at - first > 2:
+                begins = first == 0 or kinds[first - 1] < 0
+                ends = at == 512 or kinds[at] < 0
+                expected.append(
+                    (pixels[line, first], pixels[line, at - 1 if ends else at], kinds[first], (begins, ends))
+                )
+            first = at
+    assert len(runs) == len(expected) > 10
+    assert len({run.octave for run in runs}) > 1
+    for run, (start, end, octave, cut) in zip(runs, expected, strict=True):
+        np.testing.assert_allclose(run.start, start)
+        np.testing.assert_allclose(run.end, end)
+        assert (run.octave, run.cut) == (octave, cut)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -33,6 +33,7 @@ from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.board.edge_measurement import BoardMeasurer
 from gpuvision.matching.board.located_board import LocatedBoard
 from gpuvision.matching.board.measurement_result import MeasurementLimits
+from gpuvision.matching.features.ruler import best_smoothing
 from gpuvision.matching.pose.pose import BoardPose
 from gpuvision.status import Status
 from gpuvision.workflows import locating_board
@@ -265,6 +266,11 @@ def test_results_of_a_registration(monkeypatch: pytest.MonkeyPatch, status: Stat
         (-3.0, 1e-3, True, 0.0, ""),
         (0.0, 1e-4, True, 0.0, "fits as well 0.10 mm away (x 0.10 mm, y 0.00 mm), with bright copper; show the end"),
         (0.0, 1e-4, False, 0.0, ""),  # the given polarity decides
+        (3.0, 1e-4, True, 0.0, "fits as well 0.10 mm away"),  # 3 standard deviations do not decide
+        (-3.0, 1e-4, True, 0.0, "fits as well 0.10 mm away"),
+        (0.0, 2e-4, True, 0.0, "fits as well 0.20 mm away"),  # both poses at the end of the range
+        (0.0, 1e-3, True, 2e-4, ""),
+        (0.0, 1e-3, True, 2.01e-4, "fits as well 1.00 mm away"),
         (0.0, 1e-3, False, 3e-4, "fits as well 1.00 mm away (x 1.00 mm, y 0.00 mm), with dark copper; show the end"),
     ],
 )
@@ -284,6 +290,111 @@ def test_support_of_a_pose_by_the_image(
     assert asked == [((done.artwork, found, 4.0 * 2e-4, 1.25), {"is_bright": True})]
     monkeypatch.setattr(locating_board, "find_other_pose", lambda *_, **__: None)
     assert done._test_support(board_view(0.0, 0.0), found, "dark", 2e-4) == ""
+
+
+class Measured(NamedTuple):
+    """Result of the measurement of one polarity of copper."""
+
+    reason: str
+    agreeing: int
+    view: str
+
+
+@pytest.mark.parametrize(
+    ("copper", "measured", "kind", "reason"),
+    [
+        ("auto", {"bright": ("", 9), "dark": ("", 8)}, "bright", "supported"),
+        ("auto", {"bright": ("", 8), "dark": ("", 9)}, "dark", "supported"),
+        ("auto", {"bright": ("", 8), "dark": ("", 8)}, "bright", "supported"),
+        ("auto", {"bright": ("few", 9), "dark": ("", 2)}, "dark", "supported"),  # a refused pose does not count
+        ("auto", {"bright": ("few", 2), "dark": ("none", 3)}, "dark", "none"),
+        ("dark", {"bright": ("", 9), "dark": ("", 2)}, "dark", "supported"),
+        ("dark", {"bright": ("", 9), "dark": ("few", 2)}, "dark", "few"),
+    ],
+)
+def test_the_polarity_with_more_agreeing_rulers(
+    copper: Any, measured: Any, kind: str, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    locate_with(monkeypatch, measured, copper, kind=kind, why=reason)
+
+
+@pytest.mark.parametrize(
+    ("changes", "copper", "reason"),
+    [
+        ({"reason": "not registered"}, "auto", "not registered"),
+        ({"smoothing": 0.0}, "auto", "the edges are too dense to tell whether copper is bright or dark"),
+        ({"smoothing": 0.0}, "bright", "supported"),
+        ({"other": "other view"}, "auto", "ambiguous: first view 9, other view 4, 0.6"),
+        ({"other": "other view", "reason": "not registered"}, "auto", "not registered"),
+    ],
+)
+def test_reasons_against_a_pose_in_their_order(
+    changes: Any, copper: Any, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The support by the image is asked last, and only where nothing else is against the pose."""
+    locate_with(monkeypatch, {"bright": ("", 9), "dark": ("", 1)}, copper, kind="bright", why=reason, **changes)
+
+
+def locate_with(
+    monkeypatch: pytest.MonkeyPatch,
+    measured: dict[str, tuple[str, int]],
+    copper: Any,
+    *,
+    kind: str,
+    why: str,
+    smoothing: float | None = None,
+    **changes: Any,
+) -> None:
+    """Locate a board with these measurements, and compare the polarity and the reason."""
+    calls: list[Any] = []
+
+    class Measurer:
+        def __init__(self, *given: Any) -> None:
+            assert given[1:] == (features, 2.0, 9.0, 1.25, 8e-6, "cpu")
+
+        def measure(self, view: str, each: str) -> Measured:
+            if view == "other view":
+                assert each == kind
+                return Measured("", 4, view)
+            return Measured(*measured[each], f"{each} {view}")
+
+    best = best_smoothing(1.25)
+    imaging = SimpleNamespace(width_px=5.0, blur_px=1.25, shift=3e-4, smoothing_px=best if smoothing is None else 0.0)
+    features: Any = SimpleNamespace(
+        length=np.array([1e-4, 3e-4]),
+        spacing=np.array([0.0, 2e-5]),
+        fiducials=SimpleNamespace(radius=np.zeros(3)),
+        imaging=imaging,
+    )
+    monkeypatch.setattr(locating_board, "BoardMeasurer", Measurer)
+    monkeypatch.setattr(
+        locating_board,
+        "_reason_of_ambiguity",
+        lambda expected, found, other, share: f"ambiguous: first view {found.agreeing}, {other.view} 4, {share}",
+    )
+    monkeypatch.setattr(_Job, "_test_support", lambda self, *given: calls.append(given) or "supported")
+    monkeypatch.setattr(_Job, "_result", lambda self, *given: given)
+    sizes: list[Any] = []
+    devices: Any = SimpleNamespace(choose=lambda step, run, *size: sizes.append((step, size[2:])) or "cpu")
+    done: Any = job(devices=devices)
+    view: Any = FirstView("first view")
+    found: Any = done.locate(_ExpectedPose(view, (1e-3, 0.1), found="registration", **changes), features, copper)  # type: ignore[arg-type]
+    measurement, chosen, given, registration, reason = found
+    assert (chosen, given, registration) == (kind, features, "registration")
+    assert measurement.view == f"{kind} first view"
+    assert reason.startswith(why)
+    expected = [(view, f"{kind} first view", kind, 3e-4)]
+    assert calls == (expected if why == "supported" else [])
+    # Two rulers of 20 px together, pairs 1 px apart, three fiducials.
+    ((step, size),) = sizes
+    assert (step, size) == ("rulers", pytest.approx((2.0, 3.0, 20.0, 1.0, 5.0)))
+    assert {"rulers", "support"} & set(done.clock.seconds) == ({"rulers", "support"} if calls else {"rulers"})
+
+
+class FirstView(str):
+    """Name of the expected view, which has the size of a pixel."""
+
+    scale = 2e-5
 
 
 def test_covariance_at_the_image_centre(monkeypatch: pytest.MonkeyPatch) -> None:

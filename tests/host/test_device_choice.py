@@ -87,6 +87,15 @@ def test_small_work_runs_on_the_cpu_beside_a_gpu(
     assert str(found) == f"TimedCalls on {device.label}, 1e+03 us (gpu 3e+04 us)"
 
 
+def test_calls_of_a_measurement(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three calls bind the operation and fill the caches, 15 are timed; with one device, too."""
+    calls: list[Any] = []
+    monkeypatch.setattr(TimedCalls, "__call__", lambda self, *inputs, device: calls.append((inputs, device)))
+    found = fastest_device(TimedCalls(strip_length=6e-3), "frames", devices=[device])  # type: ignore[arg-type]
+    assert calls == [(("frames",), device)] * 18
+    assert (found.operation, found.device, set(found.seconds)) == ("TimedCalls", device, {device.label})
+
+
 def test_named_device_is_the_only_one(gpu: Device, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     assert device_choice.candidate_devices() == (gpu, device)
     monkeypatch.setenv("GPUVISION_DEVICE", "gpu")

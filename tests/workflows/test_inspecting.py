@@ -6,6 +6,7 @@ import csv
 import inspect
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -16,6 +17,7 @@ from gpuvision.formats.height_files import HeightMapFile
 from gpuvision.formats.range_image import write_tiff
 from gpuvision.inspection.apertures import BoardPlacement
 from gpuvision.inspection.paste import PasteSettings
+from gpuvision.workflows import inspecting_paste
 from gpuvision.workflows.inspecting_leads import inspect_leads
 from gpuvision.workflows.inspecting_paste import inspect_paste
 from paste_maps import Box, Cap, board_grid, circle, paste_map
@@ -218,3 +220,65 @@ def test_noise_that_is_no_noise_is_refused(given: dict[str, float], message: str
         inspect_leads(heights, place, **given)
     with pytest.raises(ValueError, match=message):
         inspect_paste(heights, place, PasteSettings(stencil=1e-4), pose=(0.0, 0.0, 0.0), **given)
+
+
+def aperture(x: float, y: float) -> Any:
+    """Return an aperture of 2 x 1 mm with its lower left corner at a place [m]."""
+    return SimpleNamespace(bounds=np.array([[x, y], [x + 2e-3, y + 1e-3]]))
+
+
+@pytest.mark.parametrize(("side", "sign"), [("top", 1.0), ("bottom", -1.0)])
+def test_a_search_begins_with_the_centres_over_each_other(side: Any, sign: float) -> None:
+    """The apertures reach from (1, 2) to (9, 7) mm; the map of 5 x 3 cells of 2 x 4 mm from (10, 30) mm."""
+    grid = SimpleNamespace(left=10e-3, top=30e-3, columns=5, rows=3, cell_x=2e-3, cell_y=4e-3)
+    heights: Any = SimpleNamespace(grid=grid)
+    found = inspecting_paste._centred(heights, [aperture(1e-3, 6e-3), aperture(7e-3, 2e-3)], side)
+    assert (found.side, found.theta) == (side, 0.0)
+    assert found.x == pytest.approx(14e-3 - sign * 5e-3)
+    assert found.y == pytest.approx(26e-3 - 4.5e-3)
+
+
+@pytest.mark.parametrize("given", ["pose", "initial_pose", None])
+def test_a_pose_is_known_or_the_beginning_of_a_search(given: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    pose = (1e-3, -2e-3, 0.1)
+    calls: list[Any] = []
+    place, aligned, centred = (SimpleNamespace(name=name) for name in ("place", "aligned", "centred"))
+
+    def align(z: Any, grid: Any, apertures: Any, settings: Any, *, initial: Any, search_range: Any) -> Any:
+        calls.append(("align", initial, search_range))
+        return SimpleNamespace(placement=aligned)
+
+    def measure(z: Any, grid: Any, apertures: Any, placement: Any, settings: Any, **how: Any) -> Any:
+        calls.append(("measure", placement, how))
+        return "deposits"
+
+    monkeypatch.setattr(inspecting_paste, "align_apertures", align)
+    monkeypatch.setattr(inspecting_paste, "measure_deposits", measure)
+    monkeypatch.setattr(inspecting_paste, "_centred", lambda *_: centred)
+    monkeypatch.setattr(inspecting_paste, "BoardPlacement", lambda **where: SimpleNamespace(**vars(place), where=where))
+    heights: Any = SimpleNamespace(z="z", grid="grid", sigma=3e-6, phase="phase")
+    options: dict[str, Any] = {} if given is None else {given: pose}
+    found = inspect_paste(
+        heights,
+        ["aperture"],
+        "settings",
+        side="bottom",
+        search_range=(1e-3, 0.2),
+        correlation_area=4.0,
+        **options,  # type: ignore[list-item, arg-type]
+    )
+    where = {"x": 1e-3, "y": -2e-3, "theta": 0.1, "side": "bottom"}
+    *searched, (_, placement, how) = calls
+    assert how == {"sigma": 3e-6, "phase": "phase", "correlation_area": 4.0}
+    if given == "pose":
+        assert searched == []
+        assert placement.where == where
+        assert found.alignment is None
+    else:
+        ((_, initial, search_range),) = searched
+        assert search_range == (1e-3, 0.2)
+        assert initial is centred if given is None else initial.where == where
+        assert placement is aligned
+        assert found.alignment is not None
+    with pytest.raises(ValueError, match="pose and initial_pose are both given; expected a known pose or the"):
+        inspect_paste(heights, [], "settings", side="top", pose=pose, initial_pose=pose)  # type: ignore[arg-type]

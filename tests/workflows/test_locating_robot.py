@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import cv2
@@ -28,6 +29,7 @@ from gpuvision.matching.field.evidence import (
     expected_crossings,
     robot_to_field,
 )
+from gpuvision.matching.field.field_pose import PoseCandidate
 from gpuvision.matching.field.line_detection import FloorScan
 from gpuvision.status import Status
 from gpuvision.workflows import locating_robot
@@ -336,6 +338,107 @@ def test_scans_of_other_geometry_do_not_share_their_times(device: Device, monkey
 def test_numbers_of_a_scan_out_of_range_are_refused(how: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         scan_floor(np.zeros((96, 128), np.uint8), **{"scale": SCALE, "line_width": WIDE, **how})
+
+
+@pytest.mark.parametrize(
+    ("length", "width", "far", "margin", "scale", "most"),
+    [
+        (20.0, 12.0, 6.0, None, 0.25, 6.006 + 0.25),
+        (20.0, 12.0, 40.0, None, 0.25, 30.0),  # at most 1.5 lengths
+        (3.0, 5.0, 2.0, None, 0.1, 2.002 + 0.1),  # a fiftieth of the longer side
+        (12.5, 5.0, 2.0, None, 0.25, 2.002 + 0.25),
+        (20.0, 12.0, 6.0, 0.0, 0.25, 6.006 + 0.25),
+    ],
+)
+def test_map_of_a_search(
+    length: float,
+    width: float,
+    far: float,
+    margin: float | None,
+    scale: float,
+    most: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Cells of 0.4 scales, a border of a twentieth of the field, a range that holds the farthest point."""
+    monkeypatch.setattr(locating_robot, "DistanceMap", lambda **how: how)
+    field: Any = SimpleNamespace(length=length, width=width)
+    device: Any = "a device"
+    points = np.array([[0.1, 0.2], [-0.6 * far, 0.8 * far]], np.float32)
+    found: Any = locating_robot._search_map(field, points, margin, device)
+    assert found == {
+        "field": field,
+        "cell": pytest.approx(0.4 * scale),
+        "scale": pytest.approx(scale),
+        "max_range": pytest.approx(most, rel=1e-6),
+        "margin": pytest.approx(0.05 * max(length, width) if margin is None else margin),
+        "device": device,
+    }
+
+
+@pytest.mark.parametrize(
+    ("length", "width", "expected"), [(4.99, 3.0, 0.02), (5.0, 3.0, 0.125), (3.0, 5.0, 0.125), (18.0, 12.0, 0.125)]
+)
+def test_small_fields_have_thin_lines(length: float, width: float, expected: float) -> None:
+    field: Any = SimpleNamespace(length=length, width=width)
+    assert locating_robot.default_line_width(field) == expected
+
+
+@pytest.mark.parametrize("is_scan", [False, True])
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("refused", [False, True])
+def test_a_search_and_its_evidence(is_scan: bool, known: bool, refused: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At least 24 poses are refined; the evidence is that of the lines' width; a doubtful pose is no candidate."""
+    points = np.arange(8, dtype=np.float32).reshape(4, 2)
+    given: Any = FloorScan(points, np.zeros(4, np.float32), np.ones((2, 4), np.float32), 0.05) if is_scan else points
+    field: Any = SimpleNamespace(length=3.0, width=2.0)
+    level = SimpleNamespace(shape=(7, 9))
+    field_map = SimpleNamespace(cells=SimpleNamespace(level=level), scale=0.06, max_range=4.0, margin=0.15)
+    pose = (0.1, 0.2, 0.3) if known else None
+    asked: list[Any] = []
+
+    def search(searched: Any, used: Any, **how: Any) -> Any:
+        assert searched is field_map
+        np.testing.assert_array_equal(used, points)
+        asked.append(how)
+        one = np.eye(3)
+        return tuple(PoseCandidate(np.full(3, float(k)), one, one, 0.1, 0.2, 0.9, None, Status.OK) for k in range(3))
+
+    def weigh(used: Any, paths: Any, on: Any, pose: Any, **how: Any) -> Evidence:
+        asked.append((None if paths is None else paths.shape, on is field, float(pose[0]), how))
+        return Evidence(-20.0 if not refused else 0.0, 0.9, 20, 0.9, 0.8)
+
+    monkeypatch.setattr(locating_robot, "_search_map", lambda *_: field_map)
+    monkeypatch.setattr(locating_robot, "find_pose_candidates", search)
+    monkeypatch.setattr(locating_robot, "evidence", weigh)
+    sizes: list[Any] = []
+
+    class Devices(StepDevices):
+        def __init__(self) -> None:
+            self.choices = {}
+
+        first: Any = "first"
+
+        def choose(self, step: str, run: Any, *size: object) -> Any:
+            sizes.append((step, size))
+            return "chosen"
+
+    found = locate_robot(given, field, initial_pose=pose, scale=0.04, max_candidates=2, device=Devices())
+    assert sizes == [("search", ((7, 9), 4.0, not known, 24))]
+    searched, *weighed = asked
+    assert searched == {"initial_pose": pose, "max_candidates": 24, "device": "chosen"}
+    half = 0.025 if is_scan else 0.01
+    margin = None if known else 0.15
+    how = {"half_line_width": pytest.approx(half), "scale": 0.06, "max_range": 4.0, "margin": margin}
+    assert weighed == [((2, 4) if is_scan else None, True, float(k), how) for k in range(3)]
+    assert [float(each.pose[0]) for each in found.candidates] == ([] if refused else [0.0, 1.0])
+    assert [float(each.pose[0]) for each in found.doubtful] == ([0.0] if refused else [])
+    assert (found.device, found.scale, bool(found.reason)) == ("chosen", 0.04, refused)
+    assert set(found.seconds) == {"map", "choose device", "search"}
+    # One point less than unknowns and one.
+    few = locate_robot(points[:3], field, device=Devices())
+    assert few.reason == "3 points on lines, expected 4 or more"
+    assert (few.candidates, few.doubtful, few.evidence, few.seconds) == ((), (), None, {})
+    assert few.device == "first"
 
 
 def replaced(scan: FloorScan, share: float, rng: np.random.Generator) -> FloorScan:

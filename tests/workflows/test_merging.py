@@ -222,6 +222,35 @@ def test_wrong_files_are_refused(rng: np.random.Generator, tmp_path: Path) -> No
         merge_scans(scan, tmp_path / "bare.tiff", tolerance=1e-6)
 
 
+def test_arrays_of_another_shape_are_refused(rng: np.random.Generator, tmp_path: Path) -> None:
+    scan = write_scan(tmp_path / "first", step(rng, slice(0, 0)))
+    arrays, units = read_npz(scan / "range_image.npz")
+    for name in ("map_status", "map_intensity"):
+        write_npz(tmp_path / "cut.npz", {**arrays, name: arrays[name][:, :-1]}, units, overwrite=True)
+        with pytest.raises(ReadError, match=rf"cut\.npz: {name} has shape \(40, 59\), expected \(40, 60\) as map_z"):
+            read_height_map(tmp_path / "cut.npz")
+
+
+def test_what_a_map_does_not_hold_follows_from_its_heights(rng: np.random.Generator, tmp_path: Path) -> None:
+    """Without flags a hole has no data; without intensities a height has intensity 0."""
+    scan = write_scan(tmp_path / "first", step(rng, slice(30, 38)))
+    arrays, _ = read_npz(scan / "range_image.npz")
+    del arrays["map_status"], arrays["map_intensity"]
+    write_npz(tmp_path / "bare.npz", arrays, dict.fromkeys(arrays, "m"))
+    heights, _ = read_height_map(tmp_path / "bare.npz")
+    holes = np.isnan(arrays["map_z"])
+    np.testing.assert_array_equal(heights.status, np.where(holes, Status.NO_DATA, Status.OK))
+    np.testing.assert_array_equal(heights.intensity, np.where(holes, np.nan, 0.0))
+    assert np.asarray(heights.status).dtype == np.uint8
+
+
+def test_files_of_a_merge_with_and_without_sigma() -> None:
+    merge: Any = object.__new__(HeightMapMerge)
+    for sigma, files in ((None, MERGE_FILES), (np.zeros(1), (*MERGE_FILES, SIGMA_FILE))):
+        object.__setattr__(merge, "heights", SimpleNamespace(sigma=sigma))
+        assert merge.files() == files
+
+
 def test_inputs_are_not_replaced(scans: tuple[Path, Path], run: Run) -> None:
     before = (scans[0] / "range_image.npz").read_bytes()
     code, _, err = run("merge", *scans, "--out", scans[0], "--overwrite")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -104,6 +104,26 @@ def test_coarse_pixels_add_signal_or_leave_it_out(rng: np.random.Generator, mean
     skipped = SENSOR.skipping(3)
     assert skipped.electrons(2.0, exposure) == pytest.approx(SENSOR.electrons(2.0, exposure))
     assert skipped.shape == coarse.shape
+
+
+@pytest.mark.parametrize(("factor", "rows", "columns"), [(1, 100, 130), (3, 33, 43), (130, 1, 1)])
+def test_parameters_of_coarse_pixels(factor: int, rows: int, columns: int) -> None:
+    """Charge adds up; independent offsets and gains average out; a pixel that is skipped collects no light."""
+    size = {"rows": rows, "columns": columns, "pitch": pytest.approx(factor * 5e-6)}
+    binned = {
+        "full_well": factor**2 * 12e3,
+        "dark_current": factor**2 * 2e3,
+        "dsnu": factor * 4.0,
+        "prnu": 0.01 / factor,
+    }
+    for found, changed in (
+        (SENSOR.binned(factor), {name: pytest.approx(value) for name, value in binned.items()}),
+        (SENSOR.skipping(factor), {"collecting": pytest.approx(1.0 / factor**2)}),
+    ):
+        assert asdict(found) == asdict(SENSOR) | size | changed
+    for made in (SENSOR.binned, SENSOR.skipping):
+        with pytest.raises(ValueError, match="factor is 0, expected at least 1"):
+            made(0)
 
 
 def test_saturation_is_the_full_well_or_the_largest_level() -> None:

@@ -60,6 +60,13 @@ def test_arrays(tmp_path: Path) -> None:
         ("e.npy", np.zeros(3), "count", r"e.npy: an NPY file holds one array, without a name; leave out encoder_key"),
         ("e.npy", b"no array", None, r"e.npy: not a readable"),
         ("e.npz", b"no archive", None, r"e.npz: not a readable encoder file"),
+        (
+            "e.npz",
+            {"a": np.array([1, None])},
+            None,
+            r"e.npz: not a readable encoder file: Object arrays cannot be loaded",
+        ),
+        ("e.npy", np.array([1, None]), None, r"e.npy: not a readable"),
         ("e.npz", {"a": np.zeros(2), "b": np.zeros(2)}, None, r"several arrays; name one of them .* \(a, b\)"),
     ],
 )

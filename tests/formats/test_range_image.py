@@ -167,6 +167,14 @@ def test_an_npz_holds_all_arrays_and_their_units(tmp_path, rng):
         export.write_npz(tmp_path / "all.npz", arrays, {"x": "m"})
 
 
+def test_an_npz_with_objects_is_refused(tmp_path):
+    np.savez(tmp_path / "objects.npz", x=np.array([1, None]), units=np.array('{"x": "m"}'))
+    with pytest.raises(
+        ValueError, match=r"not a readable NPZ file of arrays and units: Object arrays cannot be loaded"
+    ):
+        export.read_npz(tmp_path / "objects.npz")
+
+
 WRITERS = {
     "tiff": lambda path, **how: export.write_tiff(path, np.zeros((2, 2)), **how),
     "png": lambda path, **how: export.write_png16(path, np.zeros((2, 2)), **how),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -155,11 +156,11 @@ class CmosSensor:
     def saturation(self) -> float:
         """Photoelectrons at which a pixel saturates: its full well, or the largest grey level."""
         wanted = (self.max_level - self.dark_level) / self.gain
-        if self.nonlinearity and wanted < self.full_well * (1.0 - self.nonlinearity):
-            # Smaller root of n - (nonlinearity / full_well) n^2 = wanted, without cancellation.
-            bend = self.nonlinearity / self.full_well
-            wanted = 2.0 * wanted / (1.0 + float(np.sqrt(1.0 - 4.0 * bend * wanted)))
-        return float(min(self.full_well, wanted))
+        if wanted >= self.full_well * (1.0 - self.nonlinearity):
+            return float(self.full_well)
+        # Smaller root of n - (nonlinearity / full_well) n^2 = wanted, without cancellation.
+        bend = self.nonlinearity / self.full_well
+        return 2.0 * wanted / (1.0 + math.sqrt(1.0 - 4.0 * bend * wanted))
 
     @property
     def read_noise(self) -> float:

@@ -131,7 +131,13 @@ def test_saturation_is_the_full_well_or_the_largest_level() -> None:
     assert replace(SENSOR, bits=11).saturation == pytest.approx((2047 - 64) / 0.2)
     bent = replace(SENSOR, bits=11, nonlinearity=0.1)
     assert float(bent.level(bent.saturation)) == pytest.approx(2047.0)
-    assert bent.saturation > replace(SENSOR, bits=11).saturation
+    # n (1 - 0.1 n / 12 000) = 9915
+    assert bent.saturation == pytest.approx((1.0 - math.sqrt(1.0 - 0.4 * 9915.0 / 12e3)) * 12e3 / 0.2, rel=1e-12)
+    assert replace(SENSOR, nonlinearity=0.1).saturation == 12e3
+    # At the full well the response is 12 000 (1 - 0.1) = 10 800 electrons: 2160 levels above the dark level.
+    for level, expected in ((4095.0 - 2161.0, 12e3), (4095.0 - 2160.0, 12e3), (4095.0 - 2159.0, 11_993.76)):
+        found = replace(SENSOR, nonlinearity=0.1, dark_level=level)
+        assert found.saturation == pytest.approx(expected, rel=1e-6)
     assert float(bent.level(1e9)) == 2047.0
     # The slope of a bent response magnifies the noise behind it.
     assert float(bent.noise(8000.0) ** 2 - 8000.0 - 80.0**2) == pytest.approx(

@@ -101,6 +101,19 @@ def test_what_says_nothing_is_refused(lines: list[list[np.ndarray]], message: st
         pack(lines)
 
 
+@pytest.mark.parametrize(("part", "is_extended"), [(1.01, True), (0.99, False)])
+def test_least_extent_of_a_line(part: float, is_extended: bool) -> None:
+    """The points of a line scatter by 1e-7 of half the diagonal of all points, 5 px, or more."""
+    side = np.array([0.0, 1.0, 2.0, 3.0])
+    long = np.stack([2.0 * side, 8.0 * side / 3.0], axis=1)  # 6 x 8 px
+    short = 3.0 + part * 5e-7 / side.std() * np.stack([0.6 * side, 0.8 * side], axis=1)
+    if is_extended:
+        assert pack([[long, short]]).counts.tolist() == [4, 4]
+    else:
+        with pytest.raises(ValueError, match="all points of line 1 lie on one place"):
+            pack([[long, short]])
+
+
 @pytest.mark.parametrize("shape", [(3, 2), (3, 3, 1), (3, 3, 3), (3, 3, 2, 1)])
 def test_shape_of_a_grid(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=re.escape(f"grid points have shape {shape}")):

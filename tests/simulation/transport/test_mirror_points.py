@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from canary import Guarded
 from gpuvision.host import Device
 from gpuvision.reference import mirrors as reference
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.transport.mirror_points import MirrorPoints, smooth_normals
+from gpuvision.simulation.transport.mirror_points import MirrorPoints, TriangleBlocks, max_bulge, smooth_normals
 from gpuvision.status import Status
 
 WAYS = pytest.mark.parametrize(
@@ -203,6 +204,97 @@ def test_normals_of_a_cylinder_turn_round_and_of_no_area_are_zero() -> None:
     wall = np.abs(normals[:-2, 0, 2]) < 0.5
     radial = scene.corners[:-2][wall] * [1, 1, 0]
     np.testing.assert_allclose(normals[:-2][wall], radial / np.linalg.norm(radial, axis=2, keepdims=True), atol=1e-12)
+
+
+@pytest.mark.parametrize("crease", [0.5, 0.7, 1.0])
+def test_normals_of_a_soup_are_maxs_means(crease: float, rng: np.random.Generator) -> None:
+    """Sums over the corners at one position, weighted by sine over the product of the edges, up to the crease angle."""
+    ball = np.array(trimesh.creation.icosphere(0).triangles)
+    shape = np.array([[1.0, 0.3, 0.1], [0.0, 0.8, 0.2], [0.1, -0.2, 1.3]])
+    corners = ball @ shape.T
+    found = smooth_normals(Scene(corners), crease=crease)
+    edges = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat = edges / np.linalg.norm(edges, axis=1, keepdims=True)
+    joined = 0
+    for triangle, corner in np.ndindex(len(corners), 3):
+        total = np.zeros(3)
+        for other, k in np.ndindex(len(corners), 3):
+            if np.array_equal(corners[other, k], corners[triangle, corner]) and flat[other] @ flat[triangle] > np.cos(
+                crease
+            ):
+                a, b = (corners[other, (k + step) % 3] - corners[other, k] for step in (1, 2))
+                total += np.cross(a, b) / (a @ a * (b @ b))
+                joined += 1
+        np.testing.assert_allclose(found[triangle, corner], total / np.linalg.norm(total), rtol=0, atol=1e-13)
+    assert 60 < joined < 300
+
+
+def test_the_bulge_is_bounded(rng: np.random.Generator) -> None:
+    """The bound by its definition, and the lift of points by half the weighted depths below the tangent planes."""
+    corners = rng.uniform(-1.0, 1.0, (40, 3, 3))
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None] + rng.normal(
+        0, 0.3, (40, 3, 3)
+    )
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    found = max_bulge(corners, normals)
+    weights = rng.dirichlet([1.0, 1.0, 1.0], 200)
+    for triangle, (points, directions) in enumerate(zip(corners, normals, strict=True)):
+        heights = [
+            abs((points[j] - points[i]) @ directions[i]) + abs((points[j] - points[i]) @ directions[j])
+            for i, j in ((0, 1), (1, 2), (2, 0))
+        ]
+        assert found[triangle] == pytest.approx(max(heights) / 6.0, rel=1e-12)
+        place = weights @ points
+        depth = np.stack(
+            [(each - place) @ direction for each, direction in zip(points, directions, strict=True)], axis=1
+        )
+        lift = 0.5 * (weights * depth) @ directions
+        assert np.linalg.norm(lift, axis=1).max() <= found[triangle] * (1.0 + 1e-12)
+    assert max_bulge(np.zeros((0, 3, 3)), np.zeros((0, 3, 3))).shape == (0,)
+
+
+def test_blocks_bound_their_triangles(rng: np.random.Generator) -> None:
+    """Every corner with the bulge is in the ball of its block, every normal in its cone; both bounds are reached."""
+    corners, normals = ball(2, (1.0, 0.6, 0.4))
+    one_sided = rng.random(len(corners)) < 0.9
+    blocks = TriangleBlocks.of(corners, normals, outside=one_sided)
+    assert sorted(blocks.order) == list(range(len(corners)))
+    assert blocks.start[0] == 0
+    assert blocks.start[-1] == len(corners)
+    for n, (first, last) in enumerate(itertools.pairwise(blocks.start)):
+        mine = blocks.order[first:last]
+        points, directions = corners[mine].reshape(-1, 3), normals[mine].reshape(-1, 3)
+        np.testing.assert_allclose(blocks.middle[n], 0.5 * (points.min(axis=0) + points.max(axis=0)))
+        reach = np.linalg.norm(corners[mine] - blocks.middle[n], axis=2).max(axis=1) + max_bulge(
+            corners[mine], normals[mine]
+        )
+        assert blocks.radius[n] == pytest.approx(reach.max(), rel=1e-12)
+        mean = directions.sum(axis=0)
+        np.testing.assert_allclose(blocks.axis[n], mean / np.linalg.norm(mean), atol=1e-12)
+        assert blocks.cone[n] == pytest.approx(np.arccos(np.clip(directions @ blocks.axis[n], -1, 1)).max(), rel=1e-6)
+        assert blocks.outside[n] == one_sided[mine].all()
+    rows = blocks.rows(np.array([0.5, -1.0, 2.0]))
+    np.testing.assert_allclose(rows.middle, blocks.middle - [0.5, -1.0, 2.0])
+    assert np.all(rows.radius > blocks.radius)
+    np.testing.assert_allclose(rows.radius, blocks.radius, rtol=2e-5)
+    twice = np.minimum(2.0 * blocks.cone * (1.0 + 1e-5) + 1e-6, np.pi)
+    np.testing.assert_allclose([rows.cosine_of_twice, rows.sine_of_twice], [np.cos(twice), np.sin(twice)], atol=1e-12)
+    np.testing.assert_allclose(rows.sine, np.sin(0.5 * twice), atol=1e-12)
+    np.testing.assert_array_equal(rows.one_sided, blocks.outside & (twice < 0.5 * np.pi))
+    assert 0.0 < rows.one_sided.mean() < 1.0
+
+
+def test_normals_that_cancel_have_a_wide_cone() -> None:
+    corners = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]]).repeat(2, axis=0)
+    normals = np.array([[[1.0, 0.0, 0.0]] * 3, [[-1.0, 0.0, 0.0]] * 3])
+    blocks = TriangleBlocks.of(corners, normals)
+    np.testing.assert_array_equal(blocks.axis, [[0.0, 0.0, 1.0]])
+    assert blocks.cone[0] == pytest.approx(0.5 * np.pi)
+    assert not blocks.outside.any()
+    empty = TriangleBlocks.of(corners[:0], normals[:0])
+    assert empty.table(np.zeros(3)).shape == (1, 11)
+    assert not empty.table(np.zeros(3)).any()
+    assert blocks.table(np.zeros(3)).shape == (1, 11)
 
 
 @WAYS

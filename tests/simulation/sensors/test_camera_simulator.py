@@ -145,6 +145,23 @@ def test_axes_that_run_backwards(device: Device) -> None:
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-9)
 
 
+def test_heights_of_signals_are_in_the_order_of_the_view(device: Device) -> None:
+    """Also where the columns or the rows of the frame run the other way; the offset is added once."""
+    view, axes = camera_view(), pixel_axes(camera_view())
+    pixels = 30.0 + np.arange(view.samples) * 0.37
+    light = line(view, pixels)["direct"]
+    expected = sheet_point(view.triangulation, view.u_centres[0] + PIXEL * pixels, view.v_centres)[1]
+    for u, v in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)):
+        turned = SampleAxes(
+            position_origin=axes.position_origin if u > 0.0 else float(view.u_centres[-1]),
+            position_pitch=u * axes.position_pitch,
+            sample_origin=axes.sample_origin if v > 0.0 else float(view.v_centres[-1]),
+            sample_pitch=v * axes.sample_pitch,
+        )
+        simulator = camera(view, readout={"axes": turned, "threshold": 5.0}, gain=1e-3, offset=5.0)
+        np.testing.assert_allclose(simulator.heights(simulator.signal(light), device), expected, atol=2e-6)
+
+
 def test_dark_profiles(device: Device) -> None:
     reading = camera().read({"direct": camera_view().dark()}, device=device)
     assert (reading.status == Status.LOW_SIGNAL).all()

@@ -236,6 +236,28 @@ def test_noise_belongs_to_the_profile() -> None:
     assert not np.array_equal(simulator.currents(light, seed=4), whole[0])
 
 
+def test_a_reading_is_of_profile_0_by_default(device: Device) -> None:
+    view = psd_view()
+    light = {"direct": gaussian(view, [0.0], 1e-6, 5e-5)}
+    simulator = psd(view, readout={"noise": PsdNoise(independent=1e-9)})
+    first, other = (simulator.read(light, seed=3, first_profile=k, device=device).position for k in (0, 1))
+    np.testing.assert_array_equal(simulator.read(light, seed=3, device=device).position, first)
+    np.testing.assert_array_equal(simulator.currents(light, seed=3), simulator.currents(light, seed=3, first_profile=0))
+    assert np.all(first != other)
+
+
+def test_heights_of_signals_are_in_the_order_of_the_view(device: Device) -> None:
+    """Also where the strips of the readout run the other way."""
+    view = psd_view()
+    places = np.linspace(-2e-3, 1e-3, 5)
+    light = gaussian(view, places, 1e-6, 5e-5)
+    backwards = SampleAxes(sample_origin=float(view.v_centres[-1]), sample_pitch=-PITCH)
+    expected = sheet_point(view.triangulation, places, view.v_centres)[1]
+    for simulator in (psd(view), psd(view, readout={"axes": backwards})):
+        heights = simulator.heights(simulator.signal(light), device)
+        np.testing.assert_allclose(heights, expected, rtol=1e-6, atol=1e-9 if device.has_double else 1e-7)
+
+
 def test_ambient_light_has_shot_noise_also_where_its_mean_is_gone() -> None:
     view = psd_view()
     light = stack_profiles([{"direct": gaussian(view, [0.0], 1e-6, 5e-5)}] * 400)

@@ -25,14 +25,6 @@ from gpuvision.servoing.delay_response import FrameTimeCurve
 SQUARE = np.array([[0.0, 0.0], [1e-3, 0.0], [1e-3, 1e-3], [0.0, 1e-3]])
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """Figures that are saved from now on."""
-    figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **how: figures.append(figure))
-    return figures
-
-
 def data(line: Any) -> np.ndarray:
     """Return the points of a drawn line (n, 2)."""
     return np.stack([np.asarray(line.get_xdata(), float), np.asarray(line.get_ydata(), float)], axis=-1)
@@ -79,6 +71,49 @@ def test_layers_of_the_artwork() -> None:
     np.testing.assert_allclose([drill.min(axis=0), drill.max(axis=0)], [[1.8, 1.8], [2.2, 3.2]], atol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("shift", "is_shown"),
+    [
+        ((0.0, 0.0), True),
+        ((4e-3, 0.0), True),  # it touches the window of 4 mm
+        ((0.0, 4e-3), True),
+        ((-1e-3, 0.0), True),
+        ((0.0, -1e-3), True),
+        ((4.1e-3, 0.0), False),
+        ((0.0, 4.1e-3), False),
+        ((-1.1e-3, 0.0), False),
+        ((0.0, -1.1e-3), False),
+    ],
+)
+def test_only_shapes_in_the_window_are_drawn(shift: tuple[float, float], is_shown: bool) -> None:
+    axes = new_figure(4.0, 4.0).add_subplot()
+    artwork = some_artwork(silk=(Shape(SQUARE + shift),))
+    draw_artwork(axes, artwork, np.array([[0.0, 0.0], [4e-3, 4e-3]]))
+    silk: Any = axes.collections[2]
+    assert len(silk.get_paths()) == is_shown
+
+
+@pytest.mark.parametrize(("height", "inches"), [(0.3e-3, 3.0), (2e-3, 4.5), (9e-3, 12.0)])
+def test_size_of_the_page_of_features(height: float, inches: float, drawn: list[Figure], tmp_path: Path) -> None:
+    """9 in wide, 3 to 12 in high, and a line of text; a border of 4 % of the longer side around 4 mm."""
+    region = np.array([[0.0, 0.0], [4e-3, height]])
+    draw_features(tmp_path / "features.png", some_artwork(), features(region=region), region)
+    border = 0.04 * max(4e-3, height)
+    high = 9.0 * (height + 2 * border) / (4e-3 + 2 * border)
+    expected = high if inches == 4.5 else inches
+    assert tuple(drawn[0].get_size_inches()) == pytest.approx((9.0, expected + 0.9))
+
+
+@pytest.mark.parametrize(("rows", "inches"), [(10, 3.0), (90, 14.0)])
+def test_size_of_the_page_of_a_located_board(rows: int, inches: float, drawn: list[Figure], tmp_path: Path) -> None:
+    view = BoardView(scale=1e-4, shape=(rows, 61), pose=(0.0, 0.0, 0.0))
+    draw_located_board(tmp_path / "a.png", np.zeros((rows, 61)), some_artwork(), located_board(view))
+    assert tuple(drawn[0].get_size_inches()) == pytest.approx((10.0, inches + 0.8))
+    # A flat image has a grey scale, too.
+    low, high = drawn[0].axes[0].images[0].get_clim()
+    assert low == 0.0 < high < 1e-6
+
+
 def features(**changes: Any) -> Any:
     values = {
         "region": np.array([[0.0, 0.0], [4e-3, 3e-3]]),
@@ -98,6 +133,8 @@ def test_selected_features(side: str, drawn: list[Figure], tmp_path: Path) -> No
     chosen = features()
     region = [[0.0, 0.0], [4e-3, 3e-3]]
     draw_features(tmp_path / "features.png", some_artwork(side=side), chosen, region)
+    # As wide as high as the window of 4.32 x 3.32 mm.
+    assert [*drawn[0].get_size_inches(), drawn[0].dpi] == pytest.approx([9.0, 9.0 * 3.32 / 4.32 + 0.9, 150])
     (axes,) = drawn[0].axes
     rulers = [each for each in axes.collections if isinstance(each, LineCollection)]
     np.testing.assert_allclose(segments(rulers[0]), [[[0.9, 2.0], [1.1, 2.0]]])
@@ -152,6 +189,7 @@ def test_located_board(drawn: list[Figure], tmp_path: Path) -> None:
     image = np.linspace(0.0, 1.0, 41 * 61).reshape(41, 61)
     located = located_board(view)
     draw_located_board(tmp_path / "located.png", image, some_artwork(), located)
+    assert [*drawn[0].get_size_inches(), drawn[0].dpi] == pytest.approx([10.0, 10.0 * 41 / 61 + 0.8, 150])
     (axes,) = drawn[0].axes
     (shown,) = axes.images
     np.testing.assert_array_equal(shown.get_array(), image)
@@ -216,6 +254,7 @@ def test_delay_of_a_loop(drawn: list[Figure], tmp_path: Path) -> None:
         period=2e-3,
     )
     draw_delay(tmp_path / "delay.png", picture)
+    assert tuple(drawn[0].get_size_inches()) == (12.0, 8.5)
     budget, step, locus, against, beside = drawn[0].axes
     bars = [(each.get_x(), each.get_width()) for each in map(cast, ["Any"] * 2, budget.patches)]
     assert bars == [pytest.approx((0.0, 2.0)), pytest.approx((2.0, 3.0))]
@@ -244,7 +283,9 @@ def test_measured_delay(drawn: list[Figure], tmp_path: Path) -> None:
     command, seen = 1e-6 * np.arange(5.0), 2e-6 * np.arange(5.0)
     delay = MeasuredDelay(2e-3, 1e-5, 3e-4, 1e-5, 1.0, 1e-9, 2.5, np.array([2e-3, 2.1e-3, 2.1e-3]))
     draw_measured_delay(tmp_path / "measured.png", time, command, seen, delay)
+    assert tuple(drawn[0].get_size_inches()) == (12.0, 4.5)
     left, right = drawn[0].axes
+    assert left.get_position().width / right.get_position().width == pytest.approx(2.0)
     commanded, delayed, measured = left.lines
     np.testing.assert_allclose(data(commanded), np.stack([np.arange(5.0)] * 2, axis=-1))
     np.testing.assert_allclose(data(delayed), np.stack([np.arange(5.0) + 2.0, np.arange(5.0)], axis=-1))
@@ -268,6 +309,7 @@ def test_delay_and_errors_of_placements(drawn: list[Figure], tmp_path: Path) -> 
         delay={"exposure": 1e-3, "pose": 3e-3},
         tolerance=(5e-6, 2e-3),
     )
+    assert [*drawn[0].get_size_inches(), drawn[0].dpi] == [15.0, 9.2, 120]
     panels: dict[str, Any] = {each.get_xlabel() + each.get_title(): each for each in drawn[0].axes}
     bars = [(each.get_x(), each.get_width()) for each in panels["time [ms]delay budget: 4.00 ms"].patches]
     assert bars == [pytest.approx((0.0, 1.0)), pytest.approx((1.0, 3.0))]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -28,16 +27,6 @@ from gpuvision.ranging.regrid import Grid
 from gpuvision.status import Status
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Figure]]:
-    """Figures that are saved from now on; their texts must lie on the page."""
-    figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **how: figures.append(figure))
-    yield figures
-    for text in (text for figure in figures for text in figure.texts):
-        assert all(0.0 <= each <= 1.0 for each in text.get_position()), f"{text.get_text()!r} is not on the page"
-
-
 def data(line: Any) -> np.ndarray:
     """Return the points of a drawn line (n, 2)."""
     return np.stack([np.asarray(line.get_xdata(), float), np.asarray(line.get_ydata(), float)], axis=-1)
@@ -50,6 +39,11 @@ def labels(axes: Any) -> tuple[str, str, str]:
 
 def ranges(axes: Any) -> list[float]:
     return [*axes.get_xlim(), *axes.get_ylim()]
+
+
+def page(figure: Figure) -> Any:
+    """Return the size of the page [in] and its resolution [px/in]."""
+    return pytest.approx((*figure.get_size_inches(), figure.dpi))
 
 
 # ---- calibrations --------------------------------------------------------------------------------------------
@@ -74,6 +68,10 @@ def test_picture_of_a_sensor_calibration(drawn: list[Figure], tmp_path: Path) ->
     )
     draw_sensor_calibration(tmp_path / "picture.png", picture)
     left, right, below, beside = drawn[0].axes
+    assert page(drawn[0]) == (13.0, 8.0, 150)
+    # The panes of images are half as high again as those of the readings.
+    grid_of_panes: Any = left.get_subplotspec().get_gridspec()
+    assert np.divide(*grid_of_panes.get_height_ratios()) == pytest.approx(1.5)
     (shown,) = left.images
     np.testing.assert_array_equal(shown.get_array(), image)
     assert shown.get_clim() == (0.0, pytest.approx(np.percentile(image, 99.8)))
@@ -119,6 +117,7 @@ def test_picture_of_a_calibration_by_lines(drawn: list[Figure], tmp_path: Path) 
     errors = np.array([0.4, -0.1, np.nan, 0.2])
     draw_calibration(tmp_path / "picture.png", some_calibration(errors, points))
     panels = drawn[0].axes
+    assert page(drawn[0]) == (19.0, 5.6, 150)
     residuals, correction, uncertainty = panels[:3]
     (dots,) = residuals.collections
     np.testing.assert_array_equal(dots.get_offsets(), points[[1, 3, 0]])
@@ -197,6 +196,7 @@ def test_picture_of_an_inspection(drawn: list[Figure], tmp_path: Path) -> None:
     )
     axes, bar = drawn[0].axes
     (shown,) = axes.images
+    assert page(drawn[0]) == (10.0, 8.5 * 8.0 / 6.0 + 0.8, 150)
     np.testing.assert_array_equal(shown.get_array(), z)
     edges = [0.95, 6.95, 1.1, 9.1]
     assert shown.get_extent() == pytest.approx(edges)
@@ -229,6 +229,7 @@ def test_many_regions_have_no_names_and_large_maps_are_thinned_out(drawn: list[F
             title="", label="", colours="viridis",
         )  # fmt: skip
     assert [len(each.axes[0].texts) for each in drawn] == [60, 0]
+    assert page(drawn[0]) == (10.0, 3.0 + 0.8, 150)  # 3 in high at least
     np.testing.assert_array_equal(drawn[0].axes[0].images[0].get_array(), z[::2, ::2])
 
 
@@ -247,6 +248,7 @@ def test_picture_of_frames(along: Any, drawn: list[Figure], tmp_path: Path) -> N
     ]
     assert frames[0].found_fraction == pytest.approx(4 / 6)
     draw_line_frames(tmp_path / "frames.png", frames, along=along, title="frames")
+    assert (12.0, 5.0 * 6.0 + 1.25 if along == "columns" else 2.0 * (0.2 * 12.0 + 0.25) + 1.0, 110) == page(drawn[0])
     first, second = drawn[0].axes
     high = np.percentile(np.concatenate([each.image.ravel() for each in frames]), 99.9)
     for axes, frame in ((first, frames[0]), (second, frames[1])):
@@ -321,6 +323,7 @@ def test_picture_of_a_track(drawn: list[Figure], tmp_path: Path) -> None:
         for k in range(1, 13)
     ]
     draw_robot_track(tmp_path / "track.png", FIELD, states)
+    assert page(drawn[0]) == (9.0, 6.5, 130)
     (axes,) = drawn[0].axes
     certain, ambiguous = axes.lines
     np.testing.assert_allclose(data(certain), [each.pose[:2] for each in states[5:]])
@@ -356,6 +359,7 @@ def test_picture_of_a_located_robot(drawn: list[Figure], tmp_path: Path) -> None
     image = np.arange(60 * 80 * 3, dtype=np.uint8).reshape(60, 80, 3)
     draw_located_robot(tmp_path / "located.png", located, image)
     draw_located_robot(tmp_path / "points.png", located)
+    assert page(drawn[0]) == (13.0, 5.8, 130)
     view, field = drawn[0].axes
     (shown,) = view.images
     np.testing.assert_array_equal(shown.get_array(), image[..., ::-1])
@@ -418,7 +422,9 @@ def test_picture_of_a_plan(drawn: list[Figure], tmp_path: Path) -> None:
         PlannedSetting("ml 6", 40e-6, 6e-6, chosen=False),
     )
     draw_plan(tmp_path / "plan.png", settings, 8e-6, title="camera")
+    assert page(drawn[0]) == (6.5, 4.5, 150)
     (axes,) = drawn[0].axes
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
     assert labels(axes) == ("time per frame [us]", "predicted error of the heights [um]", "camera")
     limit, chosen, other = axes.lines
     np.testing.assert_allclose(limit.get_ydata(), 8.0)

@@ -3,10 +3,12 @@ from __future__ import annotations
 import math
 
 import cv2
+import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from gpuvision import Status
 from gpuvision.plots import range_image as picture
@@ -259,3 +261,185 @@ def test_numbers_have_the_digits_of_their_step():
     assert picture._format_length(-0.5, 1.0, 0.01) == "\N{MINUS SIGN}0.50"
     assert picture._format_length(-1e-9, 1.0, 0.01) == "0.00"
     assert math.isclose(picture.round_length(1e-3), 1e-3)
+
+
+# ---- brightness and colours by their formulas ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("slope", "shown"), [(9.0, 4.0), (-9.0, -4.0), (3.9, 3.9)])
+def test_slopes_beyond_four_are_as_bright_as_four(slope, shown):
+    """Before the smoothing; what the lamp does not reach has the ambient light alone."""
+    x = np.tile(np.arange(20.0), (15, 1))
+    light, normal = np.array(picture._LIGHT), np.array([-shown, 0.0, 1.0])
+    lit = max(float(light @ normal / light[2] / np.linalg.norm(normal)), 0.0)
+    assert (lit == 0.0) == (slope < 0.0)
+    np.testing.assert_allclose(picture.shade_relief(slope * x, 1.0, 1.0), 0.3 + 0.65 * lit, rtol=1e-12)
+
+
+def test_a_hole_does_not_change_the_brightness_of_its_surroundings():
+    x, y = np.meshgrid(np.arange(24.0), np.arange(17.0))
+    z = 0.3 * x - 0.2 * y
+    whole = picture.shade_relief(z, 1.0, 1.0)
+    z[5:9, 7:12] = np.nan
+    shade = picture.shade_relief(z, 1.0, 1.0)
+    known = np.isfinite(z)
+    np.testing.assert_allclose(shade[known], whole[known], rtol=1e-12)
+    assert np.isnan(shade[~known]).all()
+
+
+def test_slopes_are_means_over_the_known_neighbours():
+    z = np.array([[0.0, 1.0, 4.0, np.nan, 7.0, 9.0, np.nan], [5.0, 5.0, 5.0, np.nan, np.nan, np.nan, 1.0]])
+    across = [[1.0, 2.0, 3.0, 0.0, 2.0, 2.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]]
+    down = [[5.0, 4.0, 1.0, 0.0, 0.0, 0.0, 0.0]] * 2
+    np.testing.assert_array_equal(picture._slope(z, 1), across)
+    np.testing.assert_array_equal(picture._slope(z, 0), down)
+
+
+def test_colours_of_doubtful_and_unexplained_cells():
+    """A cell with several flags has the colour of the rarer one; a tint weighs 0.45; shade multiplies the colour."""
+    hole, folded = (np.array(to_rgb(each)) for each in ("#cbd5e1", "#e0218a"))
+    dark, ambiguous = (np.array(to_rgb(each)) for each in ("#4b5563", "#b07aa1"))
+    missing, both = Status.NO_DATA | Status.LOW_SIGNAL, Status.NOT_INVERTIBLE | Status.AMBIGUOUS
+    status = np.array([[missing, 0, both, both, Status.LOW_SIGNAL, Status.AMBIGUOUS, Status.LOW_SIGNAL, 0]], np.uint8)
+    z = np.array([[np.nan, np.nan, np.nan, 0.5, np.nan, 0.5, 0.5, 0.5]])
+    shade = np.array([[np.nan] * 3 + [0.8, np.nan, 0.4, 0.6, np.nan]])
+    made, legend = picture.paint_heights(z, status, shade, (0.0, 1.0), "shaded")
+    grey = 0.78 / 0.95
+    expected = [hole, hole, folded, 0.55 * 0.8 * grey + 0.45 * folded, dark, 0.55 * 0.4 * grey + 0.45 * ambiguous]
+    np.testing.assert_allclose(made[0], [*expected, np.full(3, 0.6 * grey), np.full(3, grey)], rtol=1e-12)
+    assert [(each.colour, each.part) for each in legend] == [
+        ("#cbd5e1", 1 / 8),  # the cell without a flag is not counted
+        ("#e0218a", 2 / 8),
+        ("#b07aa1", 1 / 8),
+        ("#4b5563", 1 / 8),
+    ]
+
+
+def test_heights_have_the_colours_of_the_scale():
+    z = np.array([[-1.0, 2.0, 3.0, 4.0, 9.0]])
+    made, _ = picture.paint_heights(z, np.zeros(z.shape, np.uint8), np.full(z.shape, 0.9), (2.0, 4.0), "colour")
+    viridis = mpl.colormaps["viridis"]
+    ends = [np.array(viridis(each)[:3]) for each in (0.14, 1.0)]
+    np.testing.assert_allclose(made[0, [0, 1]], [0.9 * ends[0]] * 2, rtol=1e-12)
+    np.testing.assert_allclose(made[0, [3, 4]], [0.9 * ends[1]] * 2, rtol=1e-12)
+    np.testing.assert_allclose(made[0, 2], 0.9 * np.array(viridis(0.57)[:3]), atol=0.01)
+
+
+# ---- layout of the page ----------------------------------------------------------------------------------------------
+
+ENTRIES = [picture.LegendEntry("#cbd5e1", "hole", 0.25), picture.LegendEntry("#e0218a", "folded", 0.0004)]
+
+
+def inches(axes, page):
+    """Return left, bottom, width and height of axes [in]."""
+    return [value * size for value, size in zip(axes.get_position().bounds, (*page.page, *page.page), strict=True)]
+
+
+@pytest.mark.parametrize("aspect", [2.0, 0.5])
+@pytest.mark.parametrize("labels", [None, ("sample", "profile")])
+@pytest.mark.parametrize("span", [None, (-2e-3, 5e-4)])
+def test_places_on_the_page(aspect, labels, span):
+    """The longer side has 1100 pixels at 150 per inch; below lie the legend and the length bar, or the labels."""
+    page = picture._Page(np.zeros((10, 20, 3)), aspect, ENTRIES, "title", "subtitle", span, labels=labels)
+    longer = 1100 / 150
+    width, height = (longer, longer / 2) if aspect == 2.0 else (longer / 2, longer)
+    left, below = (0.8 if labels else 0.3), 0.12 + 2 * 0.21
+    bottom = below + (0.5 if labels else 0.45)
+    across = max(left + width + (1.2 if span else 0.3), 5.6)
+    assert page.page == pytest.approx((across, bottom + height + 0.72))
+    assert tuple(page.figure.get_size_inches()) == pytest.approx(page.page)
+    shown, *bars = page.figure.axes
+    assert inches(shown, page) == pytest.approx([left, bottom, width, height])
+    assert (shown.get_xlabel(), shown.get_ylabel()) == (labels or ("", ""))
+    assert (len(shown.get_xticks()) > 0, len(shown.get_yticks()) > 0) == (bool(labels),) * 2
+    assert shown.images[0].get_interpolation() == "nearest"
+    title, subtitle, *legend = page.figure.texts
+    places = [(left, page.page[1] - 0.33), (left, page.page[1] - 0.57)]
+    places += [(left + 0.28, below - 0.21 * line + 0.015) for line in (1, 2)]
+    found = [np.multiply(text.get_position(), page.page) for text in page.figure.texts]
+    np.testing.assert_allclose(found, places)
+    assert [text.get_text() for text in (title, subtitle)] == ["title", "subtitle"]
+    assert [text.get_text() for text in legend] == ["hole  (25.0 %)", "folded  (< 0.1 %)"]
+    swatches = [each for each in page.figure.artists if isinstance(each, Rectangle)]
+    for line, (swatch, entry) in enumerate(zip(swatches, ENTRIES, strict=True), 1):
+        place = np.multiply((*swatch.get_xy(), swatch.get_width(), swatch.get_height()), (*page.page, *page.page))
+        assert place == pytest.approx([left, below - 0.21 * line, 0.2, 0.12])
+        assert swatch.get_facecolor()[:3] == to_rgb(entry.colour)
+    assert len(bars) == (span is not None)
+    if span:
+        room = min(height, 4.5)
+        assert inches(bars[0], page) == pytest.approx([left + width + 0.16, bottom + height - room, 0.16, room])
+        assert bars[0].get_ylabel() == "height z  [mm]"
+        assert bars[0].get_ylim() == pytest.approx((-2.0, 0.5))
+        ticks = bars[0].get_yticks()
+        assert 4 <= len(ticks) <= 9
+        np.testing.assert_allclose(np.diff(ticks), 0.5)
+
+
+def test_only_maps_beyond_the_pixels_of_the_page_are_smoothed():
+    """1100 x 550 pixels: where cells are enlarged along one side, they keep sharp edges."""
+    for shape, expected in (
+        ((550, 1100), "antialiased"),
+        ((549, 1100), "nearest"),
+        ((550, 1099), "nearest"),
+        ((600, 1200), "antialiased"),
+    ):
+        page = picture._Page(np.zeros((*shape, 3)), 2.0, [], "", "", None)
+        assert page.figure.axes[0].images[0].get_interpolation() == expected
+
+
+@pytest.mark.parametrize(
+    ("width", "length", "text"), [(0.5, 0.1, "100 mm"), (41e-6, 10e-6, "10 µm"), (9.0, 2.0, "2 m")]
+)
+def test_the_length_bar_is_a_round_part_of_the_width(width, length, text):
+    """Four fields of alternating colours, as long together as the text says, beside it."""
+    page = picture._Page(np.zeros((10, 20, 3)), 2.0, ENTRIES, "", "", None)
+    page.length_bar(width)
+    bar = page.figure.axes[-1]
+    drawn_length = 1100 / 150 * length / width
+    assert inches(bar, page) == pytest.approx([0.3, 0.54 + 0.08, drawn_length, 0.09])
+    assert [*bar.get_xlim(), *bar.get_ylim()] == [0.0, 4.0, 0.0, 1.0]
+    fields = [(each.get_x(), each.get_y(), each.get_width(), each.get_height()) for each in bar.patches]
+    assert fields == [(k, 0, 1, 1) for k in range(4)]
+    colours = [each.get_facecolor()[:3] for each in bar.patches]
+    assert colours == [to_rgb("#22262b"), to_rgb("#ffffff")] * 2
+    label = page.figure.texts[-1]
+    assert label.get_text() == text
+    place = np.multiply(label.get_position(), page.page)
+    np.testing.assert_allclose(place, [0.3 + drawn_length + 0.1, 0.54 + 0.085])
+
+
+def test_texts_of_a_map_and_a_scan(tmp_path, monkeypatch):
+    """Size, part with a height, range of the heights, and the exaggeration of the relief where it is above 1."""
+    pages = []
+    page = picture._Page
+    monkeypatch.setattr(picture, "_Page", lambda *given, **how: pages.append((given, how)) or page(*given, **how))
+    monkeypatch.setattr(Figure, "savefig", lambda *_, **__: None)
+    grid = Grid(left=0.0, top=0.0, cell_x=2e-3, cell_y=5e-4, columns=6, rows=4)
+    steep = np.tile(2e-3 * np.arange(6.0), (4, 1))
+    steep[0, 0] = np.nan
+    for number, z in enumerate((steep, 0.1 * steep)):
+        for style in ("colour", "shaded"):
+            heights = HeightMap(z, np.ones(z.shape), np.zeros(z.shape, np.uint8))
+            picture.draw_height_map(tmp_path / f"{number}{style}.png", heights, grid, style=style, title="a map")
+    size = "6 × 4 cells of 2 mm × 500 µm  ·  95.8 % measured  ·  heights "
+    subtitles = [f"{size}0.0 to 10.0 mm"] * 2 + [f"{size}0.00 to 1.00 mm  ·  relief 2 ×"] * 2
+    assert [given[4] for given, _ in pages] == subtitles
+    assert [given[3] for given, _ in pages] == ["a map"] * 4
+    assert [given[1] for given, _ in pages] == [pytest.approx(6.0)] * 4  # 12 mm by 2 mm
+    spans = [given[5] for given, _ in pages]
+    assert spans[1] is spans[3] is None
+    assert spans[0] == pytest.approx(picture.height_span(steep))
+    pages.clear()
+    for samples in ("across", "down"):
+        picture.draw_scan(
+            tmp_path / f"{samples}.png", steep, np.zeros(steep.shape, np.uint8), samples=samples, aspect=3.0,
+            title="a scan", span=(0.0, 1.0),
+        )  # fmt: skip
+    for (given, how), shape, labels in zip(
+        pages, ((4, 6, 3), (6, 4, 3)), (("sample", "profile"), ("profile", "sample")), strict=True
+    ):
+        assert given[0].shape == shape
+        text = "4 profiles of 6 samples  ·  " + subtitles[0].partition("  ·  ")[2]
+        assert given[1:] == (3.0, [], "a scan", text, (0.0, 1.0))
+        assert how == {"labels": labels}

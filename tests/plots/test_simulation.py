@@ -14,14 +14,6 @@ from error_maps import errors_of
 from gpuvision.plots.simulation import PictureScale, draw_causes, draw_errors
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """Figures that are saved from now on."""
-    figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **how: figures.append(figure))
-    return figures
-
-
 def test_errors_that_are_compared_have_one_scale_and_unit(drawn: list[Figure], tmp_path: Path) -> None:
     """One sensor errs by up to a millimetre, the other one by half of that: the same colour is the same error."""
     large, small = errors_of(np.full((5, 7), 0.6e-3)), errors_of(np.full((4, 9), -0.3e-3))
@@ -50,6 +42,7 @@ def test_pictures_have_one_orientation(
     errors = np.zeros((5, 7))
     errors[4, 0] = 1e-3
     draw(tmp_path / "a.png", errors_of(errors, mirrored=mirrored), "part", PictureScale(1e-3, 1e-5), backward=backward)
+    assert [*drawn[0].get_size_inches(), drawn[0].dpi] == [8.0, 5.5, 150]
     (axes,) = (each for each in drawn[0].axes if each.images)
     (image,) = axes.images
     # Place of sample 0 of profile 4 on the page.

@@ -1,0 +1,64 @@
+"""Grey images and their noise: accepted types and shapes at their limits, and the noise by loops."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.special import ndtri
+
+from gpuvision.camera.image import estimate_pixel_noise, grey_image
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
+@pytest.mark.parametrize("channels", [None, 1, 3, 4])
+def test_grey_of_an_image(dtype: type, channels: int | None, rng: np.random.Generator) -> None:
+    """A fourth channel is ignored; float64 becomes float32, the other types stay."""
+    shape = (16, 17) if channels is None else (16, 17, channels)
+    image = rng.integers(0, 200, shape).astype(dtype)
+    kept = np.float32 if dtype is np.float64 else dtype
+    found = grey_image(image)
+    assert (found.shape, found.dtype) == ((16, 17), kept)
+    assert found.flags.c_contiguous
+    plain = image.reshape(16, 17, -1).astype(kept)
+    expected = plain[..., 0] if channels in (None, 1) else cv2.cvtColor(plain[..., :3].copy(), cv2.COLOR_BGR2GRAY)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(grey_image(image[:, ::-1]), expected[:, ::-1])
+
+
+def test_what_is_no_image() -> None:
+    for shape in ((15, 16), (16, 15), (15, 16, 3)):
+        with pytest.raises(ValueError, match=f"image has {shape[1]} x {shape[0]} px, expected at least 16 x 16"):
+            grey_image(np.zeros(shape, np.uint8))
+    assert grey_image(np.zeros((2, 3), np.uint8), min_size=2).shape == (2, 3)
+    with pytest.raises(ValueError, match="expected at least 3 x 3"):
+        grey_image(np.zeros((2, 3), np.uint8), min_size=3)
+    for shape in ((16,), (16, 16, 2), (16, 16, 5), (0, 16), (16, 16, 3, 1)):
+        with pytest.raises(ValueError, match=r"expected \(height, width\) or .* with 1 or 3 or 4 channels"):
+            grey_image(np.zeros(shape, np.uint8))
+    with pytest.raises(ValueError, match="with 3 channels"):
+        grey_image(np.zeros((16, 16, 1), np.uint8), channels=(3,))
+    for image in (np.zeros((16, 16), np.int32), np.zeros((16, 16), bool), np.zeros((16, 16)).tolist()):
+        with pytest.raises(TypeError, match="expected an array of uint8, uint16 or float32"):
+            grey_image(image)
+    with pytest.raises(TypeError, match="image is float64, expected"):
+        grey_image(np.zeros((16, 16)), convert_float64=False)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float64])
+def test_noise_of_pixels(dtype: type, rng: np.random.Generator) -> None:
+    """The median of the magnitudes of second differences along rows and columns, whose kernel's norm is 6."""
+    image = (100.0 + 5.0 * np.arange(30.0) + rng.normal(0.0, 4.0, (25, 30))).astype(dtype)
+    weights = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
+    every = [
+        abs(np.sum(weights * image[row : row + 3, column : column + 3].astype(float)))
+        for row in range(23)
+        for column in range(28)
+    ]
+    assert np.linalg.norm(weights) == pytest.approx(6.0)
+    assert estimate_pixel_noise(image) == pytest.approx(np.median(every) / ndtri(0.75) / 6.0, rel=1e-4)
+    holes = image.astype(float)
+    holes[5, 6] = np.nan
+    inside = [each for number, each in enumerate(every) if not (3 <= number // 28 <= 5 and 4 <= number % 28 <= 6)]
+    assert estimate_pixel_noise(holes) == pytest.approx(np.median(inside) / ndtri(0.75) / 6.0, rel=1e-4)
+    assert estimate_pixel_noise(np.full((5, 5), np.nan)) == 0.0

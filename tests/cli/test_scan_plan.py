@@ -27,7 +27,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Gener
     np.save("in.npy", np.clip(np.rint(frames), 0, 255).astype(np.uint8))
     text = resources.files("gpuvision").joinpath("presets", "sensors", "camera_line.toml").read_text(encoding="utf-8")
     text = text.replace("threshold = 16", "threshold = 16\nread_noise = 0.5\ngain = 0.1")
-    Path("s.toml").write_text(text.replace("window = 4", "window = 8"))
+    # Build options of test_planning_scan.py: without a second peak, a window of 6.
+    for before, after in (("window = 4 ", "window = 6 "), ("ambiguity = 0.4 ", "# ")):
+        assert text.count(before) == 1
+        text = text.replace(before, after)
+    Path("s.toml").write_text(text)
     return tmp_path
 
 
@@ -56,7 +60,7 @@ def test_a_tolerance_scans_with_the_chosen_readout(folder: Path) -> None:
     report = json.loads((folder / "out" / "report.json").read_text())
     chosen = report["readout"]
     assert text.startswith(f"plan: {chosen['method']} {chosen['window']}: predicted error")
-    assert chosen == {"method": "windowed", "window": 8, "fir_length": 4, "precision": None}
+    assert chosen == {"method": "windowed", "window": 6, "fir_length": 4, "precision": None}
 
 
 def test_a_plan_without_a_tolerance_and_options_without_effect_are_refused(folder: Path) -> None:

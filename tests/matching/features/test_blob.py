@@ -52,7 +52,8 @@ def centre(blobs: Any, k: int = 0) -> np.ndarray:
     [(np.uint8, "vector"), pytest.param(np.uint16, "vector", marks=pytest.mark.slow), (np.float32, "work_item")],
 )
 def test_a_disc(device: Device, dtype: Any, variant: Any) -> None:
-    blobs = replace(PLAIN, variant=variant)(image_of(a_disc(), dtype), place(), device=device)
+    saturation = None if dtype == np.float32 else 255.0
+    blobs = replace(PLAIN, variant=variant, saturation=saturation)(image_of(a_disc(), dtype), place(), device=device)
     assert blobs.status[0] == 0
     np.testing.assert_allclose(centre(blobs), TRUE, rtol=0, atol=2e-3)  # rounded grey levels: 0.3 of 100
     np.testing.assert_allclose(blobs.shift[0], TRUE - [47.9, 40.0], rtol=0, atol=2e-3)
@@ -388,7 +389,7 @@ def test_canaries_and_bound_calls(device: Device, variant: Any, rng: np.random.G
 
 
 def test_no_marks(device: Device) -> None:
-    blobs = PLAIN(np.zeros((40, 40), np.uint8), np.zeros((0, 3), np.float32), device=device)
+    blobs = PLAIN(np.zeros((40, 40), np.float32), np.zeros((0, 3), np.float32), device=device)
     assert blobs.x.shape == (0,)
     assert blobs.covariance.shape == (0, 3, 3)
 
@@ -403,7 +404,7 @@ def test_wrong_input(device: Device) -> None:
     with pytest.raises(ValueError, match="shape"):
         replace(PLAIN, shape="square", polarity="dark")(np.zeros(SHAPE, np.float32), place(), device=device)
     with pytest.raises(TypeError, match="float32"):
-        PLAIN(np.zeros(SHAPE, np.uint8), place().astype(np.float64), device=device)
+        PLAIN(np.zeros(SHAPE, np.float32), place().astype(np.float64), device=device)
 
 
 @pytest.mark.parametrize(

@@ -204,9 +204,7 @@ def test_choices(device: Device, variant: Any, edge_selection: Any, rng: np.rand
     image = reference.stripe_image(SHAPE, 0.3, 90.0, 16.0, 1.0) + rng.normal(0.0, 1.0, SHAPE)
     image += 0.4 * reference.step_image(SHAPE, 0.3, 112.0, 1.0)
     rulers = reference.random_rulers(0.3, 94.0, 10, rng, MIDDLE)
-    operation = RulerEdges(
-        threshold=15.0, length=80, smoothing_px=1.5, edge_selection=edge_selection, max_edges=5, variant=variant
-    )
+    operation = RulerEdges(threshold=15.0, length=80, edge_selection=edge_selection, max_edges=5, variant=variant)
     ours = operation(image.astype(np.float32), rulers, device=device)
     for k, found in enumerate(expected(operation, image, rulers)):
         assert 2 <= len(found) <= 4
@@ -325,7 +323,7 @@ def test_through_a_lens(device: Device, variant: Any, model: Any, rng: np.random
     place = ideal @ [math.cos(angle), math.sin(angle)] - distance
     image = (100.0 + 50.0 * np.tanh(place / 1.5)).astype(np.float32)
     rulers = reference.random_rulers(angle, distance, 20, rng, (30.0, 90.0))
-    operation = replace(STRONGEST, length=33, smoothing_px=1.5, model=model, variant=variant)
+    operation = replace(STRONGEST, length=33, model=model, variant=variant)
     ours = operation(image, rulers, device=device)
     inside = ours.status == 0
     assert inside.sum() >= 10
@@ -336,7 +334,7 @@ def test_through_a_lens(device: Device, variant: Any, model: Any, rng: np.random
     assert np.nanmax(np.abs(ignored.position - true)) > 0.2
     for k in np.flatnonzero(inside)[:5]:
         grey, _ = reference.profile(image, rulers[k], 33, operation.width, 1.0, model.distort)
-        theirs = max(reference.find_edges(grey, 1.5, 20.0), key=lambda edge: abs(edge["gradient"]))
+        theirs = max(reference.find_edges(grey, operation.smoothing_px, 20.0), key=lambda edge: abs(edge["gradient"]))
         assert abs(ours.position[k] - theirs["position"]) < 5e-4
 
 

@@ -149,7 +149,7 @@ def test_a_given_scale_is_a_factor_on_the_sigmas(device: Device, rng: np.random.
     wide = rows.copy()
     wide[..., 6] *= 2.0
     one, other = (
-        SolvePose(loss="least_squares", scale=scale, placement=PLACE, max_leverage=1.0)(each, device=device)
+        SolvePose(scale=scale, placement=PLACE, max_leverage=1.0)(each, device=device)
         for scale, each in ((1.0, wide), (2.0, rows))
     )
     assert not one.status.any()

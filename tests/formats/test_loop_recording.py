@@ -43,7 +43,7 @@ def test_numbers_up_to_a_million_are_read(tmp_path: Path) -> None:
         (HEADER + "0,0,0\n1,1e308,0\n", r"line 3: command is 1e\+308, expected a magnitude of at most 1e\+06 m or rad"),
         (HEADER + "0,0,0\n1,0,-1e7\n", r"line 3: measured is -1e\+07"),
         (HEADER + "0,0,0\n0.5,0,0\n0.5,0,0\n", r"line 4: time is 0\.5 after 0\.5, expected a later one"),
-        (HEADER + "0,0,0\n1,0,0\n2,0,0\n1.5,0,0\n", r"line 5: time is 1\.5 after 2, expected a later one"),
+        (HEADER + "0,0,0\n1,0,0\n2,0,0\n3,0,0\n2.5,0,0\n", r"line 6: time is 2\.5 after 3, expected a later one"),
         (HEADER + "0," + 100 * "x" + ",0\n", f"line 2: '0,{58 * 'x'}', expected numbers"),
         ("", "the file is empty; expected the header time,command,measured"),
     ],

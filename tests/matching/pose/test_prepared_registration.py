@@ -11,7 +11,7 @@ import pytest
 
 from gpuvision.matching.artwork.edges import BoardEdges
 from gpuvision.matching.features.imaging import Imaging
-from gpuvision.matching.pose import registration
+from gpuvision.matching.pose import coarse_registration, registration
 from gpuvision.matching.pose.coarse_registration import CoarseRegistration
 from gpuvision.matching.pose.motion import KnownEdges
 from gpuvision.matching.pose.registration import (
@@ -258,3 +258,27 @@ def test_searches_at_their_limits_are_taken() -> None:
         wrong: Any = registration.RulerEdges(threshold=10.0, **ruler)  # type: ignore[arg-type]
         with pytest.raises(TypeError, match="must be a RulerEdges that returns one single edge"):
             search_of(ruler=wrong, limits=limits)
+
+
+def test_border_of_the_cost_map_holds_all_edges_at_all_shifts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the shifts, two cells, and the turn of the farthest edge; at most the larger side of the image."""
+
+    class StoppedError(Exception):
+        pass
+
+    borders: list[int] = []
+
+    def costs(*, threshold: float, border: int) -> Any:
+        assert threshold == 10.0
+        borders.append(border)
+        raise StoppedError
+
+    monkeypatch.setattr(coarse_registration, "CellMeans", lambda **_: lambda *_, **__: SimpleNamespace(means=None))
+    monkeypatch.setattr(coarse_registration, "EdgeCostMap", costs)
+    for angle, side in ((0.25, 81), (3.0, 81), (0.25, 12)):
+        search = search_of(angle=angle, cell_px=3)
+        with pytest.raises(StoppedError):
+            search._search_grid(np.zeros((side, side // 2)), None)
+        away = 40.0 * np.linalg.norm(search.search.point - np.array([0.1, -0.2]), axis=1).max()
+        turned = min(2.0 * math.sin(angle / 2.0) * away, side)
+        assert borders[-1] == max(search.positions()) // 2 + 2 + math.ceil(turned / 3)

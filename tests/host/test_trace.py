@@ -363,3 +363,104 @@ with Trace({str(tmp_path / "t.json")!r}):
     without_times = json.loads((tmp_path / "t.json").read_text())["otherData"]["commands without device times"]
     assert computed.count("compute") + without_times >= 2  # of the bind and of the call
     assert without_times == 0 or device.kind == "rusticl"
+
+
+def test_spans_of_a_thread_that_cross_go_to_further_parts() -> None:
+    """A span that begins where another one ends follows it; of two that begin together the longer one contains."""
+    times = {"a": (0, 10), "b": (5, 15), "c": (6, 9), "d": (10, 12), "e": (11, 20), "f": (30, 40), "g": (30, 50)}
+    spans = [trace_module._Span("lane", name, *each, {}) for name, each in times.items()]
+    parts = [[each.name for each in part] for part in trace_module._nested_parts(spans[::-1])]
+    assert parts == [["a", "c", "d", "g", "f"], ["b"], ["e"]]
+    assert trace_module._nested_parts([]) == [[]]
+
+
+@pytest.mark.parametrize(("late", "is_kept"), [(1_011_000, True), (1_011_001, False), (0, True), (-3_000, True)])
+def test_bounds_of_the_offset_may_differ_by_a_millisecond_and_the_drift(
+    tmp_path: Path, late: int, is_kept: bool
+) -> None:
+    """Two calls of 1 us, 10 ms apart: the drift is a thousandth of that. The offset is the middle of the bounds."""
+    trace = Trace(tmp_path / "t.json")
+    trace.add_span("host", "", 0, 10)
+    queue = type("Queue", (), {"device": SimpleNamespace(name=" fake ")})()
+    apart = 10_000_000
+    for before, queued in ((0, 0), (apart, apart - late)):
+        event = FakeEvent(queued, apart + before, apart + before + 7_000)
+        trace.add_event(queue, "compute", "op", event, before, before + 1_000)
+    trace.write()
+    lanes = spans_by_lane(tmp_path / "t.json")
+    left_out = json.loads((tmp_path / "t.json").read_text())["otherData"]["commands without device times"]
+    if not is_kept:
+        assert (set(lanes), left_out) == ({"host"}, 2)
+        return
+    offset = (max(0, late) + min(1_000, late + 1_000)) // 2
+    assert left_out == 0
+    assert [(each["ts"], each["dur"]) for each in lanes["device fake, queue 1"]] == [
+        ((apart + offset) / 1e3, 7.0),
+        ((2 * apart + offset) / 1e3, 7.0),
+    ]
+
+
+def test_stages_of_a_batch_are_kept_together(tmp_path: Path) -> None:
+    """Of four spans three are of the first batch; the next batch does not fit, a single span does."""
+    trace = Trace(tmp_path / "t.json", limit=4)
+    stages = {"source": (10, 20), "compute": (20, 30), "wait": (30, 40)}
+    trace.add(stages, 0, 2)
+    assert not trace.is_full
+    trace.add(stages, 2, 2)
+    trace.add_span("read", "file", 5, 6)
+    assert trace.is_full
+    trace.add_span("read", "file", 7, 8)
+    trace.write()
+    lanes = spans_by_lane(tmp_path / "t.json")
+    assert {name: [each["args"] for each in spans] for name, spans in lanes.items()} == {
+        "producer": [{"frame": 0, "frames": 2}],
+        "device compute": [{"frame": 0, "frames": 2}],
+        "consumer": [{"frame": 0, "frames": 2}],
+        "host": [{"of": "file"}],
+    }
+    assert json.loads((tmp_path / "t.json").read_text())["otherData"]["spans beyond the limit"] == 4
+
+
+def test_streams_take_the_least_free_number(tmp_path: Path) -> None:
+    trace = Trace(tmp_path / "t.json")
+    queues = [object() for _ in range(4)]
+    assert [trace.begin_stream(queue) for queue in queues[:3]] == [1, 2, 3]
+    trace.end_stream(2)
+    assert [trace.is_of_stream(queue) for queue in queues] == [True, False, True, False]
+    assert trace.begin_stream(queues[3]) == 2
+    trace.end_stream(1)
+    assert [trace.is_of_stream(queue) for queue in queues] == [False, False, True, True]
+    trace.add({"sink": (1, 2)}, 0, 1, stream=3)
+    trace.write()
+    assert set(spans_by_lane(tmp_path / "t.json")) == {"consumer, stream 3"}
+
+
+def test_completed_commands_are_read_while_others_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each event is kept until its times are read; a command without times is counted."""
+    status = {"done": int(cl.command_execution_status.COMPLETE), "runs": int(cl.command_execution_status.RUNNING)}
+
+    class Event(FakeEvent):
+        def __init__(self, state: str) -> None:
+            super().__init__(0, 2, 3)
+            self.command_execution_status = status[state]
+
+    class Untimed(Event):
+        @property
+        def profile(self) -> Any:
+            raise cl.RuntimeError("clGetEventProfilingInfo failed: PROFILING_INFO_NOT_AVAILABLE")
+
+        @profile.setter
+        def profile(self, value: object) -> None:
+            pass
+
+    monkeypatch.setattr(trace_module, "_PENDING", 3)
+    trace = Trace(tmp_path / "t.json")
+    queues = [type("Queue", (), {"device": SimpleNamespace(name=name)})() for name in ("one", "other")]
+    for number, event in enumerate((Event("done"), Untimed("done"))):
+        trace.add_event(queues[number], "compute", "op", event, 0, 1000)
+    assert (len(trace._pending), len(trace._executed)) == (2, 0)
+    trace.add_event(queues[0], "compute", "op", Event("runs"), 0, 1000)
+    assert (len(trace._pending), len(trace._executed)) == (1, 1)
+    trace.write()
+    assert (len(trace._pending), len(trace._executed)) == (0, 2)
+    assert json.loads((tmp_path / "t.json").read_text())["otherData"]["commands without device times"] == 1

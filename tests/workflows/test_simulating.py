@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from error_maps import errors_of
 from gpuvision.cli import main as cli
 from gpuvision.formats.range_image import read_npz
 from gpuvision.host import Device
@@ -28,7 +29,8 @@ from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.masks import Mask
-from gpuvision.simulation.sensors.readings import PATHS
+from gpuvision.simulation.sensors.readings import PATHS, GroundTruth
+from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.workflows import light_cache, simulating
 from gpuvision.workflows.light_cache import (
     PROFILES_PER_BLOCK,
@@ -380,3 +382,163 @@ def test_patches_of_the_default_size_suffice_in_a_groove(device: Device) -> None
     # Measured: 1.0 um; even patches are wrong by 10 um.
     assert error < 2e-6
     assert error < estimate
+
+
+# ---- steps of a simulation -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("places", "step", "profiles", "first", "last"),
+    [
+        ((0.0, 10.0), 1.0, None, 0, 9),
+        ((0.5, 10.5), 1.0, None, 1, 9),  # profiles that only touch its ends do not count
+        ((0.49, 10.51), 1.0, None, 0, 10),
+        ((0.0, 10.0), -1.0, None, -9, 0),
+        ((0.0, 10.0), 1.0, 4, 3, 6),
+        ((0.0, 10.0), 1.0, 5, 2, 6),
+        ((0.0, 10.0), 1.0, 9, 0, 8),
+        ((0.0, 10.0), 1.0, 10, 0, 9),
+        ((0.0, 10.0), 1.0, 11, 0, 9),
+        ((0.4, 0.6), 1.0, None, 0, 0),
+    ],
+)
+def test_profiles_that_meet_a_part(
+    places: tuple[float, float],
+    step: float,
+    profiles: int | None,
+    first: int,
+    last: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Profile k lies at 0.5 mm + k step."""
+    monkeypatch.setattr(simulating, "_corner_transports", lambda *_: MM * np.array([np.mean(places), *places]))
+    transport = StraightTransport(start=0.5 * MM, step=step * MM)
+    part: Any = None
+    found = simulating._transports_over(part, transport, profiles)
+    np.testing.assert_allclose(found, 0.5 * MM + step * MM * np.arange(first, last + 1), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("places", "step", "message"),
+    [
+        ([0.0, 1.0], None, r"a simulation needs \[transport\] step: metres per profile"),
+        ([], 1.0, "the part has no triangle"),
+        ([0.6, 1.4], 1.0, "no profile meets the part: it is shorter than a step of the transport"),
+        ([0.5, 1.5], 1.0, "no profile meets the part"),
+    ],
+)
+def test_parts_that_no_profile_meets(
+    places: list[float], step: float | None, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(simulating, "_corner_transports", lambda *_: MM * np.array(places))
+    part: Any = None
+    with pytest.raises(ValueError, match=message):
+        simulating._transports_over(part, StraightTransport(start=0.5 * MM, step=step and MM * step), None)
+
+
+def test_transports_of_corners_on_oblique_axes() -> None:
+    """Corner = origin + G g + H h + L direction: L of each finite corner."""
+    g, h, along = np.array([0.8, 0.1, -0.3]), np.array([-0.2, 0.4, 0.9]), np.array([0.48, 0.6, -0.64])
+    origin = np.array([0.1, -0.2, 0.3])
+    transports = np.array([0.01, -0.02, 0.05, 0.07, 0.11, -0.13])
+    corners = origin + np.outer([1.0, 2.0, -1.0, 0.5, 3.0, -4.0], g) + np.outer(np.arange(6.0), h)
+    corners = (corners + np.outer(transports, along)).reshape(2, 3, 3)
+    corners[1, 0, 2] = np.nan
+    part: Any = SimpleNamespace(corners=corners)
+    transport = StraightTransport(
+        step=1.0, g_axis=tuple(g), h_axis=tuple(h), direction=tuple(along), origin=tuple(origin)
+    )
+    np.testing.assert_allclose(simulating._corner_transports(part, transport), np.delete(transports, 3), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("patch_size", "expected"), [(None, 7e-3), (2e-3, 2e-3)])
+def test_size_of_patches_is_given_or_that_of_the_light(
+    part_file: Path, patch_size: float | None, expected: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    light = SimpleNamespace(patch_size=7e-3)
+    monkeypatch.setattr(simulating, "require_light", lambda sensor: light)
+    task = task_of(part_file, patch_size=patch_size, tolerance=0.0, paths=("direct", "diffuse-diffuse", "direct"))
+    assert (task.patch_size, task.tolerance, task.paths) == (expected, 0.0, ("direct", "diffuse-diffuse"))
+    for size in (0.0, -1.0, np.inf, np.nan):
+        with pytest.raises(ValueError, match=f"the patch size is {size}, expected metres, more than 0"):
+            task_of(part_file, patch_size=size)
+    with pytest.raises(ValueError, match="the tolerance is inf, expected metres, 0 or more"):
+        task_of(part_file, tolerance=np.inf)
+
+
+def block_of(first: int, count: int) -> Any:
+    """Return a block of light whose numbers are those of its profiles; one path is not of a sensor."""
+    profiles = np.arange(first, first + count, dtype=float)
+    light = {name: Exposure(profiles + 0.25, profiles + 0.5) for name in ("direct", "diffuse-diffuse", "thrown")}
+    truth = GroundTruth(*(profiles + 10.0 * k for k in range(len(GroundTruth._fields))))
+    return SimpleNamespace(exposures=light, truth=truth)
+
+
+@pytest.mark.parametrize(("most", "every"), [(100, 1), (70, 1), (69, 2), (35, 2), (34, 3), (7, 10)])
+def test_light_of_every_nth_profile_where_all_would_be_too_many(most: int, every: int) -> None:
+    """Seven profiles of ten bins, in blocks of four."""
+
+    class Store(list[Any]):
+        task = SimpleNamespace(transports=np.zeros(7), blocks=lambda: [range(4), range(4, 7)])
+
+    store: Any = Store([block_of(0, 4), block_of(4, 3)])
+    light, truth = simulating._all_light(store, 10, most)
+    chosen = np.arange(7.0)[::every]
+    assert set(light) == {"direct", "diffuse-diffuse"}
+    for each in light.values():
+        np.testing.assert_array_equal(each[0], chosen + 0.25)
+        np.testing.assert_array_equal(each[1], chosen + 0.5)
+    for number, each in enumerate(truth):
+        np.testing.assert_array_equal(each, chosen + 10.0 * number)
+
+
+def test_statistics_are_sums_and_largest_bounds() -> None:
+    blocks: Any = [
+        SimpleNamespace(statistics={"rays": np.array([3.0, 4.0]), "bound": np.array([0.5, 0.2]), "estimated": [1.0]}),
+        SimpleNamespace(statistics={"rays": np.array([10.0]), "bound": np.array([0.3]), "estimated": [2.0, 1.5]}),
+    ]
+    found: dict[str, float] = {}
+    for each in blocks:
+        found = simulating._add_statistics(found, each)
+    assert found == {"rays": 17.0, "bound": 0.5, "estimated": 2.0}
+
+
+def test_attributions_are_joined_field_by_field() -> None:
+    rng = np.random.default_rng(4)
+    parts = [errors_of(rng.normal(size=(count, 5)), causes=("shape", "noise")) for count in (2, 3)]
+    joined = simulating._concatenate(parts)
+    np.testing.assert_array_equal(joined.error, np.concatenate([each.error for each in parts]))
+    assert list(joined.causes) == ["shape", "noise"]
+    for name in joined.causes:
+        np.testing.assert_array_equal(joined.causes[name], np.concatenate([each.causes[name] for each in parts]))
+    for k, each in enumerate(joined.truth):
+        np.testing.assert_array_equal(each, np.concatenate([part.truth[k] for part in parts]))
+
+
+def test_readings_of_blocks_have_the_numbers_of_their_profiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noise is drawn by the number of a profile; statistics are added up."""
+    asked: list[Any] = []
+
+    def attribute(simulator: Any, exposures: Any, truth: Any, **how: Any) -> Any:
+        asked.append((simulator, exposures, how))
+        return errors_of(np.zeros((len(truth.h), 5)))
+
+    monkeypatch.setattr(simulating, "attribute_errors", attribute)
+
+    class Store(list[Any]):
+        task = SimpleNamespace(part=None)
+
+    blocks = [
+        SimpleNamespace(exposures=k, truth=SimpleNamespace(h=np.zeros(count)), statistics={"rays": np.ones(count)})
+        for k, count in enumerate((4, 3, 2))
+    ]
+    store: Any = Store(blocks)
+    simulator: Any = "a simulator"
+    device: Any = "a device"
+    found, statistics = simulating._attribute_errors(store, simulator, 5, device)
+    assert asked == [
+        ("a simulator", k, {"seed": 5, "first_profile": first, "device": "a device"})
+        for k, first in enumerate((0, 4, 7))
+    ]
+    assert found.error.shape == (9, 5)
+    assert statistics == {"rays": 9.0}

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from gpuvision.simulation.light_paths import LightPaths, _widened, distance_from
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.readings import BEYOND_ENDS
 from gpuvision.simulation.transport.illumination import LightSheet
 from sensor_views import sensor_view
 
@@ -162,22 +164,71 @@ def test_bounces_are_left_out_where_they_cannot_matter(device):
 
 
 @pytest.mark.slow
-def test_the_error_of_the_patches_is_estimated(device):
+@pytest.mark.parametrize("size", [0.04, 0.02])
+def test_the_error_of_the_patches_is_estimated(device, size):
     """The estimate contains the change of the readings when the patches become half as large."""
-    made = {}
-    for size in (0.04, 0.02):
-        made[size] = paths(corner(), device, paths=(*PATHS, "multi-bounce"), patch_size=size).profile(0.0)
+    large, small = (
+        paths(corner(), device, paths=(*PATHS, "multi-bounce"), patch_size=each).profile(0.0)
+        for each in (2.0 * size, size)
+    )
     one = sensor_view()
 
     def place(profile):
         total = profile.exposures["direct"] + profile.exposures["multi-bounce"]
         return total.first_moment(one.u_edges) / total.total()
 
-    lit = made[0.02].exposures["direct"].total() > 0.0
-    slope = StripErrorModel.from_exposure(one, made[0.02].exposures["direct"]).slope
-    change = (np.abs(place(made[0.04]) - place(made[0.02])) * slope)[lit].max()
-    assert made[0.02].statistics["estimated error of patches [m]"] == pytest.approx(change, rel=0.05)
-    assert "estimated error of patches [m]" not in paths(corner(), device).profile(0.0).statistics
+    lit = small.exposures["direct"].total() > 0.0
+    slope = StripErrorModel.from_exposure(one, small.exposures["direct"]).slope
+    change = (np.abs(place(large) - place(small)) * slope)[lit].max()
+    assert small.statistics["estimated error of patches [m]"] == pytest.approx(change, rel=0.05)
+
+
+@pytest.mark.parametrize("aperture", [1e-3, 0.1, 0.31])
+def test_the_bound_of_bounces_is_that_of_the_nearest_surface(device, aperture):
+    """The line sends half of its light; the top of the wall is the nearest place, from the edge of the aperture."""
+    view = replace(sensor_view(), aperture=aperture)
+    materials = [GREY, Material(diffuse=Lambert(albedo=0.25))]
+    profile = paths(corner(), device, view=view, materials=materials, min_power=1e-9).profile(0.0)
+    assert "estimated error of patches [m]" not in profile.statistics
+    assert profile.statistics["power"] == pytest.approx(3.0 * 0.04)
+    nearest = math.hypot(0.02, 0.1) - 0.5 * aperture
+    opening = 0.25 * math.pi * aperture**2
+    solid_angle = min(opening / nearest**2, 2.0 * math.pi) if nearest > 0.0 else 2.0 * math.pi
+    power = 0.5 * 3.0 * 0.04 * 0.5 / (1.0 - 0.5) * 0.5 / math.pi * solid_angle
+    reading = StripErrorModel.from_exposure(view, profile.exposures["direct"], min_power=1e-9)
+    expected = reading.error_bound(power).max()
+    assert profile.statistics["bound of multi-bounce left out [m]"] == pytest.approx(expected, rel=1e-9)
+
+
+def test_light_beyond_the_ends_is_that_of_a_wider_sensor(device):
+    """Power and moment beyond either end, about the middle of the first and the last bin; blurred before it is cut."""
+    edges = np.linspace(-3e-3, 3e-3, 25)
+    narrow = sensor_view(u_edges=edges[6:17])
+    ramp = np.array(
+        [
+            [[-0.1, -0.1, -0.02], [0.1, -0.1, 0.03], [0.1, 0.1, 0.03]],
+            [[-0.1, -0.1, -0.02], [0.1, 0.1, 0.03], [-0.1, 0.1, -0.02]],
+        ]
+    )
+    sheet = LightSheet(transport=narrow.transport, power=3.0)
+    made, whole = (
+        paths(Scene(ramp), device, view=each, sheet=sheet, paths=("direct",), blur=2e-4, end_bins=bins)
+        .profile(0.0)
+        .exposures
+        for each, bins in ((narrow, 5), (replace(sensor_view(u_edges=edges), axis=narrow.axis), 0))
+    )
+    direct, beyond = made["direct"], made[BEYOND_ENDS]
+    np.testing.assert_allclose(direct.power, whole["direct"].power[:, 6:16], rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(direct.moment, whole["direct"].moment[:, 6:16], rtol=1e-7, atol=1e-24)
+    centres = 0.5 * (edges[1:] + edges[:-1])
+    for place, outer, inner in ((0, slice(1, 6), 6), (-1, slice(16, 21), 15)):
+        power, moment = whole["direct"].power[:, outer], whole["direct"].moment[:, outer]
+        np.testing.assert_allclose(beyond.power[:, place], power.sum(axis=1), rtol=1e-6, atol=1e-18)
+        first = (moment + power * (centres[outer] - centres[inner])).sum(axis=1)
+        np.testing.assert_allclose(beyond.moment[:, place], first, rtol=1e-6, atol=1e-22)
+    assert beyond.power.sum() > 0.1 * direct.power.sum()
+    assert not beyond.power[:, 1:-1].any()
+    assert BEYOND_ENDS not in whole
 
 
 def test_bounces_that_are_not_simulated_have_a_bound(device):
@@ -186,7 +237,9 @@ def test_bounces_that_are_not_simulated_have_a_bound(device):
     for albedo in (0.5, 1.0):
         made_of = [Material(diffuse=Lambert(albedo=albedo))]
         model = paths(corner(), device, paths=(*PATHS, "multi-bounce"), materials=made_of, patch_size=0.04)
-        with_bounces = model.profile(0.0).exposures
+        with_patches = model.profile(0.0)
+        assert 0.0 < with_patches.statistics["estimated error of patches [m]"] < 1e-3
+        with_bounces = with_patches.exposures
         profile = paths(corner(), device, materials=made_of).profile(0.0)
         reading = StripErrorModel.from_exposure(one, profile.exposures["direct"])
         moved = StripErrorModel.from_exposure(one, profile.exposures["direct"] + with_bounces["multi-bounce"])

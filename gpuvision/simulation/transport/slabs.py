@@ -111,7 +111,7 @@ class SlabImage(NamedTuple):
         reach = u + spread * (np.clip([low, high], -self.tail_sigmas, self.tail_sigmas) - middle)
         first = np.maximum(np.searchsorted(view.u_edges, reach.min(axis=0), side="right") - 1, 0)
         last = np.minimum(np.searchsorted(view.u_edges, reach.max(axis=0), side="left"), view.bins)
-        count = np.maximum(last - first, 0)
+        count = last - first
         of, place = np.repeat(np.arange(len(u)), count), concatenated_ranges(first, count)
         # Edges of the bins in sigmas of the sheet.
         ends = middle[of] + (np.stack([view.u_edges[place], view.u_edges[place + 1]]) - u[of]) / spread[of]

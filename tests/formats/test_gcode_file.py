@@ -75,6 +75,34 @@ def test_offset_maps_points_like_its_code() -> None:
     np.testing.assert_allclose([reached.real, reached.imag], 1e3 * offset.to_machine((7e-3, 5e-3)), atol=5e-5)
 
 
+@pytest.mark.parametrize(("turn", "theta", "mirrored", "rotation"), [
+    (0.5, 0.75, False, -0.25),
+    (0.5, 0.75, True, 1.25),
+    (3.0, -1.0, False, 4.0 - 2.0 * math.pi),
+    (-3.0, 1.0, False, 2.0 * math.pi - 4.0),
+    (3.0, 1.0, True, 4.0 - 2.0 * math.pi),
+])  # fmt: skip
+def test_rotation_is_at_most_a_half_turn(turn: float, theta: float, mirrored: bool, rotation: float) -> None:
+    found = work_offset((0.02, 0.03, theta), (0.1, -0.2, turn), mirrored=mirrored)
+    assert found.rotation == pytest.approx(rotation, abs=1e-12)
+    assert found.is_mirrored == mirrored
+    np.testing.assert_allclose(found.to_machine((0.02, 0.03)), (0.1, -0.2), atol=1e-12)
+
+
+@pytest.mark.parametrize(("dialect", "lines"), [
+    ("linuxcnc", ["G21 (mm)", "G90", "G10 L2 P1 X12.50000 Y-3.25000 R28.647890", "G54"]),
+    ("fanuc", ["G21 (mm)", "G90", "G69", "G10 L2 P1 X12.50000 Y-3.25000", "G54", "G68 X0 Y0 R28.647890"]),
+])  # fmt: skip
+def test_words_of_the_code(dialect: Dialect, lines: list[str]) -> None:
+    plain, mirrored = (WorkOffset(0.0125, -0.00325, 0.5, each) for each in (False, True))
+    assert work_offset_code(plain, dialect) == "\n".join(lines) + "\n"
+    note = "(bottom side: the program must be mirrored, x to -x)"
+    assert work_offset_code(mirrored, dialect, "board 7") == "\n".join(["(board 7)", note, *lines]) + "\n"
+    for comment in ("a\nM3", "a(b", "a\rM3"):
+        with pytest.raises(ValueError, match="has a parenthesis or a line break"):
+            work_offset_code(plain, dialect, comment)
+
+
 def test_wrong_dialects_numbers_and_comments_are_refused() -> None:
     dialect: Any = "grbl"
     with pytest.raises(ValueError, match="expected one of linuxcnc, fanuc"):

@@ -16,12 +16,15 @@ from gpuvision.cli.arguments import (
     echo,
     named_path,
     prints_report,
+    reject_unused,
     write_report,
 )
 from gpuvision.host.errors import GpuVisionError
 
 if TYPE_CHECKING:
     from gpuvision.profiling.curves.curve import Point
+
+_SECONDS = 0.3  # time to measure a setting [s]
 
 
 def curves(
@@ -30,11 +33,20 @@ def curves(
         typer.Argument(metavar="OPERATION", help="Operations to measure, such as line or ruler. Default: all."),
     ] = None,
     device: DeviceLabels = None,
-    seconds: Annotated[float, typer.Option(help="Approximate time to measure each setting [s].", min=0.01)] = 0.3,
+    seconds: Annotated[
+        float | None, typer.Option(help="Approximate time to measure each setting [s]. Default: 0.3.", min=0.01)
+    ] = None,
     as_json: ReportFile = None,
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", parser=named_path, help="Folder for a picture of each operation.")
     ] = None,
+    maps: Annotated[
+        bool,
+        typer.Option(
+            "--maps",
+            help="Measure the region of inputs in which single precision stays close to float64, instead of settings.",
+        ),
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure speed against accuracy: time and error of the settings that a user chooses.
@@ -43,9 +55,19 @@ def curves(
     others have. Errors of points are Euclidean distances. The table shows for each setting the median time, the root
     mean square error, the 95th percentile, and the fraction of samples without a value. A star marks the best settings:
     no other one on the same data is better in time, error or lost samples and as good in the others.
+
+    With --maps nothing is timed. The table shows for each operation two axes of its inputs (light level, distance,
+    distortion, size, condition), and the fraction of the places in their plane where the relative error against float64
+    is below 1e-6 and 1e-3, as measured and as the error model predicts.
     """
     if importlib.util.find_spec("numba") is None:
         raise GpuVisionError("the package numba is missing; install it: pip install 'gpuvision[profile]'")
+    if maps:
+        from gpuvision.cli.curves_maps import measure_stability
+
+        reject_unused("with --maps", seconds=seconds)
+        measure_stability(operations or (), device or (), as_json, plots, overwrite=overwrite)
+        return
     from gpuvision.host.outputs import Outputs
     from gpuvision.profiling.curves import curve, plot
     from gpuvision.profiling.harness import describe_machine
@@ -57,7 +79,10 @@ def curves(
     devices = devices_of(device)
     machine = describe_machine(devices)
     points = curve.measure_curves(
-        operations or curve.OPERATIONS, devices, seconds=seconds, progress=lambda line: echo(line, err=True)
+        operations or curve.OPERATIONS,
+        devices,
+        seconds=seconds or _SECONDS,
+        progress=lambda line: echo(line, err=True),
     )
     report = {"machine": machine, "points": [point.to_dict() for point in points]}
     write_report(as_json, report, outputs)

@@ -42,6 +42,7 @@ from gpuvision.cli.main import application
         ),
         (("select", "g", "--region", "0,0,1cm,1cm", "--scale", "25um", "--out", "d", "--device", "pocl"), "--device"),
         (("profile", "psd", "--contract", "--quick"), "--quick"),
+        (("curves", "psd", "--maps", "--seconds", "1"), "--seconds"),
         (("profile", "psd", "--contract", "--growth"), "--growth"),
         (("profile", "--offline", "sm_90", "--contract"), "--contract"),
         (("profile", "--from", "points.npy", "--plots", "d", "--contract"), "--contract"),

@@ -263,6 +263,8 @@ class SolvePose(VisionOperation[BoardPose]):
     Error: the unknowns are displacements relative to the centre of the rows, not positions. Single precision costs a
     millionth of the displacement, and in the pose 3e-7 of the extent of the rows; at a placement point outside the rows
     the error grows with its distance.
+    Both grow with the condition. The normal equations square it: in single precision a pose with a condition above 1400
+    may be wrong without a flag. ``max_condition`` refuses such a pose by default.
 
     References
     ----------

@@ -585,3 +585,103 @@ def test_three_sigma_on_real_boards_are_below_half_a_pixel(
     counted = np.array([each for each in result.settled if each is not None])
     assert len(counted) == 10
     assert abs(np.mean(counted - result.predicted_settling)) <= 0.6
+
+
+class Cell:
+    """Cell that notes what it places; the second part is not released."""
+
+    made: list[Any]
+
+    def __init__(self, *given: Any) -> None:
+        self.made.append(given)
+        self.machine, self.calls = given[1], []
+        self.made.append(self.calls)
+
+    def identify(self, zone: Any) -> None:
+        self.calls.append(("identify", zone.copy()))
+        self.machine = SimpleNamespace(**{**vars(self.machine), "identified": True})
+
+    def place(self, start: Any, swing: Any, true: Any, offset: Any) -> Any:
+        number = sum(call[0] == "place" for call in self.calls)
+        self.calls.append(("place", start.copy(), swing.copy(), true.copy(), offset.copy()))
+        run = SimpleNamespace(released=number != 1, steered_frames=10 + number)
+        return run, np.array([start, offset + 1e-6 * (number + 1)]), 0.25 * number
+
+
+@pytest.mark.parametrize("rule", ["vibration", "known", "response"])
+def test_placements_begin_at_random_errors_within_the_landing_zone(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start errors fill 0.9 of the zone less the swing; calibration and drift are drawn anew for each part."""
+    for name, function in (
+        ("check_resonances", lambda machine: None),
+        ("plan_placement", lambda *given, **how: planned.append((given, how)) or plan),
+        ("predict_budget", lambda *given: given),
+        ("PlacementCell", Cell),
+    ):
+        monkeypatch.setattr(placing, name, function)
+    monkeypatch.setattr(Cell, "made", [], raising=False)
+    planned: list[Any] = []
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    plan = SimpleNamespace(camera_to_board=turn)
+    calibrated = np.array([1e-3, 2e-3, 0.1])
+    machine: Any = SimpleNamespace(
+        swing=(1e-5, 0.0, 0.0),
+        tolerance=SimpleNamespace(landing_zone=1e-4, landing_angle=0.02),
+        pipette_in_camera=SimpleNamespace(pose=calibrated, pose_covariance=np.diag([1e-12, 4e-12, 9e-8])),
+        drift=SimpleNamespace(covariance=np.diag([1e-14, 0.0, 0.0])),
+        settling=SimpleNamespace(
+            rule="response" if rule == "response" else "vibration",
+            frequency=(1.0, 1.0, 1.0) if rule == "known" else None,
+        ),
+    )
+    machine.for_side = lambda side: machine if side == "bottom" else None
+    artwork: Any = SimpleNamespace(side="bottom")
+    device: Any = "a device"
+    steps: list[Any] = []
+    count = 40
+    result: Any = simulate_placements(
+        artwork, (1.0, 2.0, 3.0), machine, count=count, budget=30, seed=4, device=device,
+        progress=lambda *given: steps.append(given),
+    )  # fmt: skip
+    assert planned == [((artwork, (1.0, 2.0, 3.0), machine), {"budget": 30, "device": device})]
+    given, calls = Cell.made
+    assert given == (artwork, machine, plan, device, 4)
+    assert steps == [(number, count) for number in range(1, count + 1)]
+    zone = np.array([8e-5, 9e-5, 0.018])
+    if rule == "vibration":
+        name, told = calls.pop(0)
+        assert name == "identify"
+        np.testing.assert_allclose(told, zone)
+        assert result.machine.identified
+    starts, swings, true, offsets = (np.array([call[k] for call in calls]) for k in range(1, 5))
+    assert np.all(np.abs(starts) <= zone)
+    assert np.all(np.abs(starts).max(axis=0) > 0.8 * zone)
+    assert np.all(starts.min(axis=0) < -0.5 * zone)
+    assert np.all(swings[:, 1:] == 0.0)
+    assert 0.8e-5 < np.abs(swings[:, 0]).max() <= 1e-5
+    assert swings[:, 0].min() < 0.0 < swings[:, 0].max()
+    # The camera sees the parts in its own frame, the board in the frame of the files.
+    np.testing.assert_allclose(offsets, (true - calibrated) @ turn.T, atol=1e-18)
+    np.testing.assert_allclose(np.std(true - calibrated, axis=0), [1e-6, 2e-6, 3e-4], rtol=0.35)
+    assert abs(np.corrcoef(true[:, 0], true[:, 1])[0, 1]) < 0.5
+    np.testing.assert_allclose(result.sources["calibration"] + result.sources["drift"], offsets, atol=1e-18)
+    assert np.all(result.sources["drift"][:, [0, 2]] == 0.0)
+    assert 3e-8 < np.std(result.sources["drift"][:, 1]) < 3e-7
+    released = np.arange(count) != 1
+    assert np.isfinite(result.error).all(axis=1).tolist() == released.tolist()
+    rest = result.sources["vision and servo"]
+    expected = 1e-6 * np.arange(1.0, count + 1)[released, None] * np.ones(3)
+    np.testing.assert_allclose(rest[released], expected, atol=1e-15)
+    assert np.isnan(rest[1]).all()
+    np.testing.assert_array_equal(result.reach, 0.25 * np.arange(count))
+    predicted_for, _, frames = result.budget
+    assert predicted_for is result.machine
+    assert frames == [10 + number for number in range(count) if number != 1]
+    again: Any = simulate_placements(artwork, (1.0, 2.0, 3.0), machine, count=2, seed=5, device=device)
+    assert not np.array_equal(Cell.made[3][-1][1], starts[1])
+    assert len(again.placements) == 2
+    for swing in ((0.9e-4, 0.0, 0.0), (0.0, 0.0, 0.019)):
+        machine.swing = swing
+        with pytest.raises(ValueError, match=r"swing is .*, expected less than 0\.9 of the landing zone"):
+            simulate_placements(artwork, (1.0, 2.0, 3.0), machine, count=1, device=device)
+    with pytest.raises(ValueError, match="count is 0"):
+        simulate_placements(artwork, (1.0, 2.0, 3.0), machine, count=0, device=device)

@@ -201,6 +201,7 @@ def test_the_exit_code_says_whether_all_is_valid(measured: dict[str, Any], chang
     measured["growth"] = dataclasses.replace(measured["growth"], **changes)
     ran = CliRunner().invoke(application(), ["profile", "psd", "--growth", "--json", "-"], catch_exceptions=False)
     assert ran.exit_code == code
+    assert measured["memory"] == 256 * 2**20  # the default
     assert ran.stdout == measured["growth"].to_json()  # without other text
     assert measured["growth"].lines()[0] in ran.stderr.splitlines()
     assert ("not valid" in ran.stderr) == ("probes" not in changes)

@@ -85,3 +85,18 @@ def test_rows_and_columns_whose_centres_lie_in_bounds(margin: float) -> None:
         np.testing.assert_array_equal(np.arange(90)[columns], np.flatnonzero(inside))
         inside = (y >= low[1] - margin - 1e-12) & (y <= high[1] + margin + 1e-12)
         np.testing.assert_array_equal(np.arange(70)[rows], np.flatnonzero(inside))
+
+
+@pytest.mark.parametrize("margin", [0.0, 35e-6])
+def test_an_aperture_with_its_margin_lies_within_the_map(margin: float) -> None:
+    """The map ends at the outer edges of its cells, of 20 x 30 um; each side a nanometre within and beyond."""
+    ends = np.array([[GRID.left, GRID.top - 69 * GRID.cell_y], [GRID.left + 89 * GRID.cell_x, GRID.top]])
+    ends += 0.5 * np.array([[-1.0], [1.0]]) * (GRID.cell_x, GRID.cell_y)
+    for side in (0, 1):
+        for end, inwards in ((0, 1.0), (1, -1.0)):
+            for shift, fits in ((1e-9, True), (-1e-9, False)):
+                centre = ends.mean(axis=0)
+                centre[side] = ends[end, side] + inwards * (60e-6 + margin + shift)
+                low, high = 1e3 * (centre - 60e-6), 1e3 * (centre + 60e-6)
+                (window,) = aperture_windows([box(*low, *high)], GRID, margin)
+                assert (window is not None) == fits, (side, end, shift)

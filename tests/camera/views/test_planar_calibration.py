@@ -420,6 +420,15 @@ def _lacking(views):
     }
 
 
+def test_too_few_points_for_the_smallest_model(rng):
+    """Of one view of four points a camera has 3 parameters and the pose 6: more than the 8 coordinates."""
+    target, image = scene(rng, "grid", 10, views=1).views(rng, 0.1)[0]
+    corners = [0, 1, -2, -1]
+    message = "4 points in 1 views are too few for the 9 unknowns of model 'none'"
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        fit_camera([(target[corners], image[corners])], (1280, 1024))
+
+
 @pytest.mark.parametrize("message", _lacking([(np.zeros((8, 3)), np.zeros((8, 2)))] * 3))
 def test_what_the_views_lack(message, rng):
     made = scene(rng, "grid", 10, views=3)

@@ -118,6 +118,18 @@ def test_scale_of_a_grid(bright: bool) -> None:
     np.testing.assert_array_equal(found.size, 5.0)
 
 
+@pytest.mark.parametrize(("pitch", "side"), [(60, 40), (58, 26), (30, 22)])
+def test_scale_of_few_large_squares(pitch: int, side: int) -> None:
+    """Of 3 x 3 squares the middle one has symmetric neighbours; a window of a sixth lies within a square of 40 px."""
+    grey = grid(pitch, side, 3, True)
+    scale = estimate_scale(grey, BlobLimits())
+    assert (scale.bright, scale.pitch, scale.cell_area) == (True, pytest.approx(pitch), pytest.approx(pitch**2))
+    found = find_pattern_blobs(grey, BlobLimits())
+    assert len(found.points) == 9
+    np.testing.assert_array_equal(found.size, side)
+    assert found.coverage == pytest.approx(side**2 / pitch**2, rel=0.02)  # smoothing rounds the corners
+
+
 def test_too_few_blobs_have_no_scale() -> None:
     """Five blobs are the least number of a trial."""
     cross = [(20, 8), (8, 20), (20, 20), (32, 20), (20, 32)]

@@ -16,6 +16,7 @@ from gpuvision.ranging.regrid import Grid
 GRID = Grid(left=1e-3, top=5e-3, cell_x=2e-5, cell_y=3e-5, columns=42, rows=36)
 NONE: Any = np.zeros((0, 0), bool)
 SURFACE = ReferenceSurface(np.array([1.2e-3, 4.5e-3]), 5e-4, 1, np.array([1e-4, 2e-5, -3e-5]), np.eye(3), 2e-6, 99)
+PARTS = ((slice(0, 12), slice(0, 13)), (slice(14, 33), slice(11, 34)))
 
 
 def of_pairs(parts: list[tuple[np.ndarray, np.ndarray]]) -> float:
@@ -53,12 +54,16 @@ def test_correlation_area_is_the_sum_over_pairs() -> None:
     ]
     parts = []
     # 7e-5 m are 4 cells of the smaller size of 2e-5 m, 5e-5 m are 3.
-    for rows, columns in ((slice(0, 12), slice(0, 13)), (slice(14, 33), slice(11, 34))):
+    for rows, columns in PARTS:
         values = (z - SURFACE.heights(x, y))[rows, columns] / 2e-6
         parts.append((values, free[rows, columns] & (np.abs(values) <= 3.0)))
     found, expected = correlation_area(z, free, GRID, rings), of_pairs(parts)
     assert 3.0 < expected < 15.0
     assert found == pytest.approx(expected, rel=1e-6)
+    # The unit of the deviations does not matter: a scale that is far too large clips nothing.
+    wide = rings[0]._replace(surface=SURFACE._replace(scale=0.02))
+    whole = [(parts[0][0], free[PARTS[0]])]
+    assert correlation_area(z, free, GRID, [wide]) == pytest.approx(of_pairs(whole), rel=1e-6)
 
 
 def test_noise_of_single_cells_and_no_noise() -> None:

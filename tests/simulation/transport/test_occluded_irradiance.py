@@ -28,6 +28,7 @@ from gpuvision.simulation.transport.occluded_irradiance import (
     segment_rows,
 )
 from gpuvision.status import Status
+from tiers import variants_of
 
 ON_DEVICES = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 # Builds take most of the time: each variant has one of the two types here; other tests use the default of the device.
@@ -499,10 +500,25 @@ def test_selected_indices_without_a_segment(device: Device, variant: Any, rng: n
     result = selected_of(soup(rng, 3), receivers, segments, lists, device, variant)
     np.testing.assert_array_equal(result.status[0], np.repeat([0, Status.OUT_OF_RANGE, Status.OUT_OF_RANGE, 0], 16))
     np.testing.assert_array_equal(np.isnan(result.irradiance), result.status != 0)
-    operation = OccludedIrradiance(scene=Scene(NO_TRIANGLES), segments=3, selected=1, variant=variant)
-    weights, starts = np.ones((1, 64, 2), np.float32), np.array([-1, 1, 1, 1, 7], np.int32)
-    beyond = operation(receivers, weights, segments.astype(np.float32), starts, np.zeros(1, np.int32), device=device)
-    np.testing.assert_array_equal(beyond.status[0] != 0, np.repeat([True, False, False, True], 16))
+
+
+def test_lists_beyond_the_selection(device: Device, rng: np.random.Generator) -> None:
+    """A list begins at 0 at the earliest, and ends with the selection at the latest; others spoil their own block."""
+    segments, receivers = segments_of(rng, 3).astype(np.float32), receivers_of(rng, 1, 64).astype(np.float32)
+    selected, bad = np.array([0, 2], np.int32), Status.OUT_OF_RANGE
+    cases = {
+        (-1, 2, 2, 2, 3): [bad, 0, 0, bad],
+        (0, 1, 2, 2, 2): [0, 0, 0, 0],
+        (-1, -1, 0, 3, 2): [bad, bad, bad, 0],
+        (0, 0, 2, 1, 7): [0, 0, 0, bad],
+    }
+    for variant in variants_of(device):
+        operation = OccludedIrradiance(scene=Scene(NO_TRIANGLES), segments=3, selected=2, variant=variant)
+        for starts, expected in cases.items():
+            numbers = np.array(starts, np.int32)
+            result = operation(receivers, np.ones((1, 64, 2), np.float32), segments, numbers, selected, device=device)
+            np.testing.assert_array_equal(result.status[0], np.repeat(expected, 16))
+            np.testing.assert_array_equal(np.isnan(result.irradiance[0]), np.repeat(expected, 16) != 0)
 
 
 @pytest.mark.parametrize("is_slow", [False, True])

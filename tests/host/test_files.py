@@ -261,3 +261,58 @@ def test_a_full_disk_of_every_kind_of_write(tmp_path: Path, monkeypatch: pytest.
     np.savez(plain, a=np.zeros(100_000), b=np.zeros(7))
     assert raised.value.wanted == len(plain.getvalue())
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("links", [True, False])
+@pytest.mark.parametrize("fails_at", [1, 2, 3, 4, None])
+def test_a_move_that_fails_restores_every_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool, fails_at: int | None
+) -> None:
+    """New and replaced files and folders; also on a file system without hard links."""
+    out = tmp_path / "out"
+    (out / "b").mkdir(parents=True)
+    (out / "a").write_text("old a")
+    (out / "b" / "c").write_text("old c")
+    replace, count = os.replace, [0]
+
+    def sometimes(source: Path, target: Path) -> None:
+        if ".gpuvision." in str(source) and Path(source).name in ("a", "c", "d", "f"):
+            count[0] += 1
+            if count[0] == fails_at:
+                raise OSError("no more")
+        replace(source, target)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError("no hard links here")
+
+    if not links:
+        monkeypatch.setattr(os, "link", refuse)
+    new = {"a": "new a", "b/c": "new c", "b/d": "new d", "e/f": "new f"}
+
+    def write() -> None:
+        with files.atomic_folder(out) as inside:
+            for name, text in new.items():
+                (inside / name).parent.mkdir(exist_ok=True)
+                (inside / name).write_text(text)
+
+    monkeypatch.setattr(os, "replace", sometimes)
+    old = {"a": "old a", "b/c": "old c"}
+    if fails_at is None:
+        write()
+    else:
+        with pytest.raises(OSError, match="no more"):
+            write()
+    found = {str(each.relative_to(out)): each.read_text() for each in out.rglob("*") if each.is_file()}
+    assert found == (new if fails_at is None else old)
+    assert (out / "e").exists() == (fails_at is None)
+    assert [each.name for each in tmp_path.iterdir()] == ["out"]
+
+
+def test_temporaries_of_a_process_are_removed_before_it_ends(tmp_path: Path) -> None:
+    (tmp_path / "unrelated").write_text("stays")
+    with files._temporary(tmp_path, Path.mkdir) as folder, files._temporary(tmp_path, Path.touch):
+        (folder / "a").write_text("half")
+        assert len(list(tmp_path.iterdir())) == 3
+        files.remove_temporaries()
+        assert [each.name for each in tmp_path.iterdir()] == ["unrelated"]
+    assert not files._live

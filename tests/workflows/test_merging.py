@@ -244,6 +244,47 @@ def test_what_a_map_does_not_hold_follows_from_its_heights(rng: np.random.Genera
     assert np.asarray(heights.status).dtype == np.uint8
 
 
+@pytest.mark.parametrize("has_sigma", [False, True])
+def test_report_of_a_merge(has_sigma: bool) -> None:
+    """Each number once; the differences are 1, 2, 4, 5 and 9 um: median 4 um, deviations 3, 2, 0, 1, 5 um."""
+    source = np.zeros((2, 4), np.uint8)
+    source[0], source[1, :2] = (FIRST, FIRST | SECOND, SECOND, SECOND | DISAGREES), (SECOND, UNCONFIRMED)
+    grid = Grid(left=1.0, top=2.0, cell_x=3e-3, cell_y=4e-3, columns=4, rows=2)
+    heights: Any = SimpleNamespace(source=source, sigma=np.zeros(1) if has_sigma else None)
+    settings = {"max_sigmas": 2.5, "tolerance": 1e-6, "disagreement": "keep", "require_both": False}
+    differences = np.array([1.0, 2.0, 4.0, 5.0, 9.0]) * 1e-6
+    merge = HeightMapMerge(
+        names=("one", "other"), heights=heights, grid=grid, differences=differences, settings=settings
+    )
+    report = merge.report()
+    assert report.pop("gpuvision")
+    assert report == {
+        "first": "one",
+        "second": "other",
+        "max_sigmas": 2.5,
+        "tolerance_m": 1e-6,
+        "disagreement": "keep",
+        "require_both": False,
+        "cells": {
+            "first": 1,
+            "second": 3,
+            "both": 1,
+            "none": 3,
+            "unconfirmed": 3,
+            "unconfirmed_dropped": 1,
+            "common": 5,
+            "disagrees": 1,
+        },
+        "difference": {"median_m": pytest.approx(4e-6), "robust_sigma_m": pytest.approx(1.4826022 * 2e-6)},
+        "weights": "inverse variance" if has_sigma else "equal",
+        "map": dataclasses.asdict(grid),
+        "warnings": list(merge.advice()),
+    }
+    assert "dropped" not in merge.summary()
+    nothing = dataclasses.replace(merge, differences=np.zeros(0)).report()["difference"]
+    assert nothing == {"median_m": None, "robust_sigma_m": None}
+
+
 def test_files_of_a_merge_with_and_without_sigma() -> None:
     merge: Any = object.__new__(HeightMapMerge)
     for sigma, files in ((None, MERGE_FILES), (np.zeros(1), (*MERGE_FILES, SIGMA_FILE))):

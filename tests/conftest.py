@@ -205,15 +205,21 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _a_device_is_there(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def _a_device_is_there(request: pytest.FixtureRequest) -> None:
     if "device" not in request.fixturenames:
         return
     device = request.getfixturevalue("device")
     if device is None:
         pytest.fail(f"this test needs a healthy OpenCL device; {INSTALL_HINT}", pytrace=False)
     request.node.user_properties.append(("device", device.label))
+
+
+@pytest.fixture(autouse=True)
+def _no_inline_device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the tests of `Selection.without_inline` on the worker threads of PoCL only."""
     if request.node.stash.get(WITHOUT_INLINE, False):
-        monkeypatch.setattr(device, "inline_device", None)
+        for device in Device.all():
+            monkeypatch.setattr(device, "inline_device", None)
 
 
 @pytest.hookimpl(tryfirst=True)

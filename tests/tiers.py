@@ -41,8 +41,8 @@ class Selection(NamedTuple):
     left : list of pytest.Item
         The other tests.
     without_inline : set of pytest.Item
-        Chosen tests that run without PoCL's inline device, for which PoCL compiles each kernel once more: kernel tests
-        that are not in the smoke set, outside ``tests/host`` and the folders of whole tasks, whose other tests use it.
+        Chosen tests that run without PoCL's inline device, for which PoCL compiles each kernel once more: all tests
+        outside ``tests/host``. Subprocesses that tests start have the inline device.
     """
 
     chosen: list[pytest.Item]
@@ -105,7 +105,7 @@ def select_fast(items: Sequence[pytest.Item], best: Collection[Device]) -> Selec
             continue
         seen.add(case)
         selection.chosen.append(item)
-        if is_more and not _is_of_host(item) and item.path.parent.name not in _COMPOSED:
+        if not _is_of_host(item):
             selection.without_inline.add(item)
     return selection
 

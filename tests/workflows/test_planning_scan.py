@@ -297,14 +297,14 @@ def test_a_window_narrower_than_the_line_is_not_chosen(
     monkeypatch.setattr(
         planning_scan,
         "_readouts",
-        lambda sensor, _: [dataclasses.replace(sensor.readout, window=window) for window in (3, 6)],
+        lambda sensor, _: [dataclasses.replace(sensor.readout, window=window) for window in (4, 6)],
     )
     monkeypatch.setattr(planning_scan, "median_times", lambda calls: [1e-4, 2e-4][: len(calls)])
     plan = plan_scan(recording(rng, 3), noisy_camera(), tolerance=1.0, device=device)
     assert plan.chosen.readout.window == 6
-    assert [each.readout.window for each in plan.trials] == [3, 6]
+    assert [each.readout.window for each in plan.trials] == [4, 6]
     assert math.isnan(plan.trials[0].error)
-    assert plan.table().splitlines()[1].startswith("- windowed 3")
+    assert plan.table().splitlines()[1].startswith("- windowed 4")
 
 
 @pytest.mark.slow

@@ -19,17 +19,26 @@ from gpuvision.host.build_notice import BuildNotice, show_builds
 from gpuvision.ranging.line import LineReadout
 
 _PROGRAM = """
-import sys, time
+import sys, threading
 import gpuvision.cli.main as cli
 from gpuvision.host import build_notice
 
-BuildNotice = build_notice.BuildNotice
-build_notice.BuildNotice = lambda terminal: BuildNotice(terminal, delay=0.0)
+shown = threading.Event()
+
+class Notice(build_notice.BuildNotice):
+    def __init__(self, terminal):
+        super().__init__(terminal, delay=0.0, clock=lambda: 0.0)
+
+    def _write(self, text):
+        super()._write(text)
+        shown.set()
+
+build_notice.BuildNotice = Notice
 
 def application():
     def command():
         with build_notice.building("line/line.cl"):
-            time.sleep(0.5)
+            shown.wait(60.0 if sys.stderr.isatty() else 0.2)
         print("result")
     return command
 

@@ -16,18 +16,21 @@ def recorded(device, samples, calls=9):
     bound = gv.PsdReadout(strip_length=6e-3, layout="planar").bind(device, (2, samples), np.float32)
     bound.inputs[0].set(np.full((2, samples), 1e3, np.float32))
     recorder = Recorder(bound, device)
-    begun = time.perf_counter()
+    spent = []
     for _ in range(calls):
+        begun = time.perf_counter()
         recorder()
-    return recorder.medians(), (time.perf_counter() - begun) / calls
+        spent.append(time.perf_counter() - begun)
+    return recorder.medians(), np.median(spent)
 
 
 def test_the_times_on_the_device_are_within_the_time_on_the_host(device):
     times, host = recorded(device, 1_000_000)
     assert min(times) >= 0.0
     assert 0.0 < times.running < host
-    few, _ = recorded(device, 1000)
-    assert few.running < 0.5 * times.running
+    # A busy machine only adds time.
+    few = min(recorded(device, 1000)[0].running for _ in range(3))
+    assert few < 0.5 * times.running
 
 
 class Event:

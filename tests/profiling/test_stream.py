@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import time
+import subprocess
 
 import pytest
 
@@ -128,5 +128,7 @@ def test_runs_and_seconds_are_positive(words, capsys):
 
 def test_a_second_process_that_ends_early_is_an_error(monkeypatch):
     monkeypatch.setattr(stream, "_LOAD_CODE", "print('ready', flush=True)")
+    started, start = [], subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", lambda *words, **how: started.append(start(*words, **how)) or started[0])
     with pytest.raises(StreamError, match="second process ended with exit code 0"), stream._half_loaded_core():
-        time.sleep(0.5)
+        started[0].wait(60.0)

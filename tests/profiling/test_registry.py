@@ -1,4 +1,4 @@
-"""Every public operation has a benchmark."""
+"""Every public operation has a benchmark, a curve, a stability map, a place in the roofline and a contract."""
 
 from __future__ import annotations
 
@@ -13,12 +13,39 @@ pytest.importorskip("numba", reason="the extra 'profile' is not installed")
 import gpuvision as gv
 from gpuvision.host import Operation
 from gpuvision.profiling import harness
+from gpuvision.profiling.contract import agreement
+from gpuvision.profiling.curves import curve
+from gpuvision.profiling.maps import stability
 
 FOLDER = Path(harness.__file__).parent
 
 
 # Operations that a benchmark binds through another public function.
 BOUND_BY = {"EstimateFeaturePose": "FeatureSet"}
+# What public operations do not have yet. The list may only become shorter: a new operation has all of it.
+LACKS: dict[str, set[str]] = {
+    "curve": {
+        *("AnyHit", "BoardPoseEstimator", "ClosestHit", "EstimateFeaturePose", "FieldPoseRefinement"),
+        *("FieldPoseSearch", "LineIrradiance", "MeasureDeposits", "MergeHeights", "RangeImage"),
+        *("Reflectance", "RenderBoard"),
+    },
+    "map": {
+        *("AnyHit", "BoardPoseEstimator", "ClosestHit", "EstimateFeaturePose", "FieldPoseRefinement"),
+        *("FieldPoseSearch", "FindBlobs", "LineIrradiance", "MeasureDeposits", "MergeHeights"),
+        *("OccludedIrradiance", "RangeImage", "Reflectance", "RenderBoard", "UndistortImage"),
+    },
+    "roofline": {
+        *("AnyHit", "BoardPoseEstimator", "ClosestHit", "EstimateFeaturePose", "FieldPoseRefinement"),
+        *("FieldPoseSearch", "FindBlobs", "FitLines", "LineReadout", "MeasureDeposits"),
+        *("OccludedIrradiance", "Reflectance", "RenderBoard", "RulerEdges", "SolvePose", "UndistortImage"),
+        *("UndistortPoints",),
+    },
+    "contract": {
+        *("BoardPoseEstimator", "EstimateFeaturePose", "FieldPoseRefinement", "FieldPoseSearch"),
+        *("FindBlobs", "MeasureDeposits", "OccludedIrradiance", "RenderBoard", "RulerEdges", "SolvePose"),
+    },
+}
+NUMBER = 54  # of the entries of the list
 
 
 def constructed(path: Path) -> set[str]:
@@ -55,3 +82,43 @@ def test_every_public_operation_has_a_benchmark() -> None:
 def test_the_benchmark_runs_the_operation(operation: str) -> None:
     names = set().union(*(constructed(path) for path in modules_of(harness.MEASURED[operation])))
     assert BOUND_BY.get(operation, operation) in names
+
+
+def built_by(folder: str, stems: tuple[str, ...]) -> set[str]:
+    """Return the public operations that modules of a folder construct."""
+    names = set().union(*(constructed(FOLDER / folder / f"{stem}.py") for stem in stems))
+    return {each for each in public_operations() if BOUND_BY.get(each, each) in names}
+
+
+def in_the_roofline() -> set[str]:
+    """Return the public operations of benchmark modules whose cases state numbers of operations and of bytes."""
+    found = set()
+    for path in FOLDER.glob("*.py"):
+        calls = [each for each in ast.walk(ast.parse(path.read_text())) if isinstance(each, ast.Call)]
+        cases = [each for each in calls if isinstance(each.func, ast.Name) and each.func.id == "Case"]
+        if any(keyword.arg == "flops" for case in cases for keyword in case.keywords):
+            found |= {each for each in public_operations() if BOUND_BY.get(each, each) in constructed(path)}
+    return found
+
+
+def has() -> dict[str, set[str]]:
+    """Return the public operations that have each part of the profile."""
+    return {
+        "curve": built_by("curves", curve.OPERATIONS),
+        "map": built_by("maps", stability.OPERATIONS),
+        "roofline": in_the_roofline(),
+        "contract": set(agreement.stated_limits()),
+    }
+
+
+def test_every_public_operation_has_curve_map_roofline_and_contract() -> None:
+    lacking = {f"{each} has no {part}" for part, names in has().items() for each in public_operations() - names}
+    listed = {f"{each} has no {part}" for part, names in LACKS.items() for each in names}
+    assert sorted(lacking - listed) == []
+
+
+def test_the_list_of_missing_parts_becomes_shorter_only() -> None:
+    """An entry that exists is to be removed from the list, and the number lowered."""
+    assert sorted(f"{each} has a {part}" for part, names in has().items() for each in names & LACKS[part]) == []
+    assert set().union(*LACKS.values()) <= public_operations()
+    assert sum(map(len, LACKS.values())) == NUMBER

@@ -202,6 +202,46 @@ def test_agreeing_readings_are_weighed_by_their_noise() -> None:
     assert np.isfinite(SensorFusion(max_sigmas=0.0, tolerance=4e-6).fuse(one, other).h).all()
 
 
+def test_readings_agree_up_to_their_sigmas_and_the_tolerance() -> None:
+    """Sigmas of 3 and 4 um, two sigmas and 5 um: the limit is 15 um; exact numbers, on the limit and beyond."""
+    unit = 2.0**-20
+    one = reading([0.0, 0.0, 0.0, 1.0], sigma=3.0 * unit)
+    other = reading(np.array([15.0, -15.0, 15.0 + 2.0**-20, 0.0]) * unit + [0.0, 0.0, 0.0, 1.0], sigma=4.0 * unit)
+    fused = SensorFusion(max_sigmas=2.0, tolerance=5.0 * unit).fuse(one, other)
+    assert fused.source.tolist() == [BOTH, BOTH, NONE, BOTH]
+    np.testing.assert_allclose(fused.first_weight, [0.64, 0.64, np.nan, 0.64], rtol=1e-14)
+    np.testing.assert_allclose(fused.h[:2], [0.36 * 15.0 * unit, -0.36 * 15.0 * unit], rtol=1e-12)
+    np.testing.assert_allclose(fused.sigma[[0, 1, 3]], 2.4 * unit, rtol=1e-12)
+    unknown = SensorFusion(tolerance=1.0).fuse(reading([0.0], sigma=np.nan), reading([1.0], sigma=1.0))
+    assert (unknown.first_weight.tolist(), unknown.h.tolist()) == ([0.5], [0.5])
+
+
+@pytest.mark.parametrize("flag", [Status.SATURATED, Status.AMBIGUOUS])
+def test_two_doubtful_readings_are_left_to_the_rule(flag: Status) -> None:
+    one, other = reading([1e-3] * 2, status=[flag, 0], strength=3.0), reading([2e-3] * 2, status=[flag, flag])
+    assert SensorFusion().fuse(one, other).source.tolist() == [NONE, FIRST]
+    assert SensorFusion(rule="stronger").fuse(one, other).source.tolist() == [FIRST, FIRST]
+    assert SensorFusion().fuse(one, other).status.tolist() == [Status.AMBIGUOUS, 0]
+    assert SensorFusion(rule="mean").fuse(one, other).status.tolist() == [flag, 0]
+
+
+def test_values_on_the_ratio_decide() -> None:
+    """The chosen sensor is better by the factor 1.5 or more, in either order; a dark one never wins."""
+    one, other = (
+        reading([1e-3] * 4, strength=[3.0, 2.0, 3.0, 0.0]),
+        reading([2e-3] * 4, strength=[2.0, 3.0, 2.125, 1e-9]),
+    )
+    assert SensorFusion(rule="stronger").fuse(one, other).source.tolist() == [FIRST, SECOND, NONE, SECOND]
+    one, other = reading([1e-3] * 3, width=[2.0, 3.0, 2.0]), reading([2e-3] * 3, width=[3.0, 2.0, 2.875])
+    assert SensorFusion(rule="narrower").fuse(one, other).source.tolist() == [FIRST, SECOND, NONE]
+    # Errors of the first, of the second, and their mean.
+    errors = ([2.0, -5.0, 4.0, np.nan], [3.0, 2.0, -6.0, np.nan])
+    found = SensorFusion(rule="predicted").fuse(reading([1e-3] * 4), reading([2e-3] * 4), errors)
+    assert found.source.tolist() == [NONE, NONE, BOTH, NONE]
+    closer = SensorFusion(rule="predicted", min_ratio=1.25).fuse(reading([1e-3] * 4), reading([2e-3] * 4), errors)
+    assert closer.source.tolist() == [FIRST, BOTH, BOTH, NONE]
+
+
 def test_one_reading_alone() -> None:
     one, other = reading([1e-3, np.nan, np.nan]), reading([np.nan, 2e-3, np.nan])
     fused = SensorFusion().fuse(one, other)

@@ -85,6 +85,56 @@ def test_light_through_a_window(seed: int, ends: tuple[float, float], leak: floa
     np.testing.assert_allclose((halves[0] + halves[1]).moment, wide.moment, atol=1e-14)
 
 
+def test_a_leak_adds_its_share_of_the_light_outside(rng: np.random.Generator) -> None:
+    """Windows at edges of bins are exact: inside all light passes, outside the leak; transmission comes before."""
+    edges = np.array([0.0, 1.0, 2.5, 3.0, 5.0])
+    light = Exposure(rng.uniform(1.0, 2.0, (2, 3, 4)), rng.uniform(-0.2, 0.2, (2, 3, 4)))
+    windows = [[1.0, 3.0], [0.0, 2.5], [5.0, 5.0]]
+    inside = np.array([[0, 1, 1, 0], [1, 1, 0, 0], [0, 0, 0, 0]])
+    shares = rng.uniform(0.0, 1.0, (3, 4))
+    for leak in (0.0, 0.25, 1.0):
+        for transmission in (None, shares):
+            passing = Mask(windows=windows, leak=leak, transmission=transmission).apply(light, edges)
+            share = (inside + leak * (1 - inside)) * (1.0 if transmission is None else shares)
+            np.testing.assert_allclose(passing.power, share * light.power, rtol=1e-14)
+            np.testing.assert_allclose(passing.moment, share * light.moment, rtol=1e-13)
+
+
+def test_a_window_within_a_bin_divides_its_light() -> None:
+    """A bin from 2 to 4 with its centroid at 3.5: the light is even from 3 to 4, with any window."""
+    edges = np.array([2.0, 4.0])
+    light = Exposure(np.array([[8.0]]), np.array([[4.0]]))
+    for window, power, place in (
+        ((3.25, 3.75), 4.0, 3.5),
+        ((0.0, 3.25), 2.0, 3.125),
+        ((3.75, 9.0), 2.0, 3.875),
+        ((2.0, 3.0), 0.0, 3.0),
+        ((2.0, 4.0), 8.0, 3.5),
+        ((2.5, 3.5), 4.0, 3.25),
+    ):
+        passing = Mask(windows=[window]).apply(light, edges)
+        assert passing.power[0, 0] == pytest.approx(power, abs=1e-15)
+        assert passing.moment[0, 0] == pytest.approx(power * (place - 3.0), abs=1e-15)
+
+
+def test_masks_that_are_no_windows_are_not_written(tmp_path: Path) -> None:
+    windows = [[0.0, 1.0], [1.0, 2.0]]
+    for mask in (
+        Mask(),
+        Mask(windows=[windows]),
+        Mask(windows=windows, transmission=[[1.0]]),
+        Mask(windows=windows, leak=1e-9),
+    ):
+        with pytest.raises(ValueError, match="only a mask of one window per sample"):
+            mask.save(tmp_path / "mask.txt")
+    for text in ("1, 2\n3\n", "1\n2\n", "a, b\n"):
+        (tmp_path / "wrong.txt").write_text(text)
+        with pytest.raises(ValueError, match="two numbers a line"):
+            Mask.load(tmp_path / "wrong.txt")
+    (tmp_path / "one.txt").write_text("1, 2\n")
+    np.testing.assert_array_equal(Mask.load(tmp_path / "one.txt").windows, [[1.0, 2.0]])
+
+
 def test_a_point_of_light_passes_or_does_not() -> None:
     """All light at one end of its bin: no width to divide."""
     edges = np.array([0.0, 1.0, 2.0])

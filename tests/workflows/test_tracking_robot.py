@@ -8,6 +8,7 @@ import math
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -235,6 +236,64 @@ def test_report_and_summary_of_a_track(device: Device) -> None:
     assert none.summary() == "2 frames, 2 of them refused; last state NO_DATA\nno pose at the last frame"
     assert none.problem() == "no pose in 2 frames: too dark"
     assert RobotTrack(states=(lost,), refused={}, field=field, device=device).problem() == "no pose in 1 frames"
+
+
+class Followed:
+    """Filter that notes what it is told; its state has the time of the last view."""
+
+    made: list[Any]
+
+    def __init__(self, field: Any, initial: Any, *, limits: Any) -> None:
+        self.calls: list[Any] = []
+        self.made.append((field, initial, limits, self.calls))
+
+    def move(self, time: float, motion: Any, covariance: Any) -> None:
+        self.calls.append(("move", time, motion.tolist(), np.sqrt(np.diag(covariance)).tolist()))
+
+    def see(self, time: float, candidates: Any) -> None:
+        self.calls.append(("see", time, candidates))
+
+    def state(self) -> int:
+        return len(self.calls)
+
+
+@pytest.mark.parametrize("with_odometry", [False, True])
+@pytest.mark.parametrize("known", [False, True])
+def test_each_frame_moves_the_robot_and_shows_its_place(
+    known: bool, with_odometry: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Followed, "made", [], raising=False)
+    monkeypatch.setattr(tracking_robot, "RobotFilter", Followed)
+    monkeypatch.setattr(tracking_robot, "scan_floor", lambda frame, **how: (int(frame[0, 0]), how))
+    monkeypatch.setattr(
+        tracking_robot,
+        "locate_robot",
+        lambda scan, field, device: SimpleNamespace(reason="dark" if scan[0] == 1 else "", candidates=(scan, device)),
+    )
+    views = np.arange(3, dtype=np.uint8)[:, None, None] * np.ones((3, 2, 2), np.uint8)
+    motions = np.array([[0.3, 0.4, -0.5], [0.6, 0.0, 0.0]]) if with_odometry else None
+    field, device, limits = "a field", "a device", "the limits"
+    track: Any = track_robot(
+        ArraySource(views), field, rate=4.0, odometry=motions, device=device, limits=limits, scale=SCALE,  # type: ignore[arg-type]
+        initial_pose=(1.0, 2.0, 3.0) if known else None,
+    )  # fmt: skip
+    ((given, initial, used, calls),) = Followed.made
+    assert (given, used) == (field, limits)
+    if known:
+        np.testing.assert_array_equal(initial.pose, [1.0, 2.0, 3.0])
+        np.testing.assert_allclose(initial.covariance, np.diag([0.25, 0.25, 0.1225]))
+    else:
+        assert initial is None
+    seen = [("see", 0.25 * k, ((k, {"device": device, "scale": SCALE}), device)) for k in range(3)]
+    if motions is None:
+        moves = [[[0.0] * 3, [0.25, 0.25, 0.375]]] * 2
+    else:
+        moves = [[motions[0].tolist(), [0.052, 0.052, 0.052]], [motions[1].tolist(), [0.062, 0.062, 0.002]]]
+    assert [calls[k] for k in (0, 2, 4)] == seen
+    for call, time, (motion, sigmas) in zip((calls[1], calls[3]), (0.25, 0.5), moves, strict=True):
+        assert call == ("move", time, motion, pytest.approx(sigmas))
+    assert track.states == (1, 3, 5)
+    assert (track.refused, track.field, track.device) == ({1: "dark"}, field, device)
 
 
 class Views(Source):

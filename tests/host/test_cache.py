@@ -223,3 +223,33 @@ def test_the_import_ignores_a_relative_cache_folder(tmp_path: Path) -> None:
     ran = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path, env=environment)
     assert ran.stdout == "None\n"
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("rights", "is_private"), [(0o600, True), (0o644, True), (0o620, False), (0o602, False)])
+def test_a_file_that_others_may_write_is_not_private(tmp_path: Path, rights: int, is_private: bool) -> None:
+    file, link = tmp_path / "file", tmp_path / "link"
+    file.write_text("text")
+    file.chmod(rights)
+    link.symlink_to(file)
+    assert cache.is_private(file) == is_private
+    assert cache.read_private(file) == ("text" if is_private else None)
+    assert not cache.is_private(link)
+    assert not cache.is_private(tmp_path / "none")
+    assert cache.is_private(tmp_path) == (not tmp_path.stat().st_mode & 0o022)
+
+
+def test_a_private_file_has_at_most_the_bytes_that_are_asked_for(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"12345")
+    file.chmod(0o600)
+    assert cache.read_private_bytes(file, 5) == b"12345"
+    assert cache.read_private_bytes(file, 4) is None
+    file.write_bytes(b"\xff\xfe")
+    assert cache.read_private(file) is None  # no text
+
+
+def test_a_folder_that_cannot_be_made_private_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "_holds", lambda *_: False)
+    with pytest.raises(PermissionError, match="entries cannot be made private; remove it"):
+        cache.private_folder(folder / "entries", {"a": "1"})
+    assert [each.name for each in folder.iterdir()] == ["entries"]

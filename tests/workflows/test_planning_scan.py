@@ -25,7 +25,7 @@ from gpuvision.workflows.scan_plan import ReadoutTrial, ScanPlan, ScanPlanLimits
 from gpuvision.workflows.scanning import scan
 
 READ_NOISE, GAIN = 1.5, 0.1
-# The fast tier tries these: each readout is a build of the kernel.
+# Each readout is a build of the kernel; the fast tier tries windows only.
 FEW: tuple[dict[str, Any], ...] = (
     {"method": "windowed", "window": 6},
     {"method": "gauss3"},
@@ -34,15 +34,20 @@ FEW: tuple[dict[str, Any], ...] = (
 ROWS = 30.2 + 0.01 * np.arange(480)
 
 
-@pytest.fixture
-def few_readouts(monkeypatch: pytest.MonkeyPatch) -> None:
+def try_readouts(monkeypatch: pytest.MonkeyPatch, *changes: dict[str, Any]) -> None:
+    """Try the sensor's readout with these changes, as if each of them took longer than the one before."""
     monkeypatch.setattr(
         planning_scan,
         "_readouts",
-        lambda sensor, *_: [dataclasses.replace(sensor.readout, **change) for change in FEW],
+        lambda sensor, *_: [dataclasses.replace(sensor.readout, **change) for change in changes],
     )
     # A busy machine must not change their order.
     monkeypatch.setattr(planning_scan, "median_times", lambda calls: [1e-4, 2e-4, 9e-4][: len(calls)])
+
+
+@pytest.fixture
+def few_readouts(monkeypatch: pytest.MonkeyPatch) -> None:
+    try_readouts(monkeypatch, *FEW)
 
 
 def noisy_camera(**changes: Any) -> Sensor:
@@ -294,12 +299,7 @@ def test_a_window_narrower_than_the_line_is_not_chosen(
     device: Device, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is tried, and it would be the fastest."""
-    monkeypatch.setattr(
-        planning_scan,
-        "_readouts",
-        lambda sensor, _: [dataclasses.replace(sensor.readout, window=window) for window in (4, 6)],
-    )
-    monkeypatch.setattr(planning_scan, "median_times", lambda calls: [1e-4, 2e-4][: len(calls)])
+    try_readouts(monkeypatch, {"window": 4}, {"window": 6})
     plan = plan_scan(recording(rng, 3), noisy_camera(), tolerance=1.0, device=device)
     assert plan.chosen.readout.window == 6
     assert [each.readout.window for each in plan.trials] == [4, 6]
@@ -349,8 +349,10 @@ def test_rounding_beyond_the_tolerance_takes_double_precision(device: Device, rn
     assert chosen.readout.precision is None
 
 
-@pytest.mark.usefixtures("few_readouts")
-def test_a_rate_gives_the_plan_of_its_stream(device: Device, rng: np.random.Generator) -> None:
+def test_a_rate_gives_the_plan_of_its_stream(
+    device: Device, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    try_readouts(monkeypatch, {"window": 6})
     frames, sensor = recording(rng), noisy_camera()
     plan = plan_scan(frames, sensor, tolerance=1.0, rate=10.0, device=device)
     assert plan.stream is not None

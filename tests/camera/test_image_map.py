@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gpuvision.camera.image_map import Packer, PixelMap, Taps, run_columns
+from gpuvision.camera.undistort_image import UndistortImage
 
 POINTS, BLANK, WINDOW, SCATTERED = 0, 1, 2, 6
 MISSING, OUTSIDE = 64, 4
@@ -177,3 +178,17 @@ def test_a_map_keeps_its_positions() -> None:
     assert (kept.positions.dtype, kept.positions.any()) == (np.float64, False)
     with pytest.raises(ValueError, match="read-only"):
         kept.positions[0, 0, 0] = 1.0
+
+
+@pytest.mark.parametrize("region", [(0, 0, 5, 4), (0, 0, 1, 1), (4, 3, 1, 1), (2, 1, 3, 3)])
+def test_a_region_lies_within_the_map(region: tuple[int, int, int, int]) -> None:
+    """Column, row, columns, rows of a map of 5 x 4 pixels; a step over each of its borders is refused."""
+    positions = np.stack(np.meshgrid(np.arange(5.0), 10.0 * np.arange(4.0)), axis=-1)
+    left, top, width, height = region
+    cut = UndistortImage(model=positions, region=region).source_positions((60, 90))
+    np.testing.assert_array_equal(cut, positions[top : top + height, left : left + width])
+    beyond = [(-1, top, width, height), (left, -1, width, height)]
+    beyond += [(6 - width, top, width, height), (left, 5 - height, width, height)]
+    for outside in beyond:
+        with pytest.raises(ValueError, match=r"UndistortImage\.region \(.*\) leaves the map of 5 x 4 pixels"):
+            UndistortImage(model=positions, region=outside).source_positions((60, 90))

@@ -124,6 +124,18 @@ def test_dots_of_a_grid() -> None:
     np.testing.assert_allclose(found.background_residual[known], 0.0, atol=1e-3)
 
 
+def test_contrast_of_bars() -> None:
+    """The contrast is averaged over half the shorter side of a dot, here of 4 px."""
+    y, x = np.mgrid[:100, :300].astype(float)
+    centre = np.stack(np.meshgrid(50.0 + 80.0 * np.arange(3), 20.0 + 20.0 * np.arange(4)), axis=-1)
+    grey = np.full(x.shape, 30.0)
+    for column, row in centre.reshape(-1, 2):
+        grey += 90.0 * np.clip(30.5 - abs(x - column), 0.0, 1.0) * np.clip(2.5 - abs(y - row), 0.0, 1.0)
+    found = measure_dots(grey.astype(np.float32), centre, np.broadcast_to([60.0, 4.0], centre.shape))
+    np.testing.assert_allclose(found.contrast, 90.0, rtol=1e-4)
+    np.testing.assert_allclose(found.points, centre, atol=1e-3)
+
+
 def test_centre_of_gravity_of_a_disc_under_curvature() -> None:
     """Against an integral over the disc: points of the plane with their area in the image as weight."""
     radius = 0.3

@@ -207,6 +207,14 @@ def test_gauss_newton_steps_are_those_of_fixed_lines(
     np.testing.assert_allclose(found - lens, expected - lens, rtol=1e-4, atol=1e-7)
 
 
+def test_a_solver_takes_50_steps_at_most(few: tuple[PackedLines, np.ndarray, np.ndarray]) -> None:
+    """From this start the steps of fixed lines go on; each evaluates the derivatives and the sum after the step."""
+    packed, lens, points = few
+    objective = _Objective(packed, 2)
+    ALTERNATING_SOLVERS["gauss_newton"](objective, lens, points)
+    assert objective.evaluations == 2 * 50
+
+
 def test_a_simplex_ends_at_the_minimum_for_fixed_points(few: tuple[PackedLines, np.ndarray, np.ndarray]) -> None:
     packed, lens, points = few
     found = ALTERNATING_SOLVERS["nelder_mead"](_Objective(packed, 2), lens, points)

@@ -23,7 +23,7 @@ class Outcome(NamedTuple):
     tolerance, error : float
         Asked and true root mean square error [m]; the latter NaN without a plan.
     possible : bool
-        Whether a setting truly meets the tolerance.
+        Whether a setting that truly meets the tolerance is fast enough for the rate.
     cost : float
         Time of the chosen setting over the time of the fastest one that truly meets the tolerance; NaN if none does.
     keeps_up : bool
@@ -57,7 +57,7 @@ def summary(outcomes: Sequence[Outcome]) -> str:
             f"{ratios.max(initial=0.0):.2f} tolerances",
             f"kept up with the rate: {sum(each.keeps_up for each in made)} of {len(made)}",
             f"cost at most 1.5 times the best: {cheap} of {len(costs)}, largest {largest:.2f}",
-            f"refused although a setting truly meets the tolerance: {sum(each.possible for each in refused)}",
+            f"refused although a setting is truly accurate and fast enough: {sum(each.possible for each in refused)}",
         ]
     )
 

@@ -88,13 +88,14 @@ def judge(rng: np.random.Generator, device: Device, limits: ScanPlanLimits = Sca
     rate = job.rate / free.trials[0].seconds
     errors = {each.readout: true_error(job, each.readout, device) for each in usable}
     meeting = {readout for readout, error in errors.items() if error <= tolerance}
+    possible = any(each.seconds * rate <= 1.0 for each in usable if each.readout in meeting)
     try:
         plan = plan_scan(job.frames, job.sensor, tolerance=tolerance, rate=rate, device=device, limits=limits)
     except PlanError:
-        return Outcome(None, tolerance, possible=bool(meeting))
+        return Outcome(None, tolerance, possible=possible)
     error = true_error(job, plan.chosen.readout, device)
     cost = cost_of(plan, [each for each in plan.trials if each.readout in meeting])
-    return Outcome(plan, tolerance, error, bool(meeting), cost, not _lost(job, plan, rate))
+    return Outcome(plan, tolerance, error, possible, cost, not _lost(job, plan, rate))
 
 
 def true_error(job: Job, readout: LineReadout, device: Device) -> float:

@@ -107,6 +107,7 @@ INPUTS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "docs/guides/calibrate_sensor.md": _laser_images,
     "docs/guides/simulate_part.md": _part,
     "docs/guides/locate_board.md": _board,
+    "docs/guides/plan_location.md": _board,
     "docs/guides/locate_robot.md": _floor,
     "docs/guides/inspect_paste.md": _paste,
 }

@@ -17,9 +17,11 @@ from gpuvision.cli.arguments import (
     echo,
     layers_of,
     named_path,
+    prints_report,
     quantities,
     reject_unused,
 )
+from gpuvision.cli.locate_plan import claim_location_plan, make_location_plan, write_location_plan
 from gpuvision.cli.pose_output import PoseFolder, check_image, claim_outputs, initial_pose_of, report_pose
 from gpuvision.cli.select import Side
 
@@ -130,6 +132,26 @@ GcodeDialectChoice = Annotated[
     GcodeDialect | None,
     typer.Option(help="linuxcnc: G10 L2 with R; fanuc: G10 L2, then G68 (Fanuc, Mach3, Mach4). Default: linuxcnc."),
 ]
+Tolerance = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LENGTH",
+        help="Largest error of the pose at the features of the board, such as 2um: choose number, width and smoothing "
+        "of the calipers (rulers), the fastest that are predicted to meet it on this image.",
+    ),
+]
+Rate = Annotated[
+    float | None,
+    typer.Option(help="With --tolerance: rate that measuring the chosen features must keep up with [frames/s]."),
+]
+OnlyPlan = Annotated[
+    bool,
+    typer.Option(
+        "--plan",
+        help="With --tolerance: only print the features that were tried with their predicted errors and times, and "
+        "write plan.png and features.toml to --out. No pose.",
+    ),
+]
 CopperChoice = Annotated[
     Copper, typer.Option(help="Copper is brighter or darker than its surroundings; auto: the better fit of both.")
 ]
@@ -155,6 +177,9 @@ def locate(
     gcode: GcodeFile = None,
     camera_at: CameraAt = None,
     gcode_dialect: GcodeDialectChoice = None,
+    tolerance: Tolerance = None,
+    rate: Rate = None,
+    only_plan: OnlyPlan = False,
     out: PoseFolder = None,
     as_json: ReportFile = None,
     device: DeviceLabel = None,
@@ -173,8 +198,16 @@ def locate(
     from gpuvision.workflows.locating_board import locate_board
 
     check_image(image)
-    outputs = claim_outputs("locate", (image, board, camera, features), out, as_json, overwrite)
-    outputs.claim(gcode)
+    if tolerance is None:
+        reject_unused("without --tolerance", rate=rate)
+    else:
+        reject_unused("with --tolerance, which chooses the features", features=features, budget=budget)
+    if only_plan:
+        reject_unused("with --plan", gcode=gcode)
+        outputs = claim_location_plan(tolerance, (image, board, camera), out, as_json, overwrite=overwrite)
+    else:
+        outputs = claim_outputs("locate", (image, board, camera, features), out, as_json, overwrite)
+        outputs.claim(gcode)
     machine = _camera_at(camera_at, gcode, gcode_dialect)
     chosen = None if features is None else _features(features, budget, side)
     pixel = _pixel(scale, chosen)
@@ -186,21 +219,26 @@ def locate(
     if camera is not None:
         check_calibrated_size(image, (picture.shape[1], picture.shape[0]), read_calibrated_size(camera))
     artwork = _artwork(board, chosen, "top" if side is None else side.value, layers, pixel, blur_px)
-    located = locate_board(
-        picture,
-        artwork,
-        scale=pixel,
-        initial_pose=pose,
-        search_range=distance_and_angle,
-        features=chosen,
-        model=None if camera is None else read_lens(camera),
-        budget=budget or _BUDGET,
-        blur_px=blur_px,
-        etch_bias_sigma=etch_bias_sigma,
-        threshold=threshold,
-        copper=copper.value,
-        device=None if device is None else Device.named(device),
-    )
+    options: dict[str, Any] = {
+        "scale": pixel,
+        "initial_pose": pose,
+        "search_range": distance_and_angle,
+        "model": None if camera is None else read_lens(camera),
+        "blur_px": blur_px,
+        "etch_bias_sigma": etch_bias_sigma,
+        "threshold": threshold,
+        "copper": copper.value,
+        "device": None if device is None else Device.named(device),
+    }
+    if tolerance is not None:
+        plan = make_location_plan(image, picture, artwork, tolerance, rate, options)
+        if only_plan:
+            write_location_plan(plan, image, out, as_json, outputs, overwrite=overwrite)
+            return
+        echo(f"plan: {plan}", err=prints_report(as_json))
+        chosen = plan.chosen.features
+        options |= {"initial_pose": plan.located.pose, "search_range": None, "copper": plan.located.copper}
+    located = locate_board(picture, artwork, features=chosen, budget=budget or _BUDGET, **options)
     for each in located.warnings:
         echo(f"warning: {each}", err=True)
     report_pose(located, lambda path: draw_located_board(path, picture, artwork, located), out, as_json, outputs)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from gpuvision.plots.figure import new_figure, write_png
 
 _WIDTH, _HEIGHT = 6.5, 4.5  # of the page [in]
+_MAX_NAMES = 12  # with more settings only those get a name that no other one beats
 _CHOSEN, _OTHER, _TOLERANCE = "#009e73", "#0072b2", "#d55e00"
 
 
@@ -44,6 +45,8 @@ def draw_plan(
 ) -> None:
     """Draw the error of each setting over its time, with the tolerance as a line, as PNG.
 
+    Of more than 12 settings only the chosen one and those have a name that no other one beats in time and error.
+
     Parameters
     ----------
     path : path-like
@@ -62,15 +65,28 @@ def draw_plan(
     figure = new_figure(_WIDTH, _HEIGHT)
     axes = figure.subplots()
     axes.axhline(1e6 * tolerance, color=_TOLERANCE, linewidth=1.0, label="tolerance")
+    named = _named(settings)
     for each in settings:
         colour = _CHOSEN if each.chosen else _OTHER
         place = (1e6 * each.seconds, 1e6 * each.error)
         axes.plot(
             *place, "o", color=colour, markersize=8 if each.chosen else 5, label="chosen" if each.chosen else None
         )
-        axes.annotate(each.name, place, xytext=(6, 4), textcoords="offset points", fontsize=8, color=colour)
+        if each in named:
+            axes.annotate(each.name, place, xytext=(6, 4), textcoords="offset points", fontsize=8, color=colour)
     axes.set(xlabel=f"time per {unit} [us]", ylabel=f"predicted error of {error_of} [um]", xscale="log", yscale="log")
     axes.set_title(title, fontsize=10, loc="left")
     axes.grid(which="both", alpha=0.2)
     axes.legend(fontsize=8, frameon=False)
     write_png(figure, path)
+
+
+def _named(settings: Sequence[PlannedSetting]) -> Sequence[PlannedSetting]:
+    """Return the settings that get a name."""
+    if len(settings) <= _MAX_NAMES:
+        return settings
+    return [
+        each
+        for each in settings
+        if each.chosen or not any(one.seconds < each.seconds and one.error < each.error for one in settings)
+    ]

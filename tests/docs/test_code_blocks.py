@@ -33,8 +33,13 @@ def _python_of(page: str) -> list[tuple[int, str]]:
 
 
 # A page with the operations of another page, for which other kernels are compiled, and pages whose calibration and
-# plan of a scan the tests of workflows run.
-SLOW = {"docs/tutorials/first_pose.md", "docs/guides/calibrate_sensor.md", "docs/guides/plan_scan.md"}
+# plans the tests of workflows run.
+SLOW = {
+    "docs/tutorials/first_pose.md",
+    "docs/guides/calibrate_sensor.md",
+    "docs/guides/plan_location.md",
+    "docs/guides/plan_scan.md",
+}
 
 
 @pytest.mark.parametrize(

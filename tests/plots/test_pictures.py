@@ -433,3 +433,17 @@ def test_picture_of_a_plan(drawn: list[Figure], tmp_path: Path) -> None:
     assert chosen.get_color() != other.get_color()
     assert [each.get_text() for each in axes.texts] == ["windowed 6", "ml 6"]
     assert [each.get_text() for each in axes.get_legend().get_texts()] == ["tolerance", "chosen"]
+
+
+def test_a_picture_of_many_settings_names_those_that_no_other_one_beats(drawn: list[Figure], tmp_path: Path) -> None:
+    """Times 1, 2, ... and errors 20, 19, ..., of which every third one is 30 instead."""
+    settings = [
+        PlannedSetting(f"s{k}", 1e-6 * (k + 1), 1e-6 * (30 if k % 3 == 2 else 20 - k), chosen=k == 5) for k in range(13)
+    ]
+    draw_plan(tmp_path / "a.png", settings, 8e-6, error_of="the pose", unit="image")
+    (axes,) = drawn[0].axes
+    assert labels(axes)[:2] == ("time per image [us]", "predicted error of the pose [um]")
+    assert len(axes.lines) == 14
+    assert [each.get_text() for each in axes.texts] == [f"s{k}" for k in range(13) if k % 3 != 2 or k == 5]
+    draw_plan(tmp_path / "b.png", settings[1:], 8e-6)
+    assert len(drawn[1].axes[0].texts) == 12

@@ -54,10 +54,10 @@ def select_features_in_view(
         There are not enough edges, or they do not determine the pose.
     """
     placement = np.array(view.pose[:2])
-    rulers, fiducials = _candidates_in_view(artwork, view, imaging, placement)
+    rulers, fiducials = find_features_in_view(artwork, view, imaging, placement)
     if len(rulers.sigma) + len(fiducials.sigma) < _MIN_FEATURES and imaging.smoothing_ratio > _DENSE_SMOOTHING:
         imaging = replace(imaging, smoothing_ratio=_DENSE_SMOOTHING)
-        rulers, fiducials = _candidates_in_view(artwork, view, imaging, placement)
+        rulers, fiducials = find_features_in_view(artwork, view, imaging, placement)
     if len(rulers.sigma) + len(fiducials.sigma) < _MIN_FEATURES:
         hint = pixel_hint(artwork, view.bounds, placement, imaging) if with_hint else "see the pixel size"
         raise ValueError(
@@ -68,10 +68,18 @@ def select_features_in_view(
     return select_feature_set(rulers, imaging, artwork.side, fiducials=fiducials, are_free=True, budget=budget)
 
 
-def _candidates_in_view(
+def find_features_in_view(
     artwork: Artwork, view: BoardView, imaging: Imaging, placement: npt.NDArray[np.float64]
 ) -> tuple[FeatureCandidates, Fiducials]:
-    """Return the candidates of rulers and the fiducials that lie in the image at every board position."""
+    """Return the candidates of rulers and the fiducials that lie in the image at every board position.
+
+    Parameters
+    ----------
+    artwork, view, imaging
+        As in `select_features_in_view`.
+    placement
+        (2,) point whose pose counts [m].
+    """
     parts = [find_ruler_candidates(artwork, window, placement, imaging) for window in _windows(artwork, view, imaging)]
     joined = [np.concatenate(each) for each in zip(*(part[:-1] for part in parts), strict=True)]
     rulers = FeatureCandidates._make([*joined, placement])

@@ -68,7 +68,7 @@ def test_features_stay_in_the_image(monkeypatch: pytest.MonkeyPatch, rng: np.ran
     windows = [VIEW.bounds, VIEW.bounds + 1e-3]
     monkeypatch.setattr(view_features, "_windows", lambda *_: windows)
     artwork: Any = None
-    rulers, fiducials = view_features._candidates_in_view(artwork, VIEW, IMAGING, PLACEMENT)
+    rulers, fiducials = view_features.find_features_in_view(artwork, VIEW, IMAGING, PLACEMENT)
     for given, window in zip(asked, windows, strict=True):
         assert given[0] is window
         assert given[1] is PLACEMENT
@@ -95,7 +95,7 @@ def test_a_ruler_has_fewer_samples_than_the_longest(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(view_features, "select_fiducials", lambda *_: Fiducials.empty())
     monkeypatch.setattr(view_features, "_windows", lambda *_: [view.bounds])
     artwork: Any = None
-    rulers, fiducials = view_features._candidates_in_view(artwork, view, IMAGING, PLACEMENT)
+    rulers, fiducials = view_features.find_features_in_view(artwork, view, IMAGING, PLACEMENT)
     assert len(fiducials.radius) == 0
     np.testing.assert_array_equal(rulers.length, length[:2])
 

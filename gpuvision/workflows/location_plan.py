@@ -1,0 +1,196 @@
+"""Plan of the localization of a board: feature sets that were tried, with errors and times, and the chosen one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+from gpuvision.accuracy.plan import AccuracyPlan
+from gpuvision.accuracy.trial import millionths
+from gpuvision.formats.features_file import write_features
+from gpuvision.matching.board.located_board import LocatedBoard
+from gpuvision.matching.features.feature_set import FeatureSet
+from gpuvision.matching.features.ruler import best_smoothing
+from gpuvision.validation import finite, integer
+from gpuvision.workflows.plan_files import write_plan
+
+_LEGEND = """errors of the pose in um; model: by its covariance; scatter: with repeated noise; refused: without a pose
+- has no pose in some images, depends on a single feature, or differs from the whole board"""
+FEATURES_FILE = "features.toml"
+"""Name of the file of the chosen features, which `LocationPlan.write` writes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocationPlanLimits:
+    """Limits of `gpuvision.workflows.planning_location.plan_location`.
+
+    Attributes
+    ----------
+    margin : float
+        Least ratio of the tolerance to the predicted error, at least 1. Default 1.1.
+    rate_margin : float
+        Least ratio of the time that rate and latency allow to the measured time of a frame, at least 1. Default 1.25.
+    max_leverage : float
+        Largest leverage of a feature (`gpuvision.BoardPose.leverage`), above 0 to 1. Chosen: where a fiducial had a
+        leverage of 0.75 to 0.9, up to 6 % of the images of other boards had no pose. Default 0.6.
+    draws : int
+        Number of images with additional noise that each feature set measures, 8 or more. Default 64.
+    """
+
+    margin: float = 1.1
+    rate_margin: float = 1.25
+    max_leverage: float = 0.6
+    draws: int = 64
+
+    def __post_init__(self) -> None:
+        finite(self.margin, "LocationPlanLimits.margin", minimum=1.0)
+        finite(self.rate_margin, "LocationPlanLimits.rate_margin", minimum=1.0)
+        finite(self.max_leverage, "LocationPlanLimits.max_leverage", above=0.0, maximum=1.0)
+        integer(self.draws, "LocationPlanLimits.draws", minimum=8)
+
+
+class FeaturesTrial(NamedTuple):
+    """Feature set that was tried on the image.
+
+    Attributes
+    ----------
+    features : FeatureSet
+        The features.
+    seconds : float
+        Median time from a frame to its pose [s].
+    error : float
+        Error of the pose [m]: root mean square distance by which the pose moves the features of the board. It is the
+        larger one of ``predicted`` and ``scatter``, with an error that all rulers share. NaN without a pose.
+    predicted : float
+        The error by the covariance of the pose [m].
+    scatter : float
+        The same of poses in images with additional noise, about their mean [m].
+    leverage : float
+        Largest leverage of a feature in these images: 1 if no other feature checks it.
+    refused : float
+        Fraction of the images with additional noise that have no pose.
+    """
+
+    features: FeatureSet
+    seconds: float
+    error: float
+    predicted: float
+    scatter: float
+    leverage: float
+    refused: float
+
+    @property
+    def name(self) -> str:
+        """Number and width of the rulers, number of fiducials, and the smoothing if it is not the best."""
+        imaging, fiducials = self.features.imaging, len(self.features.fiducials.radius)
+        parts = [f"{len(self.features.length)} rulers of {imaging.width_px} px"]
+        if fiducials:
+            parts.append(f"{fiducials} fiducial{'s' if fiducials > 1 else ''}")
+        if imaging.smoothing_px < best_smoothing(imaging.blur_px):
+            parts.append(f"smoothing {imaging.smoothing_px:.2g} px")
+        return ", ".join(parts)
+
+    @property
+    def error_parts(self) -> dict[str, float]:
+        """Parts of the error by name [m]."""
+        return {"covariance": self.predicted, "scatter": self.scatter}
+
+    @property
+    def legend(self) -> str:
+        """Explanation of the columns."""
+        return _LEGEND
+
+    def cells(self) -> dict[str, str]:
+        """Return the texts of a row of a table by the headings of their columns; the name is the first."""
+        headings = ("us/frame", "error", "model", "scatter")
+        numbers = map(millionths, (self.seconds, self.error, self.predicted, self.scatter))
+        texts = dict(zip(headings, numbers, strict=True))
+        return {"features": self.name, **texts, "leverage": f"{self.leverage:.2f}", "refused": f"{self.refused:.1%}"}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the columns by name, for JSON."""
+        numbers = {name: getattr(self, name) for name in self._fields if name != "features"}
+        imaging = self.features.imaging
+        return {
+            "features": self.name,
+            "rulers": len(self.features.length),
+            "fiducials": len(self.features.fiducials.radius),
+            "width_px": imaging.width_px,
+            "smoothing_px": imaging.smoothing_px,
+            **numbers,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocationPlan(AccuracyPlan[FeaturesTrial]):
+    """Plan of the localization of a board. ``str(plan)`` states it in one line.
+
+    ``locate_board(image, artwork, features=plan.chosen.features, ...)`` and ``plan.chosen.features.bind(...)`` carry it
+    out.
+
+    Attributes
+    ----------
+    chosen : FeaturesTrial
+        Fastest feature set that meets the tolerance.
+    trials : tuple of FeaturesTrial
+        All feature sets that were tried, fastest first.
+    tolerance : float
+        Asked error of the pose [m].
+    located : LocatedBoard
+        Pose of the image, by which the features were selected.
+    limits : LocationPlanLimits
+        Limits of the plan.
+    """
+
+    kind: ClassVar[str] = "feature set"
+
+    located: LocatedBoard
+    limits: LocationPlanLimits
+
+    @property
+    def margin(self) -> float:
+        """Least ratio of the tolerance to the predicted error."""
+        return self.limits.margin
+
+    @property
+    def usable(self) -> list[FeaturesTrial]:
+        """Feature sets that may be chosen."""
+        return usable_feature_sets(self.trials, self.limits)
+
+    def write(self, folder: str | Path, *, title: str = "Plan", overwrite: bool = False) -> None:
+        """Write ``plan.png`` and ``features.toml`` into a folder, which is created if it is missing.
+
+        The picture shows the predicted errors over the times, the file holds the chosen features for
+        ``gpuvision locate --features``.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Output folder.
+        title : str
+            Title of the picture. Default ``"Plan"``.
+        overwrite : bool
+            Whether files may be replaced that no earlier plan wrote. Default False.
+
+        Raises
+        ------
+        FileExistsError
+            A file exists, and is not an unchanged output of an earlier plan.
+        OSError
+            The folder cannot be written.
+        """
+        chosen = self.chosen.features
+        more = {FEATURES_FILE: lambda path: write_features(chosen, path)}
+        write_plan(self, folder, error_of="the pose", title=title, overwrite=overwrite, more=more)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the plan as dictionaries, lists and numbers for JSON."""
+        x, y, theta = self.located.pose
+        return super().to_dict() | {"pose": {"x": x, "y": y, "theta": theta}, "limits": asdict(self.limits)}
+
+
+def usable_feature_sets(trials: Sequence[FeaturesTrial], limits: LocationPlanLimits) -> list[FeaturesTrial]:
+    """Return the feature sets with a pose in each image that does not depend on a single feature."""
+    return [each for each in trials if each.error > 0.0 and not each.refused and each.leverage <= limits.max_leverage]

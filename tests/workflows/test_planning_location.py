@@ -1,0 +1,245 @@
+"""Plan of a localization: the fastest features whose error of the pose is within the tolerance."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from board_images import BoardPicture, View
+from boards import BOARD_MIDDLE, LAYERS, board_folder
+from gpuvision.accuracy.plan import PlanError
+from gpuvision.camera.orthographic import BoardView
+from gpuvision.formats.features_file import read_features
+from gpuvision.host import Device
+from gpuvision.matching.artwork.artwork import Artwork, read_artwork
+from gpuvision.workflows import planning_location
+from gpuvision.workflows.locating_board import locate_board
+from gpuvision.workflows.location_plan import (
+    FeaturesTrial,
+    LocationPlan,
+    LocationPlanLimits,
+    usable_feature_sets,
+)
+from gpuvision.workflows.planning_location import choose_features, plan_location, pose_error
+
+PIXEL, SHAPE, NOISE = 40e-6, (300, 400), 2.0
+POSE = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 2e-3)
+EXPECTED = (*BOARD_MIDDLE, 0.0)
+SHIFT, ANGLE = 4 * PIXEL, math.radians(0.3)  # search range of `locate_board` at a known pose
+
+
+@pytest.fixture(scope="module")
+def artwork(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
+    return read_artwork(board_folder(tmp_path_factory.mktemp("board")), layers=LAYERS)
+
+
+@pytest.fixture(scope="module")
+def picture(artwork: Artwork) -> BoardPicture:
+    corner = np.array(BOARD_MIDDLE) + (np.array(SHAPE[::-1]) - 1) / 2 * PIXEL * (-1, 1)
+    view = View(corner=tuple(corner), pixel=PIXEL, shape=SHAPE, noise=NOISE)
+    return BoardPicture(artwork, view, margin=20)
+
+
+def camera_image(picture: BoardPicture, pose: tuple[float, float, float], rng: np.random.Generator) -> Any:
+    """Return the uint8 image of a camera at a pose: the board moves the other way."""
+    x, y, theta = pose
+    cos, sin = math.cos(theta), math.sin(theta)
+    motion = np.array([[cos, sin], [-sin, cos]]) @ (np.array(BOARD_MIDDLE) - (x, y))
+    # `seen` turns the board about the origin, the camera about its middle.
+    middle = np.array(BOARD_MIDDLE)
+    back = middle - np.array([[cos, sin], [-sin, cos]]) @ middle
+    image = picture.seen((*(motion + back), -theta), rng)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def few_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Try six feature sets: each width is a build of the kernel."""
+    monkeypatch.setattr(planning_location, "_BUDGETS", (15, 40, 100))
+    monkeypatch.setattr(planning_location, "_RULERS", ((3, math.sqrt(5.0)), (5, math.sqrt(5.0))))
+    # A busy machine must not change their order.
+    monkeypatch.setattr(planning_location, "median_times", lambda calls, _: [1e-4 * (k + 1) for k in range(len(calls))])
+
+
+def plan_of(image: Any, artwork: Artwork, device: Device | None = None, **options: Any) -> LocationPlan:
+    return plan_location(
+        image, artwork, **({"scale": PIXEL, "initial_pose": EXPECTED, "device": device, "tolerance": 1.0} | options)
+    )
+
+
+def trial(error: float, leverage: float = 0.2, refused: float = 0.0) -> FeaturesTrial:
+    features: Any = None
+    return FeaturesTrial(features, 1e-4, error, error, 0.5 * error, leverage, refused)
+
+
+def test_the_error_of_a_pose_is_that_of_points_that_it_moves(rng: np.random.Generator) -> None:
+    """Random poses of the covariance move the points by exactly these distances."""
+    points = rng.uniform(-1.0, 1.0, (50, 2)) * (8e-3, 3e-3) + (2e-3, -1e-3)
+    root = rng.normal(size=(3, 3)) * np.array([[2e-6], [1e-6], [4e-4]])
+    poses = rng.normal(size=(20000, 3)) @ root.T
+    covariance = poses.T @ poses / len(poses)
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x = cos[:, None] * points[:, 0] - sin[:, None] * points[:, 1] + poses[:, :1] - points[:, 0]
+    y = sin[:, None] * points[:, 0] + cos[:, None] * points[:, 1] + poses[:, 1:2] - points[:, 1]
+    assert pose_error(covariance, points) == pytest.approx(math.sqrt(np.mean(x**2 + y**2)), rel=1e-3)
+
+
+def test_feature_sets_without_a_pose_in_each_image_or_with_leverage_are_not_chosen() -> None:
+    trials = [trial(1e-6, refused=1 / 64), trial(math.nan), trial(1e-6, leverage=0.601), trial(1e-6, leverage=0.6)]
+    assert usable_feature_sets(trials, LocationPlanLimits()) == trials[3:]
+    assert usable_feature_sets(trials, LocationPlanLimits(max_leverage=1.0)) == trials[2:]
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"margin": 0.99}, r"LocationPlanLimits\.margin is 0\.99, expected"),
+        ({"rate_margin": 0.99}, r"LocationPlanLimits\.rate_margin is 0\.99, expected"),
+        ({"max_leverage": 0.0}, r"LocationPlanLimits\.max_leverage is 0\.0, expected"),
+        ({"max_leverage": 1.01}, r"LocationPlanLimits\.max_leverage is 1\.01, expected"),
+        ({"draws": 7}, r"LocationPlanLimits\.draws is 7, expected"),
+    ],
+)
+def test_limits_are_checked(limits: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        LocationPlanLimits(**limits)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tolerance": 0.0}, "tolerance is 0.0, expected"),
+        ({"rate": -1.0}, "rate is -1.0, expected"),
+        ({"latency": 0.1}, "a latency needs a rate"),
+    ],
+)
+def test_wrong_arguments_are_refused(artwork: Artwork, options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        plan_of(np.zeros(SHAPE, np.uint8), artwork, **options)
+
+
+def test_an_image_without_the_board_is_refused(artwork: Artwork, rng: np.random.Generator) -> None:
+    with pytest.raises(ValueError, match="no pose to plan from: "):
+        plan_of(np.rint(rng.normal(90.0, NOISE, SHAPE)).astype(np.uint8), artwork)
+
+
+@pytest.mark.usefixtures("few_features")
+def test_a_plan_chooses_the_fastest_features_and_writes_them(
+    artwork: Artwork, picture: BoardPicture, device: Device, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    image = camera_image(picture, POSE, rng)
+    free = plan_of(image, artwork, device)
+    assert free.chosen == min(free.usable, key=lambda each: each.seconds)
+    assert {(len(each.features.length), each.features.imaging.width_px) for each in free.trials} >= {(15, 3), (40, 5)}
+    best = min(free.usable, key=lambda each: each.error)
+    plan = choose_features(free.located, free.trials, tolerance=1.1001 * best.error)
+    assert plan.chosen == best
+    with pytest.raises(PlanError, match=r"no feature set meets an error of .* \(covariance .* um, scatter .* um\)"):
+        plan_of(image, artwork, device, tolerance=1.09 * best.error)
+    plan.write(tmp_path / "out")
+    assert {each.suffix for each in (tmp_path / "out").iterdir()} == {".png", ".toml", ".json"}
+    features = read_features(tmp_path / "out" / "features.toml")
+    np.testing.assert_allclose(features.point, best.features.point)
+    located = locate_board(image, artwork, scale=PIXEL, initial_pose=EXPECTED, features=features, device=device)
+    assert located.reason == ""
+    assert abs(np.array(located.pose) - POSE)[:2].max() < 4.5 * plan.chosen.error
+    report = json.loads(json.dumps(plan.to_dict()))
+    assert report["chosen"]["rulers"] == len(best.features.length)
+    assert report["chosen"]["width_px"] == best.features.imaging.width_px
+    assert report["limits"]["draws"] == 64
+
+
+@pytest.mark.usefixtures("few_features")
+def test_a_rate_that_no_accurate_features_keep_up_with_is_refused(
+    artwork: Artwork, picture: BoardPicture, device: Device, rng: np.random.Generator
+) -> None:
+    """The times are 0.1, 0.2, ... ms in the order of the trials, so that the accurate ones are slow."""
+    image = camera_image(picture, POSE, rng)
+    free = plan_of(image, artwork, device)
+    best = min(free.usable, key=lambda each: each.error)
+    rate, found = 1.0 / best.seconds, (free.located, free.trials)
+    tolerance = 1.1001 * best.error
+    with pytest.raises(PlanError, match=r"fastest feature set that meets the tolerance and is too slow: .* us, a rate"):
+        choose_features(*found, tolerance=tolerance, rate=rate)
+    assert choose_features(*found, tolerance=tolerance, rate=0.79 * rate, latency=1.0).chosen == best
+    with pytest.raises(PlanError, match=r"a latency of \d+ us allows"):
+        choose_features(*found, tolerance=tolerance, rate=0.1 * rate, latency=best.seconds)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_features")
+def test_predicted_errors_are_those_of_images_with_known_poses(
+    artwork: Artwork, picture: BoardPicture, device: Device, rng: np.random.Generator
+) -> None:
+    """Images at poses anywhere in the search range; the reference maps the points by both poses."""
+    plan = plan_of(camera_image(picture, POSE, rng), artwork, device)
+    poses = EXPECTED + rng.uniform(-1.0, 1.0, (48, 3)) * (SHIFT, SHIFT, ANGLE)
+    images = [camera_image(picture, tuple(each), rng) for each in poses]
+    points = np.concatenate([each.features.point for each in plan.trials])
+    for each in plan.usable:
+        bound = each.features.bind(
+            device, SHAPE, np.uint8, copper="bright", threshold=plan.located.threshold, noise=plan.located.noise
+        )
+        squares = []
+        for image, pose in zip(images, poses, strict=True):
+            found = bound(image, EXPECTED)
+            assert int(found.status) == 0
+            true, measured = (
+                BoardView(scale=PIXEL, shape=SHAPE, pose=tuple(map(float, one)))  # type: ignore[arg-type]
+                for one in (pose, found.pose)
+            )
+            away = measured.to_plane(true.to_pixels(points)) - points
+            squares.append(np.mean(np.sum(away**2, axis=1)))
+        # 48 poses determine the error to about 9 %; the covariance also holds the error of sampling.
+        assert 0.5 * each.error < math.sqrt(np.mean(squares)) < 1.25 * each.error, each.name
+
+
+@pytest.mark.usefixtures("few_features")
+def test_the_error_is_the_larger_of_covariance_and_scatter_with_the_common_error(
+    artwork: Artwork, picture: BoardPicture, device: Device, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    """With six times as much additional noise the scatter is larger, without it the covariance is."""
+    image = camera_image(picture, POSE, rng)
+    noisy = planning_location._with_noise
+    for factor, name in ((6.0, "scatter"), (0.01, "predicted")):
+        monkeypatch.setattr(
+            planning_location, "_with_noise", lambda grey, noise, *more, by=factor: noisy(grey, by * noise, *more)
+        )
+        plan = plan_of(image, artwork, device, limits=LocationPlanLimits(draws=16))
+        for each in plan.trials:
+            assert getattr(each, name) == max(each.predicted, each.scatter)
+            expected = math.hypot(getattr(each, name), 0.005 * PIXEL, 0.005 * PIXEL)
+            assert each.error == pytest.approx(expected)
+
+
+@pytest.mark.usefixtures("few_features")
+def test_a_pose_elsewhere_is_no_pose(
+    artwork: Artwork, picture: BoardPicture, device: Device, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    """A feature set whose pose differs from the located one by half a pixel, many standard deviations, has no error."""
+    image = camera_image(picture, POSE, rng)
+    found = locate_board(image, artwork, scale=PIXEL, initial_pose=EXPECTED, device=device)
+    view = dataclasses.replace(found.view, pose=(found.pose[0] + 0.5 * PIXEL, *found.pose[1:]))
+    monkeypatch.setattr(planning_location, "locate_board", lambda *_, **__: dataclasses.replace(found, view=view))
+    with pytest.raises(PlanError, match="each feature set has no pose in some images with") as refusal:
+        plan_of(image, artwork, device)
+    assert all(math.isnan(each.error) for each in refusal.value.trials)
+
+
+def test_noise_is_added_in_the_dtype_of_the_image() -> None:
+    for dtype, most in ((np.uint8, 255), (np.uint16, 65535), (np.float32, np.inf)):
+        grey = np.full((60, 70), 250, dtype)
+        images = planning_location._with_noise(grey, 3.0, 9, np.random.default_rng(2))
+        assert images.dtype == dtype
+        assert images.shape == (9, 60, 70)
+        assert images.max() <= most
+        if most > 255:
+            # 37800 values determine the deviation to 0.4 %; the rounding adds 1/12.
+            assert np.std(images.astype(np.float64)) == pytest.approx(math.sqrt(9.0 + 1 / 12), rel=0.02)
+        assert not np.array_equal(images[0], images[1])

@@ -268,6 +268,7 @@ def objects(*commands: str) -> tuple[DrawnObject, ...]:
     return drawn_objects(parse_gerber(HEAD + "\n".join(commands) + "\nM02*\n", Path("board.gbr")))
 
 
+@pytest.mark.filterwarnings("ignore::SyntaxWarning")
 def test_strokes_without_area_are_left_out_and_the_others_kept() -> None:
     """A stroke with a width of 0, then a flash and a stroke."""
     found = objects(

@@ -14,7 +14,7 @@ from gpuvision.matching.artwork.artwork import Artwork, Holes, read_artwork
 from gpuvision.matching.artwork.shapes import Shape
 from gpuvision.matching.features.candidates import FeatureCandidates, find_ruler_candidates
 from gpuvision.matching.features.imaging import Imaging
-from gpuvision.matching.features.selection import Selection, select_rulers
+from gpuvision.matching.features.selection import Selection, predict_selection, select_rulers, two_row_update
 
 IMAGING = Imaging(pixel=20e-6)
 REGION = ((-1e-3, -1e-3), (21e-3, 21e-3))
@@ -324,3 +324,100 @@ def test_error_of_an_edge_in_closed_form() -> None:
     worse = np.sqrt(3.0 / 8.0 * (smoothing**2 + blur**2) ** 3 / (smoothing**5 * blur))
     assert moving.sigma(True, (1.0, 0.0)) == pytest.approx(worse * bound * np.sqrt(2.5 / 1.5) * 20e-6, rel=1e-5)
     assert moving.sigma(True, (0.0, 1.0)) == pytest.approx(float(imaging.sigma(True)), rel=1e-12)
+
+
+def candidates_by_hand(ambiguity: float = 0.0) -> FeatureCandidates:
+    """Return two rulers at right angles, one across a trace, one oblique, and a fiducial, at places on no axis."""
+    return FeatureCandidates(
+        point=np.array([[1e-3, 2e-3], [-2e-3, 1e-3], [0.5e-3, -3e-3], [2e-3, -1e-3], [-1e-3, -1e-3]]),
+        normal=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [0.6, -0.8], [1.0, 0.0]]),
+        sigma=np.array([1.0, 2.0, 1.5, 0.8, 0.5]) * 1e-6,
+        pair=np.array([False, False, True, False, True]),
+        length=np.array([1.0, 1.2, 1.4, 1.6, 0.9]) * 1e-3,
+        ambiguity=np.array([0.0, ambiguity, 0.0, 0.0, 0.0]),
+        source=np.array([0, 1, 2, 3, -1000000]),
+        spacing=np.array([0.0, 0.0, 1e-4, 0.0, 0.0]),
+        radius=np.array([0.0, 0.0, 0.0, 0.0, 2e-4]),
+        placement=np.array([0.25e-3, -0.5e-3]),
+    )
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.3])
+@pytest.mark.parametrize("ambiguity", [0.0, 0.25])
+def test_prediction_is_that_of_the_information_of_each_coordinate(missing: float, ambiguity: float) -> None:
+    """A missing or ambiguous feature has less information; the etch bias is one unknown with a prior."""
+    rulers, imaging = candidates_by_hand(ambiguity), replace(IMAGING, etch_bias_sigma=3e-6, width_px=6)
+    found = predict_selection(rulers, imaging, [0, 1, 2, 3, 4], costs=[1.0, 2.0, 3.0, 4.0, 5.5], missing=missing)
+    information = np.diag([0.0, 0.0, 0.0, 1.0 / 3e-6**2])
+    for k in range(5):
+        x, y = rulers.point[k] - rulers.placement
+        weight = (1.0 - missing) * (1.0 - rulers.ambiguity[k]) / rulers.sigma[k] ** 2
+        ways = [rulers.normal[k]] if rulers.radius[k] == 0.0 else [np.array([1.0, 0.0]), np.array([0.0, 1.0])]
+        for nx, ny in ways:
+            row = np.array([nx, ny, x * ny - y * nx, 0.0 if rulers.pair[k] else 1.0])
+            information += weight * np.outer(row, row)
+    expected = np.linalg.inv(information)[:3, :3]
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found.covariance / scale, expected / scale, atol=1e-9)
+    assert found.cost == 15.5
+    # Turns at the mean distance of the points count as shifts.
+    distance = np.hypot(*(rulers.point - rulers.placement).T).mean()
+    unit = np.array([1.0, 1.0, 1.0 / distance])
+    values = np.linalg.eigvalsh(np.linalg.inv(expected) * unit * unit[:, None])
+    assert found.condition == pytest.approx(math.sqrt(values[2] / values[0]))
+    # Rulers of 6 px of 20 um, 0.12 mm wide; the fiducial's window of 0.9 mm.
+    half = 0.5e-3 * np.array([[1.0, 0.12], [0.12, 1.2], [1.4, 0.12], [0.96 + 0.096, 1.28 + 0.072], [0.9, 0.9]])
+    np.testing.assert_allclose(found.region, [(rulers.point - half).min(axis=0), (rulers.point + half).max(axis=0)])
+
+
+@pytest.mark.parametrize(("chosen", "count"), [([0, 1], 2), ([4], 1), ([], 0)])
+def test_too_few_coordinates_are_refused(chosen: list[int], count: int) -> None:
+    with pytest.raises(ValueError, match=f"^{count} rulers do not determine x, y and theta: give a larger budget"):
+        predict_selection(candidates_by_hand(), IMAGING, chosen)
+    predict_selection(candidates_by_hand(), replace(IMAGING, etch_bias_sigma=0.0), [0, 4])
+
+
+def test_a_budget_may_be_used_up_exactly() -> None:
+    rulers = candidates_by_hand()
+    found = select_rulers(rulers, IMAGING, 5.0)
+    assert (sorted(found.chosen.tolist()), found.cost) == ([0, 1, 2, 3, 4], 5.0)
+    assert len(select_rulers(rulers, IMAGING, 4.999).chosen) == 4
+    costs = np.array([1.0, 1.0, 1.0, 3.0, 2.0])
+    assert select_rulers(rulers, IMAGING, 8.0, costs=costs).cost == 8.0
+    assert select_rulers(rulers, IMAGING, 7.999, costs=costs).cost < 8.0
+
+
+def test_rulers_of_one_source_are_limited() -> None:
+    rulers = candidates_by_hand()._replace(source=np.array([7, 7, 7, 7, 3]))
+    for most in (1, 2, 3):
+        # The fiducial has two coordinates, so that one ruler suffices with it.
+        found = select_rulers(rulers, IMAGING, 10.0, per_source=most)
+        assert len(found.chosen) == most + 1
+        assert 4 in found.chosen
+    assert len(select_rulers(rulers, IMAGING, 10.0).chosen) == 5
+    with pytest.raises(ValueError, match="per_source must be 1 or more, not 0"):
+        select_rulers(rulers, IMAGING, 10.0, per_source=0)
+    for wrong in ([1.0, 1.0, 0.0, 1.0, 1.0], [1.0] * 4):
+        with pytest.raises(ValueError, match="costs must be 5 positive numbers, one for each candidate"):
+            select_rulers(rulers, IMAGING, 10.0, costs=wrong)
+    for wrong_share in (-0.01, 1.0):
+        with pytest.raises(ValueError, match=r"missing must be in \[0, 1\)"):
+            select_rulers(rulers, IMAGING, 10.0, missing=wrong_share)
+
+
+def test_two_coordinates_shrink_a_covariance_by_their_determinant(rng: np.random.Generator) -> None:
+    rows, second = rng.normal(size=(2, 6, 4))
+    second[3:] = 0.0
+    weight = rng.uniform(0.5, 2.0, 6)
+    factor = rng.normal(size=(4, 4))
+    covariance = factor @ factor.T
+    found = two_row_update(rows, second, weight, covariance)
+    for k in range(6):
+        both = np.stack([rows[k], second[k]])
+        expected = np.eye(2) + weight[k] * both @ covariance @ both.T
+        np.testing.assert_allclose(
+            [[found.one[k], found.mixed[k]], [found.mixed[k], found.two[k]]], expected, atol=1e-12
+        )
+        assert found.determinant[k] == pytest.approx(np.linalg.det(expected))
+        np.testing.assert_allclose(found.first[k], rows[k] @ covariance)
+        np.testing.assert_allclose(found.second[k], second[k] @ covariance)

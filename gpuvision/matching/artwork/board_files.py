@@ -129,7 +129,7 @@ def open_layers(place: Path, path: Path, layers: Mapping[str, str] | None) -> La
         with contextlib.redirect_stdout(io.StringIO()):
             try:
                 return LayerStack.open(place, lazy=True, **how)
-            except (ValueError, SystemError) as problem:
+            except (ValueError, SystemError, UnboundLocalError) as problem:
                 if layers or isinstance(problem, UnicodeDecodeError):
                     raise
                 raise ReadError(f"{path}: not a readable board: {propose_layers(board_layer_files(place))}") from None
@@ -197,7 +197,10 @@ def propose_layers(files: list[Path]) -> str:
 def _guess_layers(files: list[Path]) -> dict[str, list[Path]]:
     """Return the files of each layer that their names suggest."""
     _restore_layer_rules()
-    by_program, by_words = _best_match(files)[1], _do_autoguess(files)
+    by_program = _best_match(files)[1]
+    by_words: dict[str, list[Path]] = {}
+    with contextlib.suppress(UnboundLocalError):  # gerbonara 1.5 fails where a name begins with one letter and a dot
+        by_words = _do_autoguess(files)
     guess = by_program if len(by_program) >= len(by_words) else by_words
     return {layer: sorted(found) for layer, found in sorted(guess.items()) if _KNOWN_LAYER.fullmatch(layer)}
 

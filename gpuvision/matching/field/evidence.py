@@ -191,7 +191,7 @@ def _divergence(share: float, p: float) -> float:
 def distances_to_lines(field: Field, places: npt.ArrayLike) -> Float64:
     """Return the distances of places (..., 2) on the field from the nearest line [m]."""
     x, y = np.moveaxis(np.asarray(places, np.float64)[..., None, :], -1, 0)
-    away = [np.full(x.shape[:-1], np.inf)]
+    away = []  # a field has a line or an arc
     if field.lines:
         x0, y0, x1, y1 = np.array(field.lines).T
         dx, dy = x1 - x0, y1 - y0

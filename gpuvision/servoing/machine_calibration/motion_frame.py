@@ -125,7 +125,7 @@ def fit_motion_frame(commands: npt.ArrayLike, seen: npt.ArrayLike, covariance: n
     """
     given, poses = np.asarray(commands, np.float64), np.asarray(seen, np.float64)
     for name, values in (("commands", given), ("seen", poses)):
-        if values.ndim != 2 or values.shape != (len(given), 3) or not np.all(np.isfinite(values)):
+        if values.shape != (*given.shape[:1], 3) or not np.all(np.isfinite(values)):
             raise ValueError(f"{name} have shape {values.shape}, expected finite numbers (n, 3), as many of both")
     _check_moves(given)
     design = _design(given)

@@ -40,6 +40,10 @@ def test_distances_are_those_to_dense_samples(name: str, rng: np.random.Generato
     # cos(0.04)) across it.
     np.testing.assert_allclose(distances_to_lines(field, places), nearest, atol=0.06)
     assert distances_to_lines(field, every[::50]).max() < 0.002
+    grid = distances_to_lines(field, np.zeros((2, 3, 4, 2)))
+    assert grid.shape == (2, 3, 4)
+    assert np.ptp(grid) == 0.0
+    assert distances_to_lines(field, (0.0, 0.0)).shape == ()
 
 
 def test_crossings_are_where_scan_lines_meet_lines() -> None:

@@ -179,3 +179,6 @@ def test_wrong_input_is_refused() -> None:
         fit_motion_frame(COMMANDS, _seen(COMMANDS)[:-1], COVARIANCE)
     with pytest.raises(ValueError, match="finite"):
         fit_motion_frame(COMMANDS * math.nan, _seen(COMMANDS), COVARIANCE)
+    for commands in (1.0, COMMANDS[0], COMMANDS[:, :2], COMMANDS[..., None]):
+        with pytest.raises(ValueError, match="commands have shape"):
+            fit_motion_frame(commands, _seen(COMMANDS), COVARIANCE)

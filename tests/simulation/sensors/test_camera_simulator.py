@@ -78,6 +78,41 @@ def test_photon_and_read_noise(device: Device) -> None:
             np.testing.assert_allclose(sigma, slope * blur / np.sqrt(2e4), rtol=2e-3)
 
 
+@pytest.mark.parametrize("method", ["windowed", "centroid"])
+def test_sigma_is_that_of_a_centroid_with_all_noise(method: str, device: Device) -> None:
+    """Photons, read noise and quantisation, of each pixel over the threshold in the window, up to the full well."""
+    view = camera_view()
+    gain, offset, threshold, read_noise, well, window = 0.2, 3.0, 7.0, 30.0, 9000.0, 6
+    light = line(view, np.array([1.6, 2.4, 20.3, 30.0, 31.7, 45.2, 61.2, 62.9]), electrons=3e4)
+    simulator = camera(
+        view,
+        readout={"method": method, "threshold": threshold, "window": window},
+        gain=gain,
+        offset=offset,
+        read_noise=read_noise,
+        full_well=well,
+        bits=12,
+    )
+    reading = simulator.read(light, device=device)
+    known = np.flatnonzero(np.isfinite(reading.position))
+    assert len(known) >= 4
+    np.testing.assert_array_equal(np.isfinite(reading.sigma), np.isfinite(reading.position))
+    electrons = simulator.electrons(light)
+    slope = height_secant(view.triangulation, reading.position, reading.position, view.v_centres)
+    for sample in known:
+        pixel = (reading.position[sample] - view.u_centres[0]) / PIXEL
+        reach = range(64) if method == "centroid" else range(round(pixel) - window, round(pixel) + window + 1)
+        weighted = total = 0.0
+        for k in (each for each in reach if 0 <= each < 64):
+            held = min(electrons[sample, k], well)
+            signal = held + (offset - threshold) / gain
+            if signal > 0.0:
+                weighted += (held + read_noise**2 + 1.0 / 12.0 / gain**2) * (k - pixel) ** 2
+                total += signal
+        expected = abs(slope[sample]) * PIXEL * np.sqrt(weighted) / total
+        assert reading.sigma[sample] == pytest.approx(expected, rel=1e-5)
+
+
 def test_saturation_and_rounding(device: Device) -> None:
     """A full well or the largest code limits the signal; both are flagged."""
     view = camera_view()

@@ -267,7 +267,7 @@ def test_single_beam_is_a_moebius_map(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(fitted.to_sensor(sheet)[:, 0], seen[:, 0], rtol=0, atol=5.0 * SIGMA)
     # It has no v: points are imaged in the middle of the region, whatever their G is.
     off = Triangulation.fit(seen, sheet, sigma=SIGMA, region=((-3e-3, 3e-3), (-2e-4, 7e-4)))
-    np.testing.assert_allclose(off.to_sensor(sheet + [0.01, 0.0])[:, 1], 2.5e-4, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(off.to_sensor(sheet + np.array([0.01, 0.0]))[:, 1], 2.5e-4, rtol=0, atol=1e-15)
     np.testing.assert_allclose(off.to_sensor(sheet)[:, 0], fitted.to_sensor(sheet)[:, 0], rtol=1e-9)
     np.testing.assert_allclose(fitted.to_sensor(sheet)[:, 1], 4e-4, rtol=0, atol=1e-15)
     g0, gx, gy, *_ = fitted.conditioned()

@@ -9,7 +9,7 @@ import trimesh
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.sensors.view_rays import ViewRays
+from gpuvision.simulation.sensors.view_rays import ViewRays, unit_normals
 from sensor_views import sensor_view
 
 GREY = Material(diffuse=Lambert(albedo=0.5))
@@ -63,6 +63,10 @@ def test_the_side_that_the_lens_sees_counts_and_the_nearer_surface(device):
     np.testing.assert_array_equal(seen.triangle[near] >= 2, True)
     assert (np.abs(seen.receivers[near][:, :2]) <= 0.004 + 1e-9).all()
     assert (seen.receivers[..., 5] == 1.0).all()
+    # The albedo of the surface over pi, times the etendue of the bin.
+    etendue = one.etendue(one.u_centres, one.v_centres[:, None]) * 5e-4 * (12e-3 / 7)
+    albedo = np.where(near, WHITE.albedo, GREY.albedo)
+    np.testing.assert_allclose(seen.weights, etendue * albedo / math.pi, rtol=1e-12)
 
 
 def test_where_nothing_is_seen_nothing_comes(device):
@@ -74,6 +78,7 @@ def test_where_nothing_is_seen_nothing_comes(device):
     assert missed.any()
     assert not missed.all()
     np.testing.assert_array_equal(seen.weights[missed], 0.0)
+    np.testing.assert_array_equal(seen.receivers[missed], 0.0)
     got = lines.exposure(seen, np.where(missed, np.nan, 1.0))
     assert np.isfinite(got.power).all()
     assert got.power.sum() > 0.0
@@ -83,3 +88,22 @@ def test_a_material_for_every_number(device):
     scene = Scene(floor().triangles, np.array([0, 2], np.int32))
     with pytest.raises(ValueError, match="materials 0 to 2"):
         ViewRays(view=sensor_view(), scene=scene, materials=[GREY], device=device)
+
+
+def test_an_empty_scene_shows_nothing(device):
+    lines = ViewRays(view=sensor_view(), scene=Scene(np.zeros((0, 3, 3))), materials=[], device=device)
+    seen = lines.visible_surface(1e-3)
+    assert (seen.triangle < 0).all()
+    assert not seen.weights.any()
+    assert not lines.exposure(seen, np.ones(seen.weights.shape)).power.any()
+
+
+def test_normals_of_triangles_without_area_are_zero():
+    corners = np.array(
+        [
+            [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]],
+            [[1.0, 2.0, 3.0]] * 3,
+            [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [3.0, 3.0, 3.0]],
+        ]
+    )
+    np.testing.assert_array_equal(unit_normals(Scene(corners)), [[1.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3])

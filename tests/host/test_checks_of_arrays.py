@@ -119,7 +119,5 @@ def test_what_looks_like_colours(shape: tuple[int, ...], is_colour: bool) -> Non
     if not is_colour:
         builder.check_no_colour("frames")
         return
-    with pytest.raises(
-        ValueError, match=r"Readout takes frames of one channel, got shape .*: its last axis looks like"
-    ):
+    with pytest.raises(ValueError, match=r"Readout takes frames of one channel, got shape .*: its last axis looks"):
         builder.check_no_colour("frames")

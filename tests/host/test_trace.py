@@ -464,3 +464,49 @@ def test_completed_commands_are_read_while_others_run(tmp_path: Path, monkeypatc
     trace.write()
     assert (len(trace._pending), len(trace._executed)) == (0, 2)
     assert json.loads((tmp_path / "t.json").read_text())["otherData"]["commands without device times"] == 1
+
+
+def test_a_queue_of_no_clock_hides_no_other(tmp_path: Path) -> None:
+    """The first queue counts 0, 1, 2 instead of nanoseconds, and is left out."""
+    trace = Trace(tmp_path / "t.json")
+    queues = [type("Queue", (), {"device": SimpleNamespace(name=name)})() for name in ("one", "other")]
+    for queue, times in ((queues[0], (0, 1)), (queues[1], (0, 10_000_000))):
+        for number, queued in enumerate(times):
+            before = 10_000_000 * number
+            event = FakeEvent(queued, queued + 1_000, queued + 3_000)
+            trace.add_event(queue, "compute", "op", event, before, before + 1_000)
+    trace.write()
+    lanes = spans_by_lane(tmp_path / "t.json")
+    assert {name: [each["dur"] for each in spans] for name, spans in lanes.items()} == {
+        "device other, queue 2": [2.0, 2.0]
+    }
+    assert json.loads((tmp_path / "t.json").read_text())["otherData"]["commands without device times"] == 2
+
+
+def test_a_command_that_runs_or_fails_hides_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands that wait behind a running one stay; those of other queues, and after a failed one, are read."""
+
+    class Event(FakeEvent):
+        def __init__(self, state: int) -> None:
+            super().__init__(0, 2, 3)
+            self.command_execution_status = state
+
+        def wait(self) -> None:
+            if self.command_execution_status < 0:
+                raise cl.RuntimeError("clWaitForEvents failed: OUT_OF_RESOURCES")
+
+    class Failed(Event):
+        profile = property(lambda self: self.wait(), lambda self, value: None)  # type: ignore[assignment]
+
+    complete, running = int(cl.command_execution_status.COMPLETE), int(cl.command_execution_status.RUNNING)
+    monkeypatch.setattr(trace_module, "_PENDING", 6)
+    trace = Trace(tmp_path / "t.json")
+    queues = [type("Queue", (), {"device": SimpleNamespace(name=name)})() for name in ("one", "other")]
+    events = [Event(running), Failed(-5), Event(complete), Event(complete), Event(complete), Event(complete)]
+    for number, event in enumerate(events):
+        trace.add_event(queues[number % 2], "compute", "op", event, 0, 1_000)
+    assert [each.event for each in trace._pending] == events[::2]
+    assert [each.command.event for each in trace._executed] == [events[3], events[5]]
+    assert trace._without_times == 1
+    trace.write()
+    assert len(trace._executed) == 5

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from gpuvision.host import files
+from gpuvision.host import outputs as outputs_module
 from gpuvision.host.outputs import MANIFEST, Outputs
 
 Link = Callable[[Path, Path], object]
@@ -149,3 +150,57 @@ def test_standard_output_and_devices_are_no_files(tmp_path: Path) -> None:
     outputs.claim(None, "-", Path("/dev/null"), Path("/dev/null"))
     outputs.write_text("/dev/null", "gone")
     assert not Path("/dev", MANIFEST).exists()
+
+
+@pytest.mark.parametrize("change", ["none", "size", "time", "job", "content"])
+def test_an_output_counts_as_unchanged_by_job_size_and_time(tmp_path: Path, change: str) -> None:
+    file = tmp_path / "a.txt"
+    Outputs("scan").write_text(file, "text")
+    info = file.stat()
+    if change in ("size", "content"):
+        file.write_text("longer text" if change == "size" else "mine")
+        os.utime(file, ns=(info.st_atime_ns, info.st_mtime_ns))
+    if change == "time":
+        os.utime(file, ns=(info.st_atime_ns, info.st_mtime_ns + 1))
+    outputs = Outputs("merge" if change == "job" else "scan")
+    if change in ("none", "content"):  # of the same size and time: taken for the output
+        outputs.write_text(file, "new")
+        assert file.read_text() == "new"
+    else:
+        with pytest.raises(FileExistsError, match="the file exists, and is not an unchanged output of an earlier"):
+            outputs.write_text(file, "new")
+        Outputs("merge", overwrite=True).write_text(file, "new")
+        assert file.read_text() == "new"
+
+
+def test_a_manifest_that_is_a_link_or_too_large_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, manifest = tmp_path / "a.txt", tmp_path / MANIFEST
+    Outputs("scan").write_text(file, "text")
+    size = manifest.stat().st_size
+    for most, is_used in ((size, True), (size - 1, False)):
+        monkeypatch.setattr(outputs_module, "_MAX_MANIFEST", most)
+        assert bool(outputs_module._read_manifest(tmp_path)) == is_used
+    monkeypatch.undo()
+    manifest.rename(tmp_path / "elsewhere")
+    manifest.symlink_to(tmp_path / "elsewhere")
+    assert outputs_module._read_manifest(tmp_path) == {}
+    for content in ("[]", "{}", '{"files": []}', "{", "\xff"):
+        manifest.unlink()
+        manifest.write_text(content)
+        assert outputs_module._read_manifest(tmp_path) == {}
+
+
+def test_only_the_unchanged_optional_files_of_the_job_are_removed(tmp_path: Path) -> None:
+    """A file that was changed, one of another job, a link and an input stay; so does a file that is written again."""
+    names = ["old", "changed", "other", "link", "input", "again"]
+    with Outputs("scan").folder(tmp_path) as inside:
+        for name in names:
+            (inside / name).write_text(name)
+    (tmp_path / "changed").write_text("by hand")
+    (tmp_path / "link").unlink()
+    (tmp_path / "link").symlink_to(tmp_path / "again")
+    Outputs("merge", overwrite=True).write_text(tmp_path / "other", "of another job")
+    with Outputs("scan", inputs=[tmp_path / "input"]).folder(tmp_path, optional=[*names, "missing"]) as inside:
+        (inside / "again").write_text("new")
+    assert sorted(each.name for each in tmp_path.iterdir() if each.name != MANIFEST) == sorted(names[1:])
+    assert (tmp_path / "again").read_text() == "new"

@@ -97,10 +97,13 @@ def _draw_uncertainty(axes: Axes, calibration: Calibration) -> None:
     known = np.isfinite(found.sigma_px)
     largest = float(found.sigma_px[known].max()) if known.any() else 0.0
     if largest > 0.0:
-        levels = np.geomspace(max(float(found.sigma_px[known].min()), 1e-3 * largest), largest, 13)
+        least = max(float(found.sigma_px[known].min()), 1e-3 * largest)
+        levels = np.geomspace(
+            least, max(largest, 1.001 * least), 13
+        )  # distinct, also where all uncertainties are equal
         shown = axes.contourf(
-            x, y, np.ma.masked_where(~known, np.maximum(found.sigma_px, levels[0])), levels=np.unique(levels),
-            cmap="cividis", norm=LogNorm(levels[0], max(largest, 1.001 * levels[0])), extend="max",
+            x, y, np.ma.masked_where(~known, np.maximum(found.sigma_px, least)), levels=levels,
+            cmap="cividis", norm=LogNorm(levels[0], levels[-1]), extend="max",
         )  # fmt: skip
         axes.figure.colorbar(shown, ax=axes, label="1 sigma of the correction [px]", shrink=0.8, format="%.2g")
     axes.contourf(

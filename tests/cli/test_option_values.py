@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import math
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +12,9 @@ from typing import Any
 import pytest
 
 from gpuvision.cli import calibrate, calibrate_sensor, locate, locate_robot, undistort
+from gpuvision.cli.arguments import devices_of, layers_of, prints_report, quantities, reject_unused, write_report
 from gpuvision.formats import camera_file, features_file
+from gpuvision.host import Device
 from gpuvision.workflows import locating_robot
 
 
@@ -139,3 +144,74 @@ def test_settings_of_a_view_of_the_floor(
     for given in ((0.01, None), (None, "30cm")):
         with pytest.raises(ValueError, match=r"has no effect with mounted\.toml, whose table \[mount\] gives height"):
             locate_robot._scan_settings((3, 4), field, Path("mounted.toml"), given[0], line_width, given[1])
+
+
+@pytest.mark.parametrize(
+    ("units", "values"),
+    [
+        ("m", {"": 1.0, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}),
+        ("rad", {"": 1.0, "rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0}),
+        ("s", {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}),
+    ],
+)
+def test_units_of_quantities(units: str, values: dict[str, float]) -> None:
+    for name, value in values.items():
+        for text in (f"-2.5{name}", f" -25e-1 {name} ", f"-.25e+1{name}", f"-2.5E0{name}"):
+            assert quantities(text, "--at", units) == pytest.approx((-2.5 * value,), rel=1e-12)
+    for name in {"m", "mm", "rad", "deg", "s", "ms", "km", "x"} - set(values):
+        with pytest.raises(ValueError, match=rf"--at is '1{name}', expected 1 number: {units} \(or "):
+            quantities(f"1{name}", "--at", units)
+
+
+def test_numbers_of_quantities() -> None:
+    assert quantities("1mm,2,3deg", "--at", "m,m,rad") == pytest.approx((1e-3, 2.0, math.pi / 60.0))
+    for text, message in (
+        ("1mm,2", "--at is '1mm,2', expected 3 numbers: m (or cm, mm, um), m (or cm, mm, um), rad (or mrad, deg)"),
+        ("1mm,2,3,4", "--at is '1mm,2,3,4', expected 3 numbers: "),
+        ("1mm,2,1e400", "--at is '1mm,2,1e400', expected finite numbers"),
+        ("1mm,,3", "--at is '1mm,,3', expected 3 numbers"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            quantities(text, "--at", "m,m,rad")
+
+
+def test_layers_by_name_or_pattern() -> None:
+    assert layers_of(None) is layers_of([]) is None
+    table = layers_of(["*.gtl=top copper", "a.gko= mechanical outline "])
+    assert table is not None
+    assert list(table.values()) == ["top copper", "mechanical outline"]
+    top, outline = table
+    assert [bool(re.match(top, name)) for name in ("x.gtl", "x.gtlx", "gtl")] == [True, False, False]
+    assert [bool(re.match(outline, name)) for name in ("a.gko", "b.gko")] == [True, False]
+    for text in ("a", "=top copper", "a=", "a= "):
+        with pytest.raises(ValueError, match=f"--layers is '{text}', expected a file name or pattern and a layer"):
+            layers_of([text])
+
+
+def test_options_without_effect_are_named() -> None:
+    reject_unused("here", some_value=None, flag=False)
+    for given in ({"some_value": 0}, {"some_value": ""}, {"some_value": True}):
+        with pytest.raises(ValueError, match="--some-value has no effect here; leave it out"):
+            reject_unused("here", other=None, **given)
+
+
+def test_devices_by_their_labels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Device, "named", staticmethod(lambda label: f"device {label}"))
+    monkeypatch.setattr(Device, "best", staticmethod(lambda: "best"))
+    for all_of_them, expected in ((("one", "two"), ["one", "two"]), ((), ["best"])):
+        monkeypatch.setattr(Device, "all", staticmethod(lambda found=all_of_them: found))
+        assert devices_of(None) == devices_of([]) == expected
+        assert devices_of(["b", "a"]) == ["device b", "device a"]
+
+
+@pytest.mark.parametrize("to", [None, "-", "report.json"])
+def test_a_report_goes_where_it_is_asked_for(to: str | None, capsys: pytest.CaptureFixture[str]) -> None:
+    written: list[Any] = []
+    outputs: Any = SimpleNamespace(write_text=lambda *given: written.append(given))
+    path = None if to is None else Path(to)
+    write_report(path, {"a": math.inf, "b": 1.5}, outputs)
+    assert prints_report(path) == (to == "-")
+    assert [file for file, _ in written] == ([path] if to == "report.json" else [])
+    for text in [capsys.readouterr().out] if to == "-" else [text for _, text in written]:
+        assert json.loads(text) == {"a": None, "b": 1.5}
+    assert capsys.readouterr().out == ""

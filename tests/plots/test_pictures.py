@@ -17,6 +17,8 @@ from matplotlib.patches import Ellipse
 from matplotlib.quiver import Quiver
 
 from gpuvision.matching.field.distance_map import Arc, Field
+from gpuvision.plots import calibration as calibration_picture
+from gpuvision.plots import field as field_picture
 from gpuvision.plots.calibration import draw_calibration
 from gpuvision.plots.field import draw_located_robot, draw_robot_track, field_lines
 from gpuvision.plots.inspection import draw_regions
@@ -168,6 +170,37 @@ def test_picture_of_a_calibration_by_views(drawn: list[Figure], tmp_path: Path) 
     assert not correction.lines
 
 
+def test_of_many_residuals_every_nth_is_drawn(
+    drawn: list[Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibration_picture, "_MAX_POINTS", 3)
+    for count, step in ((5, 1), (6, 2), (8, 2), (9, 3)):
+        errors = 0.1 * np.arange(1.0, count + 1)
+        points = np.stack([np.arange(float(count)), np.arange(float(count))], axis=1)
+        draw_calibration(tmp_path / f"{count}.png", some_calibration(errors, points))
+        (dots,) = drawn[-1].axes[0].collections
+        np.testing.assert_allclose(dots.get_array(), errors[::step])
+
+
+@pytest.mark.parametrize(("least", "lowest"), [(0.01, 0.01), (2e-4, 2e-4), (1e-5, 1.6e-4), (0.16, 0.16)])
+def test_scale_of_the_uncertainty(least: float, lowest: float, drawn: list[Figure], tmp_path: Path) -> None:
+    """Logarithmic, from the least one, or a thousandth of the largest one; what is not known is not filled."""
+    calibration = some_calibration(np.array([0.4, -0.1, 0.3, 0.2]), np.zeros((4, 2)))
+    sigma = np.array([[least, 0.02 if least < 0.02 else 0.16, np.nan], [0.16, 0.16, 0.16]])
+    calibration.correction_map.sigma_px = sigma
+    draw_calibration(tmp_path / "picture.png", calibration)
+    panels = drawn[0].axes
+    filled, hatched = (cast("Any", each) for each in panels[2].collections)
+    highest = max(0.16, 1.001 * lowest)  # also where all are equal
+    np.testing.assert_allclose(filled.levels, np.geomspace(lowest, highest, 13))
+    assert (filled.norm.vmin, filled.norm.vmax) == pytest.approx((lowest, highest))
+    assert list(hatched.levels) == [0.5, 1.5]
+    calibration.correction_map.sigma_px = np.full((2, 3), np.nan)
+    draw_calibration(tmp_path / "unknown.png", calibration)
+    assert len(drawn[1].axes[2].collections) == 1
+    assert len(drawn[1].axes) == len(panels) - 1
+
+
 # ---- inspection ----------------------------------------------------------------------------------------------
 
 
@@ -215,7 +248,8 @@ def test_picture_of_an_inspection(drawn: list[Figure], tmp_path: Path) -> None:
     ]
     assert bar.get_ylabel() == "volume [%]"
     assert labels(axes)[:2] == ("x [mm]", "y [mm]")
-    assert labels(axes)[2].startswith("paste\ngrey: heights ")
+    low, top = np.percentile(z, [0.5, 99.5])
+    assert labels(axes)[2] == f"paste\ngrey: heights {1e6 * low:.3g} to {1e6 * top:.3g} µm"
 
 
 def test_many_regions_have_no_names_and_large_maps_are_thinned_out(drawn: list[Figure], tmp_path: Path) -> None:
@@ -278,6 +312,35 @@ def test_picture_of_frames(along: Any, drawn: list[Figure], tmp_path: Path) -> N
     assert boxes == [(1, 2) if along == "columns" else (2, 1)] * 2
 
 
+@pytest.mark.parametrize(
+    ("count", "shape", "grid"),
+    [
+        (6, (10, 10), (2, 3)),
+        (5, (10, 10), (2, 3)),
+        (3, (10, 10), (2, 2)),
+        (2, (10, 10), (1, 2)),
+        (4, (10, 40), (4, 1)),
+        (4, (40, 10), (1, 4)),
+        (9, (10, 30), (5, 2)),
+    ],
+)
+def test_frames_fill_a_page(
+    count: int, shape: tuple[int, int], grid: tuple[int, int], drawn: list[Figure], tmp_path: Path
+) -> None:
+    """Wide frames lie below each other, tall frames side by side: the page is about 1.4 times as wide as high."""
+    frames = [
+        LineFrame(number=k, image=np.ones(shape), position=np.ones(shape[1]), status=np.zeros(shape[1], np.uint8))
+        for k in range(count)
+    ]
+    draw_line_frames(tmp_path / "frames.png", frames, along="columns", title="frames")
+    assert len(drawn[0].axes) == count
+    for number, axes in enumerate(drawn[0].axes):
+        place: Any = axes.get_subplotspec()
+        assert place.get_geometry() == (*grid, number, number)
+    high = max(12.0 / grid[1] * shape[0] / shape[1], 0.3) + 0.25
+    assert tuple(drawn[0].get_size_inches()) == pytest.approx((12.0, grid[0] * high + 1.0))
+
+
 def test_dark_frames_have_a_scale(drawn: list[Figure], tmp_path: Path) -> None:
     frame = LineFrame(
         number=0, image=np.full((5, 5), np.nan), position=np.full(5, np.nan), status=np.zeros(5, np.uint8)
@@ -304,6 +367,37 @@ def test_lines_of_a_field() -> None:
     np.testing.assert_allclose(np.hypot(*(arc - [0.5, 1.0]).T), 2.0)
     assert len(arc) == math.ceil(2.0 * math.pi / 0.08)
     np.testing.assert_allclose([arc[0], arc[-1]], [[2.5, 1.0]] * 2)
+
+
+def test_short_arcs_have_eight_points() -> None:
+    """Others have a point for each 0.08 radians."""
+    for turn, count in ((0.1, 8), (0.56, 8), (0.64, 8), (0.641, 9), (1.0, 13)):
+        field = Field(length=1.0, width=1.0, lines=(), arcs=(Arc(0.5, -1.0, 2.0, 0.3, 0.3 + turn),))
+        (arc,) = field_lines(field)
+        assert len(arc) == count
+        ends = [[0.5 + 2.0 * math.cos(each), -1.0 + 2.0 * math.sin(each)] for each in (0.3, 0.3 + turn)]
+        np.testing.assert_allclose(arc[[0, -1]], ends)
+
+
+def test_distance_from_a_line_is_that_from_its_nearest_point() -> None:
+    lines = [np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]]), np.array([[-5.0, 5.0], [-5.0, 9.0]])]
+    points = np.array([[2.0, 1.5], [-3.0, -4.0], [5.0, 2.0], [4.0, 5.0], [-7.0, 6.0], [2.5, 0.0]])
+    np.testing.assert_allclose(field_picture._distances(points, lines), [1.5, 5.0, 1.0, 2.0, 2.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("std", "limit"), [(0.02, 0.06), (0.0, 3e-3), (1e-4, 3e-3)])
+def test_points_within_three_sigmas_are_on_lines(std: float, limit: float, drawn: list[Figure], tmp_path: Path) -> None:
+    """A sigma of 1 mm at least."""
+    field = Field(length=10.0, width=6.0, lines=((-4.0, 0.0, 4.0, 0.0),), arcs=())
+    best = SimpleNamespace(pose=np.zeros(3), covariance=COVARIANCE, score=0.1, residual_std=std)
+    points = np.array([[1.0, 0.99 * limit], [2.0, -0.99 * limit], [3.0, 1.01 * limit]])
+    located: Any = SimpleNamespace(
+        points=points, candidates=(best,), doubtful=(), field=field, scale=None, summary=lambda: "located"
+    )
+    draw_located_robot(tmp_path / "located.png", located)
+    on, beside, _ = drawn[0].axes[0].lines
+    np.testing.assert_allclose(data(on), points[:2])
+    np.testing.assert_allclose(data(beside), points[2:])
 
 
 def check_ellipse(ellipse: Ellipse, centre: np.ndarray, colour: str) -> None:

@@ -71,3 +71,26 @@ def test_a_cause_has_the_same_colour_in_every_picture(drawn: list[Figure], tmp_p
         found.add(tuple(np.asarray(drawn[-1].axes[0].images[0].get_array())[0, 0, :3]))
     assert len(found) == len(others)
     assert not found & {to_rgb("#4b5563"), to_rgb("#e5e7eb")}
+
+
+@pytest.mark.parametrize(("below", "span"), [(979, 2e-3), (981, 1e-3)])
+def test_two_percent_of_the_errors_are_beyond_half_the_scale(below: int, span: float) -> None:
+    """Of a thousand errors some are 0.9 mm, the others 1.1 mm: the scale is a round length, up to twice their end."""
+    error = np.full(1000, -0.9e-3)
+    error[below:] = 1.1e-3
+    parts = [errors_of(each.reshape(-1, 5)) for each in np.split(error, [400])]
+    assert PictureScale.of(parts, 3e-6) == (pytest.approx(span), 3e-6)
+
+
+def test_the_legend_states_the_part_of_each_cause(drawn: list[Figure], tmp_path: Path) -> None:
+    """Eight samples: two without a reading, one within the limit, five by noise."""
+    error = np.array([[np.nan, np.nan, 5e-6, 1e-3], [1e-3, 1e-3, -1e-3, 1e-3]])
+    draw_causes(tmp_path / "a.png", errors_of(error), "part", PictureScale(1e-3, 12.34e-6))
+    (legend,) = drawn[0].legends
+    texts = [each.get_text() for each in legend.get_texts()]
+    assert texts == ["no reading, or no ground truth (25.0 %)", "within 12.3 µm (12.5 %)", "noise (62.5 %)"]
+    colours = [patch.get_facecolor()[:3] for patch in legend.get_patches()]
+    picture = np.asarray(drawn[0].axes[0].images[0].get_array())
+    for colour, place in zip(colours, ((0, 0), (0, 2), (1, 1)), strict=True):
+        np.testing.assert_allclose(picture[place][:3], colour)
+    assert drawn[0].axes[0].get_title(loc="left") == "part: dominant cause of each error"

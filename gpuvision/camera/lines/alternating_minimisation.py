@@ -134,14 +134,7 @@ def _fit_gauss_newton(objective: _Objective, lens: Float64, points: Float64) -> 
     for _ in range(_MAX_DESCENTS):
         distance, slopes = objective.slopes(lens, points)
         evaluation = float(inner_products(distance, distance))
-        scale = 1.0 / np.sqrt(np.maximum(np.einsum("in,in->i", slopes, slopes), 1e-30))
-        slopes *= scale[:, None]
-        step = (
-            -scale
-            * np.linalg.lstsq(
-                inner_products(slopes, slopes), inner_products(slopes, distance[None])[:, 0], rcond=1e-12
-            )[0]
-        )
+        step = -np.linalg.lstsq(slopes.T, distance, rcond=None)[0]
         after = objective.cost(lens + step, points)
         while after >= evaluation and np.max(np.abs(step)) > _MIN_STEP:
             step = 0.5 * step

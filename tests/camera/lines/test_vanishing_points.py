@@ -314,6 +314,43 @@ def test_lines_that_do_not_meet_are_found_out(rng: np.random.Generator) -> None:
         assert (other.p_value < 0.05) is (kind == "free")
 
 
+def test_summary_of_the_alternatives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the order of their models, against the largest one with the same lines; a cost of 0 compares with nothing."""
+    search: Any = Search(correlated=False, sigma=0.8)
+    search.packed.unit, search.weight = 100.0, None
+    search.fits = {
+        key: SimpleNamespace(
+            evaluation=SimpleNamespace(cost=cost),
+            parameters=SimpleNamespace(k=np.ones(key[0]), centre=np.array([0.03 * key[0], 0.04 * key[1]])),
+        )
+        for key, cost in search.costs.items()
+    }
+    search.fit = lambda order, concurrent: search.fits[order, concurrent]
+    monkeypatch.setattr(vanishing_points, "rms_px", lambda _packed, found, _weight: found.evaluation.cost)
+    monkeypatch.setattr(vanishing_points, "centre_px", lambda _packed, found: tuple(100.0 * found.parameters.centre))
+    for chosen in ((1, False), (3, True), (0, False)):
+        found = vanishing_points._alternatives(search, *chosen)
+        others = [(0, False), (1, False), (1, True), (3, False), (3, True)]
+        others.remove(chosen)
+        assert [(each.model, each.lines) for each in found] == [
+            (["none", "k1", "k1,k2", "k1,k2,k3"][order], "vanishing" if concurrent else "free")
+            for order, concurrent in others
+        ]
+        for each, other in zip(found, others, strict=True):
+            assert each.rms_px == search.costs[other]
+            more = search.parameters(*other) - search.parameters(*chosen)
+            ratio = search.costs[other] / search.costs[chosen]
+            assert each.aic == pytest.approx(60.0 * math.log(ratio) + 2.0 * more)
+            assert each.p_value == search.p_value(other, (3, chosen[1] and other[1]))
+            assert each.centre == (tuple(100.0 * search.fits[other].parameters.centre) if other[0] else None)
+            away = math.hypot(3.0 * (other[0] - chosen[0]), 4.0 * (other[1] - chosen[1]))
+            expected = away if other[0] and chosen[0] else math.nan
+            assert each.centre_distance_px == pytest.approx(expected, nan_ok=True)
+    search.fits[1, False].evaluation.cost = 0.0
+    assert vanishing_points._alternatives(search, 1, False)[0].aic == -2.0 * 3
+    assert vanishing_points._alternatives(search, 0, False)[0].aic == -math.inf
+
+
 def test_alternatives_say_how_far_their_centres_lie(rng: np.random.Generator) -> None:
     points, _ = noisy_grid(rng, 20.0, 10.0, 0.05)
     fit = fit_lens(grid_lines(points))

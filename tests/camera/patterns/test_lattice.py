@@ -11,10 +11,13 @@ from scipy.spatial import cKDTree
 from gpuvision.camera.patterns.grid_polynomial import agrees_with_grid
 from gpuvision.camera.patterns.lattice import (
     LatticePatch,
+    _seed,
     _without_overlap,
     estimate_local_steps,
     index_grid,
     index_patches,
+    join_patches,
+    patch_grid,
 )
 from target_images import view
 
@@ -122,6 +125,75 @@ def test_smaller_patches_lose_the_points_of_larger_ones() -> None:
     assert found[1].nodes.tolist() == nodes[4:8].tolist()
     assert [len(each.members) for each in _without_overlap([few, overlapping, large], 2)] == [9, 4, 2]
     assert [len(each.members) for each in _without_overlap([few, overlapping, large], 5)] == [9, 5]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [((1, 0), (0, 1)), ((0, 1), (1, 0)), ((-1, 0), (0, 1)), ((1, 2), (0, 1)), ((2, 1), (1, 1)), ((0, -1), (1, 5))],
+)
+def test_a_grid_of_any_index_has_rows_and_columns(
+    change: tuple[tuple[int, int], ...], rng: np.random.Generator
+) -> None:
+    """The shortest steps of a sheared lattice, columns along x and rows along y; empty nodes are -1."""
+    row, column = (each.ravel() for each in np.indices((5, 7)))
+    kept = rng.permutation(35)[:32]
+    row, column = row[kept], column[kept]
+    points = np.stack([40.0 * column + 6.0 * row, 3.0 * column + 30.0 * row], axis=1)
+    nodes = np.stack([column, row], axis=1) @ np.array(change) + (9, -4)
+    members = rng.permutation(32)
+    found = patch_grid(LatticePatch(members, nodes[members]), points)
+    expected = np.full((5, 7), -1)
+    expected[row, column] = np.arange(32)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_the_seed_has_the_median_steps() -> None:
+    """Of five points with steps that differ in length and in the angle between them, whichever step comes first."""
+    bases = np.array(
+        [
+            [[10.0, 0.0], [0.0, 10.0]],
+            [[0.0, 12.0], [12.0, 0.0]],
+            [[0.0, -11.0], [11.0, 0.0]],
+            [[14.0, 0.0], [0.0, 14.0]],
+            [[9.0, 0.0], [6.0, 7.0]],
+        ]
+    )
+    points = np.zeros((5, 2))
+    for left, seed in (([0, 1, 2, 3, 4], 2), ([0, 1, 3], 1), ([3], 3), ([], None)):
+        assert _seed(points, bases, np.isin(np.arange(5), left)) == seed
+
+
+@pytest.mark.parametrize(
+    ("shift", "fits"),
+    [
+        ((0.0, 0.0), True),
+        ((0.37, 0.0), True),
+        ((0.43, 0.0), False),
+        ((0.0, -0.43), False),
+        ((0.18, -0.18), True),
+        ((0.22, 0.22), False),
+    ],
+)
+def test_a_patch_continues_the_lattice_of_another_one(shift: tuple[float, float], fits: bool) -> None:
+    """Extrapolated indices deviate by 0.2 from whole numbers in the median, and by 0.4 along one axis; other origin."""
+    row, column = (each.ravel() for each in np.indices((9, 20)))
+    at = np.stack([30.0 * column + 0.02 * row**2, 25.0 * row + 0.01 * column**2], axis=1)
+    is_main, is_other = column < 12, column > 13
+    points = np.where(is_other[:, None], np.add(at, np.multiply(shift, (30.0, 25.0))), at)
+    turned = np.add(np.stack([row, -column], axis=1), (5, 3))
+    patches = [
+        LatticePatch(np.flatnonzero(is_main), np.stack([column, row], axis=1)[is_main]),
+        LatticePatch(np.flatnonzero(is_other), turned[is_other]),
+    ]
+    joined, separate = join_patches(patches, points)
+    assert len(separate) == (0 if fits else 1)
+    every = is_main | (is_other & fits)
+    assert sorted(joined.members.tolist()) == np.flatnonzero(every).tolist()
+    np.testing.assert_array_equal(joined.nodes, np.stack([column, row], axis=1)[joined.members])
+    # Nodes that the main patch has already are not joined.
+    taken = [patches[0], LatticePatch(patches[1].members, turned[is_other] + (0, 14))]
+    moved = np.where(is_other[:, None], at - (30.0 * 14, 0.0), at)
+    assert len(join_patches(taken, moved)[1]) == 1
 
 
 @pytest.mark.parametrize("turn", [-170, -80, -44, 0, 44, 100])

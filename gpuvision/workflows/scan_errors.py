@@ -280,10 +280,7 @@ def scatter_about_plane(z: Array) -> float:
     For noise that is independent from sample to sample. Correlated noise (speckle larger than a sample) scatters less
     about the plane. The median absolute deviation ignores edges; a curved surface adds its curvature.
     """
-    profiles, samples = z.shape
-    if profiles < 3 or samples < 3:
-        return math.nan
-    middles = np.unique(np.linspace(1, profiles - 2, min(profiles - 2, _PROFILES)).astype(int))
+    middles = _middles(len(z))
     rows = [z[middles + step].astype(np.float64) for step in (-1, 0, 1)]
     columns = rows[0] + rows[1] + rows[2]
     mean = (columns[:, :-2] + columns[:, 1:-1] + columns[:, 2:]) / 9.0
@@ -314,10 +311,7 @@ def phase_scatter(position: Array) -> float:
     sample], deviates from the plane by ``1 - (1 + 2 cos(2 pi k a)) (1 + 2 cos(2 pi k b)) / 9``. Of two harmonics the
     larger share counts. The slopes are means over the 3 x 3 samples, so that noise of the positions has little effect.
     """
-    profiles, samples = position.shape
-    if profiles < 3 or samples < 3:
-        return 0.0
-    middles = np.unique(np.linspace(1, profiles - 2, min(profiles - 2, _PROFILES)).astype(int))
+    middles = _middles(len(position))
     above, here, below = (position[middles + step].astype(np.float64) for step in (-1, 0, 1))
     along = (below - above) / 2.0
     along = (along[:, :-2] + along[:, 1:-1] + along[:, 2:]) / 3.0
@@ -331,6 +325,11 @@ def phase_scatter(position: Array) -> float:
         if known.any():
             shares.append(float(np.median(deviation[known] ** 2)) / _PLANE_SHARE)
     return min(max(shares), 1.0)
+
+
+def _middles(profiles: int) -> npt.NDArray[np.int_]:
+    """Return the numbers of profiles between two others: all, or `_PROFILES` that are spread evenly."""
+    return np.linspace(1, profiles - 2, min(max(profiles - 2, 0), _PROFILES)).astype(int)
 
 
 def error_budget(errors: ScanErrors | None, z: Array, map_sigma: Array | None, *, camera: bool) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import pytest
 from gpuvision.ranging.focus_stack import FocusPeak, FocusStack, StageFocus
 from gpuvision.ranging.range_image import RangePoints
 from gpuvision.ranging.sheet_motion import StraightTransport
+from gpuvision.workflows import scan_errors
 from gpuvision.workflows.scan_errors import (
     PointSigma,
     ScanErrors,
@@ -152,8 +153,17 @@ def test_a_hundred_residuals_are_enough(rng: np.random.Generator, shape: tuple[i
     assert scatter_about_plane(z) == pytest.approx(robust_scatter(z), rel=1e-9)
     z[0, 0] = np.nan  # one residual less
     assert math.isnan(scatter_about_plane(z))
-    assert math.isnan(scatter_about_plane(z[:2]))
-    assert math.isnan(scatter_about_plane(z[:, :2]))
+    for few in (z[:2], z[:, :2], z[:1, :1], z[:0]):
+        assert math.isnan(scatter_about_plane(few))
+
+
+@pytest.mark.parametrize(("profiles", "count"), [(0, 0), (2, 0), (3, 1), (9, 7), (258, 256), (259, 256), (5000, 256)])
+def test_profiles_between_two_others_are_spread_evenly(profiles: int, count: int) -> None:
+    found = scan_errors._middles(profiles)
+    assert len(set(found)) == len(found) == count
+    if count:
+        assert (found[0], found[-1]) == (1, profiles - 2)
+        assert count == 1 or np.ptp(np.diff(found)) <= 1
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (3, 8), (8, 3), (300, 4)])
@@ -169,7 +179,8 @@ def test_share_of_the_phase_by_its_closed_form(a: float, b: float, shape: tuple[
     assert phase_scatter(position) == pytest.approx(max(shares), rel=1e-6)
     position[0, 0] = np.nan
     assert phase_scatter(position) == pytest.approx(0.0 if shape == (3, 3) else max(shares), rel=1e-6)
-    assert phase_scatter(position[:2]) == phase_scatter(position[:, :2]) == 0.0
+    for profiles, samples in ((2, 9), (9, 2), (1, 1), (0, 3)):
+        assert phase_scatter(position[:profiles, :samples]) == 0.0
 
 
 # ---- budget ----------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -248,3 +249,86 @@ def test_only_known_cpu_runtimes_prefer_vectors(device: Device, kind: str, type_
     assert Device(Handle(), kind, kind, queue=device.queue).prefers_vectors is expected
     assert not device.without_vectors().prefers_vectors
     assert device.without_vectors().context is device.context
+
+
+class PaperHandle:
+    """Handle of a device with given properties."""
+
+    def __init__(self, **properties: Any) -> None:
+        usual = {
+            "name": " A device ",
+            "driver_version": "1.5",
+            "type": cl.device_type.CPU,
+            "max_compute_units": 6,
+            "double_fp_config": 0,
+            "single_fp_config": 0,
+            "max_mem_alloc_size": 1 << 30,
+            "global_mem_cache_size": 1 << 20,
+            "svm_capabilities": cl.device_svm_capabilities.FINE_GRAIN_BUFFER,
+            "extensions": "cl_khr_fp64",
+        }
+        vars(self).update(usual | properties)
+
+
+class OldHandle(PaperHandle):
+    """Handle of OpenCL 1.2, which has no shared virtual memory."""
+
+    svm_capabilities = property(lambda self: self.fail(), lambda self, value: None)
+
+    def fail(self) -> None:
+        raise cl.RuntimeError("clGetDeviceInfo failed: INVALID_VALUE")
+
+
+def paper_device(kind: type[PaperHandle] = PaperHandle, inline_device: Any = None, **properties: Any) -> Device:
+    queue: Any = SimpleNamespace(context="a context")
+    return Device(kind(**properties), "label", "pocl", queue=queue, inline_device=inline_device)
+
+
+def test_properties_of_a_device() -> None:
+    usual = paper_device()
+    assert (usual.name, usual.driver, usual.compute_units, usual.context) == ("A device", "1.5", 6, "a context")
+    assert (usual.has_double, usual.has_denormals, usual.is_cpu, usual.takes_vectors) == (False, False, True, True)
+    assert repr(usual) == "Device(label: A device, driver 1.5)"
+    assert paper_device(double_fp_config=63).has_double
+    denorm = cl.device_fp_config.DENORM
+    for config, expected in ((denorm, True), (denorm | 6, True), (6 & ~denorm, False)):
+        assert paper_device(single_fp_config=config).has_denormals == expected
+    assert usual.max_allocation == 1 << 30
+
+
+@pytest.mark.parametrize(("cache", "expected"), [(0, 32 << 20), (33 << 20, 33 << 20), (31 << 20, 32 << 20)])
+def test_the_last_cache_has_32_mib_at_least(cache: int, expected: int) -> None:
+    assert paper_device(global_mem_cache_size=cache).cache_bytes == expected
+
+
+def test_memory_is_shared_on_a_cpu_with_fine_grained_buffers() -> None:
+    fine, coarse = (cl.device_svm_capabilities.FINE_GRAIN_BUFFER, cl.device_svm_capabilities.COARSE_GRAIN_BUFFER)
+    for capabilities, expected in ((fine, True), (fine | coarse, True), (coarse, False), (0, False)):
+        assert paper_device(svm_capabilities=capabilities).shares_memory == expected
+        assert not paper_device(svm_capabilities=capabilities, type=cl.device_type.GPU).shares_memory
+    assert not paper_device(OldHandle).shares_memory
+
+
+@pytest.mark.parametrize("extension", ["", "cl_intel_exec_by_local_thread", "cl_intel_exec_by_local_thread_more"])
+@pytest.mark.parametrize("has_inline_device", [False, True])
+def test_inline_queues(extension: str, has_inline_device: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By PoCL's second device, or by an extension of Intel's runtime, whose kernels of one group alone gain."""
+    other: Any = "the inline device"
+    device = paper_device(inline_device=other if has_inline_device else None, extensions=f"cl_khr_fp64 {extension}")
+    monkeypatch.setattr(device, "_queue", lambda handle, properties: (handle, properties))
+    is_intel = extension == "cl_intel_exec_by_local_thread"
+    assert device.has_inline_queues == (has_inline_device or is_intel)
+    like: Any = SimpleNamespace(properties=2)
+    expected = (other, 2) if has_inline_device else (device.handle, 2 | 1 << 31) if is_intel else None
+    for groups in (1, 2):
+        gains = groups == 1 or has_inline_device
+        assert device.inline_queue(like, groups=groups) == (expected if gains else None)
+    assert device.new_queue(inline=True) == (
+        (device.handle, 0) if expected is None else (expected[0], expected[1] & ~2)
+    )
+    profiling = cl.command_queue_properties.PROFILING_ENABLE
+    assert device.new_queue(profiling=True) == (device.handle, profiling)
+    queue: Any = SimpleNamespace(device=other, get_info=lambda _: [cl.command_queue_info.PROPERTIES, 1 << 31, 0])
+    plain: Any = SimpleNamespace(device=device.handle, get_info=lambda _: [cl.command_queue_info.PROPERTIES, 2, 0])
+    assert device.is_inline(queue) == (is_intel or has_inline_device)
+    assert not device.is_inline(plain)

@@ -50,7 +50,8 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
     const int mine = 1;
 #else
     local ruler_memory rulers;
-    local real shared_state[5];
+    local blob_shape shared_shape;
+    local int shared_done;
     local blob_edges shared;
     const uint first = get_group_id(0), end = first + 1;
     const int mine = get_local_id(0) == 0;
@@ -94,13 +95,9 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
             }
 #ifndef VECTOR_VARIANT
             barrier(CLK_LOCAL_MEM_FENCE);
-            if (mine) {
-                shared_state[0] = shape.x, shared_state[1] = shape.y, shared_state[2] = shape.size, shared_state[3] = shape.angle;
-                shared_state[4] = done;
-            }
+            if (mine) shared_shape = shape, shared_done = done;
             barrier(CLK_LOCAL_MEM_FENCE);
-            shape.x = shared_state[0], shape.y = shared_state[1], shape.size = shared_state[2], shape.angle = shared_state[3];
-            done = shared_state[4] != 0;
+            shape = shared_shape, done = shared_done;
 #endif
             if (done) break;
         }

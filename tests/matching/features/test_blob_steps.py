@@ -107,6 +107,12 @@ kernel void models(global const real *places, constant real *shape, global real 
     for (int k = 0; k < FREEDOMS + 1; k++) made[6 * n + 1 + k] = model.row[k];
 }
 
+kernel void hiding(global const real *places, global real *made) {
+    const size_t n = get_global_id(0);
+    const blob_hidden hidden = {{2, -5}, {1, -3}, {0, 1}, {1, 0}, 2, 3, 2};
+    made[n] = hidden_at(&hidden, places[2 * n], places[2 * n + 1]) != 0;
+}
+
 kernel void greys(global const CODE *image, global const real *given, global const real *weights, constant real *table,
                   global real *made, const int rows, const int columns, const real scale) {
     const size_t n = get_global_id(0);
@@ -519,3 +525,99 @@ def test_a_match_of_few_pixels_or_far_from_its_start_fails(
     kernel = cl.Kernel(program, "greys")
     out = run(device, kernel, 1, image.astype(np.float32), *arguments, *map(np.int32, SIZE), np.float32(0.2))
     assert out[15 + 9 + 45] == is_found
+
+
+@pytest.mark.parametrize("off", [0.092, 0.108])
+@pytest.mark.parametrize("unknown", range(5))
+def test_a_match_ends_with_the_first_small_step(
+    device: Device, unknown: int, off: float, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    """A step of less than 0.05 blurs is the last one, whether it is of x, y, size, angle or blur."""
+    program, table = prepared(device, tmp_path, "cross")
+    rows, columns = np.indices(SIZE).astype(np.float64)
+    numbers, background, contrast, noise = np.array([0.4, -0.3, 9.0, 0.3, 2.0]), 50.0, 80.0, 3.0
+    dx, dy = columns - 36.0, rows - 30.0
+    image = (background + contrast * level_of("cross", dx, dy, numbers)).astype(np.float32)
+    start = numbers.copy()
+    start[unknown] += off / (9.0 if unknown == 3 else 1.0)
+    scale, reach = (0.1 + 4.0 * noise / contrast) / 6.0, start[2] + 5.0 * start[4] + 2.0
+    given = [36.0, 30.0, *start[:4], background, contrast, start[4], 0.0, 0.0, reach, 0.0, noise]
+    arguments = (np.array(given, np.float32), np.ones(PADDED, np.float32), table, np.zeros(128, np.float32))
+    out = run(device, cl.Kernel(program, "greys"), 1, image, *arguments, *map(np.int32, SIZE), np.float32(scale))
+    unknowns = 9
+    matrix = np.zeros((unknowns, unknowns))
+    matrix[np.tril_indices(unknowns)] = out[15 + unknowns : 15 + unknowns + 45]
+    step = np.linalg.solve(matrix + np.tril(matrix, -1).T, out[15 : 15 + unknowns])[:5]
+    found = out[15 + unknowns + 45 + 1 :]
+    found = np.array([*found[:4], found[6]])
+    is_last = np.linalg.norm(step * [1.0, 1.0, 1.0, 9.0, 1.0]) < 0.05 * (start[4] + step[4])
+    assert is_last == (off < 0.1)
+    further = np.abs(found - start - step).max()
+    assert further < 1e-5 if is_last else further > 5e-4
+
+
+def gravity(image: Reals, x: float, y: float, reach: float) -> Reals:
+    """Return the centroid of the levels over the mean level of a ring of 2 px, relative to (x, y)."""
+    rows, columns = np.indices(image.shape)
+    dx, dy = columns - x, rows - y
+    square = dx**2 + dy**2
+    disc, ring = square <= reach**2, (square > reach**2) & (square <= (reach + 2.0) ** 2)
+    level = image[disc] - image[ring].mean()
+    return np.array([level @ dx[disc], level @ dy[disc]]) / level.sum()
+
+
+def test_centroids(device: Device, rng: np.random.Generator, tmp_path: Path) -> None:
+    """Pixels at the limits of disc and ring belong to them; no other pixel matters, and the ring is in the image."""
+    program, table = prepared(device, tmp_path, "square")
+    kernel = cl.Kernel(program, "greys")
+    rows, columns = np.indices(SIZE)
+    last_x, last_y = SIZE[1] - 1, SIZE[0] - 1
+    off = 1.0 / 64.0
+    cases = {
+        (30.0, 27.0, 5.0): 1,
+        (31.25, 40.75, 6.0): 1,
+        (7.0, 20.0, 5.0): 1,
+        (7.0 - off, 20.0, 5.0): 0,
+        (20.0, 7.0, 5.0): 1,
+        (20.0, 7.0 - off, 5.0): 0,
+        (last_x - 7.0, 20.0, 5.0): 1,
+        (last_x - 7.0 + off, 20.0, 5.0): 0,
+        (20.0, last_y - 7.0, 5.0): 1,
+        (20.0, last_y - 7.0 + off, 5.0): 0,
+    }
+    for (x, y, reach), is_inside in cases.items():
+        image = rng.uniform(0.0, 90.0, SIZE) + 60.0 * (np.hypot(columns - x - 0.5, rows - y) < 3.0)
+        image[np.hypot(columns - x, rows - y) > reach + 2.0] = np.nan
+        image = image.astype(np.float32)
+        given = [x, y, 0.0, 0.0, 9.0, 0.0, 50.0, 80.0, 1.2, 0.0, 0.0, reach, 0.0, 3.0]
+        arguments = (np.array(given, np.float32), np.ones(PADDED, np.float32), table, np.zeros(128, np.float32))
+        out = run(device, kernel, 1, image, *arguments, *map(np.int32, SIZE), np.float32(0.2))
+        assert out[1] == is_inside
+        if is_inside:
+            np.testing.assert_allclose(out[2:4], gravity(image.astype(np.float64), x, y, reach), rtol=1e-4, atol=1e-4)
+
+
+def test_a_centroid_outside_of_the_disc_is_none(device: Device, tmp_path: Path) -> None:
+    program, table = prepared(device, tmp_path, "square")
+    rows, columns = np.indices(SIZE).astype(np.float64)
+    for to_x, to_y in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+        for slope, is_found in ((0.5, 1), (1.5, 0)):
+            # The mean square of a coordinate in a disc is a quarter of the square of its radius.
+            plane = slope * 4.0 / 5.0 * (to_x * (columns - 30.0) + to_y * (rows - 28.0))
+            image = np.where(np.hypot(columns - 30.0, rows - 28.0) <= 5.0, 80.0 * (1.0 + plane), 0.0)
+            given = [30.0, 28.0, 0.0, 0.0, 9.0, 0.0, 50.0, 80.0, 1.2, 0.0, 0.0, 5.0, 0.0, 3.0]
+            arguments = (np.array(given, np.float32), np.ones(PADDED, np.float32), table, np.zeros(128, np.float32))
+            kernel = cl.Kernel(program, "greys")
+            out = run(device, kernel, 1, image.astype(np.float32), *arguments, *map(np.int32, SIZE), np.float32(0.2))
+            assert out[1] == is_found
+
+
+def test_hidden_parts_of_the_contour(device: Device, tmp_path: Path) -> None:
+    """Two rectangles across and along x; their border is not hidden."""
+    program, _ = prepared(device, tmp_path, "square")
+    places = np.stack(np.meshgrid(np.arange(-9.0, 10.0), np.arange(-9.0, 10.0)), axis=-1).reshape(-1, 2)
+    x, y = places.T
+    arguments = (places.astype(np.float32), np.zeros(len(places), np.float32))
+    made = run(device, cl.Kernel(program, "hiding"), len(places), *arguments)
+    one, other = (np.abs(y - 1.0) < 3.0) & (np.abs(x - 2.0) < 2.0), (np.abs(x + 5.0) < 3.0) & (np.abs(y + 3.0) < 2.0)
+    np.testing.assert_array_equal(made, one | other)

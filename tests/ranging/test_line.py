@@ -512,7 +512,7 @@ def test_least_total_on_a_device_without_denormal_numbers(device, along, variant
     without.has_denormals = False
     # Two samples of half the total: both levels are exact.
     least = 64 * 2.0**23 * float(np.finfo(np.float32).tiny)
-    readout = LineReadout(method="centroid", along=along, variant=variant, outputs=("total", "status"))
+    readout = LineReadout(method="centroid", along=along, variant=variant)
     for total, status in ((least, 0), (least * (1.0 - 2.0**-22), LOW_SIGNAL), (least * (1.0 + 2.0**-22), 0)):
         frame = column(*[0.0] * 20, total / 2, total / 2, *[0.0] * 42, dtype=np.float32)
         reading = readout(frame if along == "columns" else np.ascontiguousarray(frame.T), device=without)

@@ -294,7 +294,7 @@ def test_missing_rows_are_as_if_they_were_not_there(device: Device, rng: np.rand
 @pytest.mark.double
 def test_fitted_lines_carry_their_angle(device: Device, rng: np.random.Generator) -> None:
     """Poses from fitted lines agree with poses from the edges of the lines."""
-    lines, each = 12, 20
+    lines, each = 12, 10
     angle = np.arange(lines) * np.pi / lines
     normal = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
     along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -432,3 +432,45 @@ def test_real_chessboards(data: Path) -> None:
     assert len(done.detected_targets) == len(files) == 13
     # OpenCV's corners and calibration with the same model: 0.4183 px.
     assert done.fit.rms_px < 0.4183
+
+
+# ---- too few data ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("change", ["none", "points", "coverage"])
+def test_few_points_or_a_small_part_of_the_image_do_not_tell(change: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    least = calibrating._MIN_POINTS
+    targets: list[Any] = [SimpleNamespace(points=least - 7), SimpleNamespace(points=7 - (change == "points"))]
+    coverage = calibrating._MIN_COVERAGE - (1e-3 if change == "coverage" else 0.0)
+    monkeypatch.setattr(calibrating, "image_coverage", lambda *_: coverage)
+    if change == "none":
+        calibrating._check_enough_to_judge(targets, (64, 48), "dots")
+        return
+    count = least - (change == "points")
+    message = f"dots found in 2 images: {count} points over {100 * coverage:.0f} % of the image, too few to tell"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        calibrating._check_enough_to_judge(targets, (64, 48), "dots")
+
+
+def test_a_target_of_lines_has_no_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = SimpleNamespace(points="points")
+    monkeypatch.setattr(calibrating, "find_lines", lambda image: ("lines of", image))
+    monkeypatch.setattr(calibrating, "find_dots", lambda image: found)
+    monkeypatch.setattr(calibrating, "find_chessboard", lambda image, corners: found if corners == (9, 6) else None)
+    monkeypatch.setattr(calibrating, "grid_lines", lambda points: ("lines through", points))
+    image: Any = "an image"
+    expected = {
+        "lines": (None, ("lines of", "an image")),
+        "dots": ("points", ("lines through", "points")),
+        "chessboard": ("points", ("lines through", "points")),
+    }
+    for pattern, (grid, families) in expected.items():
+        target: Any = calibrating._detect(Path("a.png"), image, pattern, (9, 6))  # type: ignore[arg-type]
+        assert (target.image, target.grid, target.families) == (Path("a.png"), grid, families)
+
+
+def test_a_calibration_without_a_model_is_not_written(tmp_path: Path) -> None:
+    straight: Any = SimpleNamespace(model=None)
+    with pytest.raises(ValueError, match="the lines are straight without a lens; no correction is needed, nothing was"):
+        write_calibration(straight, tmp_path / "lens.toml")
+    assert list(tmp_path.iterdir()) == []

@@ -97,6 +97,21 @@ def test_readings_behind_the_camera_have_no_weight(rng: np.random.Generator) -> 
     np.testing.assert_array_equal(found.weight, np.repeat([1.0, 0.0], 16))
 
 
+def test_readings_next_to_the_fold_of_the_lens_have_no_weight(rng: np.random.Generator) -> None:
+    """They have a ray, but half a pixel across the line on there is none: no derivative."""
+    camera = replace(CAMERA, distortion=(-0.5, *(0.0,) * 13))
+    rows = np.arange(240.0, 2000.0, 0.1)
+    known = np.isfinite(camera.rays(np.stack([np.full_like(rows, 320.0), rows], axis=1))).all(axis=1)
+    last = rows[known].max()
+    assert not known.all()
+    pixels = rng.uniform([100.0, 80.0], [500.0, 300.0], (18, 2))
+    pixels[:3] = [[320.0, last - 0.3], [320.0, last - 0.7], [320.0, last + 1.0]]
+    one, two = target((0.2, 0.0, 0.0), (0.0, 0.0, 0.5)), target((0.2, 0.1, 0.0), (0.0, 0.0, 0.4))
+    found = triangulate(camera, [LaserLine(pixels, one), LaserLine(pixels, two)], "columns", (), DEFAULT_LIMITS)
+    np.testing.assert_array_equal(found.weight[:18], [0.0, 1.0, 0.0, *[1.0] * 15])
+    assert np.isfinite(found.ray[0]).all()
+
+
 def test_one_target_needs_steps(rng: np.random.Generator) -> None:
     pixels = rng.uniform([100.0, 80.0], [500.0, 400.0], (16, 2))
     plane = target((0.2, 0.0, 0.0), (0.0, 0.0, 0.5))

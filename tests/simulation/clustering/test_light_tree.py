@@ -120,6 +120,17 @@ def test_every_node_has_the_numbers_of_its_segments(spread: float, rng: np.rando
     assert (wide > 0) == (spread > 1.0)
 
 
+def test_a_representative_has_a_length_where_all_light_is_in_one_place() -> None:
+    """A thousandth of the reach, to a segment without light: the exitance stays finite, and the power is kept."""
+    short = [0.0, 0.0, 0.0, 1e-9, 0.0, 0.0, 0.0, 0.0, 1.0, 5.0]
+    dark = [0.4, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    tree = LightTree.build(np.array([short, dark]))
+    start, end, normal, exitance = np.split(tree.representatives[1], [3, 6, 9])
+    assert np.linalg.norm(end - start) == pytest.approx(1e-3, rel=1e-6)
+    assert exitance[0] * np.linalg.norm(end - start) == pytest.approx(5e-9, rel=1e-9)
+    np.testing.assert_allclose(normal, [0.0, 0.0, 1.0])
+
+
 def test_nodes_are_halved_along_the_widest_axis(rng: np.random.Generator) -> None:
     """By number, and by the order along one of the midpoint's axes, or of the normal's, times half of the extent."""
     table = segments(rng, 13, 1.0)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
+import importlib.metadata
 import os
 import tempfile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import pytest
 
@@ -161,3 +163,49 @@ def test_workers_of_a_restricted_process_are_not_pinned(cores: None, monkeypatch
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {2, 3})
     runtime.pin_workers()
     assert "POCL_AFFINITY" not in os.environ
+
+
+@pytest.mark.parametrize("missing", [None, "intel-opencl-rt", "intel-cmplr-lib-rt", "driver"])
+def test_libraries_of_the_wheels_by_name(missing: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The driver and the libraries that it finds by name only, of both wheels; nothing without one of these."""
+
+    class Packaged(PurePosixPath):
+        def locate(self) -> Path:
+            return Path("/site") / self
+
+    content = {
+        "intel-opencl-rt": ["lib/cl.cfg", "lib/libintelocl.so", "lib/zz.so", "lib/libintelocl.so.2"],
+        "intel-cmplr-lib-rt": [
+            "lib/libirng.so",
+            "lib/libimf.so",
+            "lib/libsvml.so",
+            "lib/libintlc.so.5",
+            "lib/libiomp5.so",
+        ],
+    }
+
+    def files(wheel: str) -> list[Packaged]:
+        if wheel == missing:
+            raise importlib.metadata.PackageNotFoundError(wheel)
+        return [Packaged(name) for name in content[wheel] if not (missing == "driver" and name.endswith("ocl.so"))]
+
+    monkeypatch.setattr(importlib.metadata, "files", files)
+    names = ["libintelocl.so", "libirng.so", "libimf.so", "libsvml.so", "libintlc.so.5"]
+    expected = {} if missing else {name: Path("/site/lib", name) for name in names}
+    assert runtime._wheel_libraries() == expected
+
+
+def test_libraries_are_loaded_for_the_whole_process_in_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: list[tuple[str, int]] = []
+    monkeypatch.setattr(ctypes, "CDLL", lambda name, mode: loaded.append((name, mode)))
+    libraries = {name: Path("/lib", name) for name in ("libimf.so", "libintlc.so.5", "libintelocl.so", "libsvml.so")}
+    assert runtime._load_siblings(libraries)
+    assert loaded == [(f"/lib/{name}", ctypes.RTLD_GLOBAL) for name in ("libintlc.so.5", "libimf.so", "libsvml.so")]
+
+
+def test_entries_that_cannot_be_read_are_left_out(tmp_path: Path) -> None:
+    (tmp_path / "a.icd").write_text("liba.so")
+    (tmp_path / "b.txt").write_text("libb.so")
+    (tmp_path / "c.icd").mkdir()
+    assert runtime._entries(tmp_path) == {"a.icd": "liba.so"}
+    assert runtime._entries(tmp_path / "none") == {}

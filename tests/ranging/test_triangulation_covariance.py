@@ -12,6 +12,7 @@ import pytest
 
 from gpuvision.camera.lens import Lens
 from gpuvision.ranging import homography
+from gpuvision.ranging.homography_fit import fit_models
 from gpuvision.ranging.triangulation import Triangulation
 
 # Neither square nor about 0.
@@ -64,6 +65,27 @@ def test_covariance_of_the_parameters_is_that_of_least_squares(model: Any, is_kn
     scale = np.maximum(spread, 1e-9 * spread.max())
     difference = (np.array(fitted.covariance) - expected) / np.outer(scale, scale)
     assert np.abs(difference).max() < (1e-5 if is_known else 0.02)
+
+
+def test_covariance_of_a_single_beam_is_by_u_alone() -> None:
+    """The three constants of H over u; v has no residual, whatever its sigma is."""
+    constants, heights = (2.0, 1e-3, 40.0), np.linspace(-0.004, 0.006, 11)
+    sheet = np.stack([np.full(11, 0.003), heights], axis=1)
+
+    def seen(values: np.ndarray) -> np.ndarray:
+        return np.asarray(made(values).to_sensor(sheet)[:, 0])
+
+    measured = np.stack([seen(np.array(constants)), np.full(11, 4e-4)], axis=1)
+    fitted = Triangulation.fit(measured, sheet, sigma=SIGMA, model="C3", region=REGION)
+    by_constants = derivative(seen, constants) / SIGMA[0]
+    to_parameters = derivative(lambda c: made(c).conditioned(), constants)
+    expected = to_parameters @ np.linalg.inv(by_constants.T @ by_constants) @ to_parameters.T
+    np.testing.assert_allclose(np.array(fitted.covariance)[3:5, 3:5], expected[3:5, 3:5], rtol=1e-5)
+    np.testing.assert_allclose(np.array(fitted.covariance)[6, 6], expected[6, 6], rtol=1e-5)
+    (fit,) = fit_models(measured + [[2e-6, 0.0]] * np.array([[1.0], [-1.0]] * 5 + [[0.0]]), sheet, sigma=SIGMA)
+    assert fit.model == "C3"
+    assert fit.degrees_of_freedom == 8
+    assert 0.8 < fit.rms < 1.0  # ten of eleven readings are off by one sigma of u
 
 
 def on_sheet(operation: Triangulation, point: np.ndarray) -> np.ndarray:

@@ -28,7 +28,7 @@ from sensor_views import sensor_view
 TRANSPORT = 2e-3
 LENSES = {
     "none": None,
-    "barrel": Lens(k1=-4e3, k2=2e7, centre=(4e-4, -3e-4)),
+    "barrel": Lens(k1=-6e3, centre=(4e-4, -3e-4)),  # folds at 7.5 mm, the image of 5 mm
     "pincushion": Lens(k1=3e3, centre=(-5e-4, 2e-4)),
 }
 

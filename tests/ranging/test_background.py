@@ -88,6 +88,59 @@ def test_pairs_become_one_frame_each(light_first: bool, count: int) -> None:
     np.testing.assert_array_equal(found, np.reshape(wanted, (-1, 7, 11)))
 
 
+class Unknowing(ArraySource):
+    """Source that does not know its end, and gives one frame in each read."""
+
+    stopped = closed = False
+
+    def wait(self) -> bool:
+        return True
+
+    def read_into(self, out: Any, arrived: Any) -> int:
+        return super().read_into(out[:1], arrived[:1]) if self._next < self.length else 0
+
+    def stop(self) -> None:
+        self.stopped = True
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_sources_end_where_a_read_gives_no_frame() -> None:
+    """Frames come one by one, also the two of a pair and those of a group; the wrapped source is stopped and closed."""
+    frames = frames_of(5, np.uint8)
+    previous, pairs = PreviousSubtracted(Unknowing(frames)), PairsSubtracted(Unknowing(frames))
+    subtracted = ImageSubtracted(Unknowing(frames), np.zeros_like(frames[0]))
+    np.testing.assert_array_equal(read(subtracted), frames)
+    found = read(previous)
+    np.testing.assert_array_equal(found[1:], [expected(frames[k], frames[k - 1]) for k in range(1, 5)])
+    assert len(found) == 5
+    out, arrived = np.full((2, 7, 11), CANARY, np.uint8), np.zeros(2, np.int64)
+    assert previous.read_into(out, arrived) == subtracted.read_into(out, arrived) == 0
+    assert np.all(out == CANARY)
+    assert pairs.wait()
+    assert len(read(pairs)) == 2
+    assert not pairs.wait()
+    sample = sample_frames(Unknowing(frames), group=2)
+    np.testing.assert_array_equal(sample.frames.reshape(4, 7, 11), frames[:4])
+    np.testing.assert_array_equal(sample.numbers, [0, 2])
+    for source in (previous, pairs, subtracted):
+        source.stop()
+        source.close()
+        assert source._source.stopped
+        assert source._source.closed
+
+
+def test_lengths_and_rates_of_unknown_sources_are_unknown() -> None:
+    source = ArraySource(frames_of(5, np.uint8))
+    source.length, source.rate = None, None
+    pairs = PairsSubtracted(source)
+    assert (pairs.length, pairs.rate) == (None, None)
+    source.length, source.rate = 5, 30.0
+    previous = PreviousSubtracted(source)
+    assert (previous.length, previous.rate, previous.shape, previous.dtype) == (5, 30.0, (7, 11), np.uint8)
+
+
 def test_a_pair_arrives_with_its_second_frame() -> None:
     times = iter(range(100, 200))
     source = PairsSubtracted(ArraySource(frames_of(6, np.uint8), clock=lambda: next(times)))

@@ -20,6 +20,7 @@ from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
 from gpuvision.simulation.transport.mirror_surfaces import MirrorLimits, MirrorSurfaces
 from gpuvision.simulation.transport.mirrors import Mirrors
+from gpuvision.simulation.transport.plane_mirrors import triangle_planes
 from mirror_scenes import mirrors_of, quad, sensor_view
 
 ALBEDO, SHARE = 0.5, 0.8
@@ -251,6 +252,27 @@ def test_a_curved_mirror_in_steps_converges_to_the_second_order(device: Device) 
     ]
     assert abs(totals[0] - totals[2]) / abs(totals[1] - totals[2]) > 3.0
     assert abs(totals[1] / totals[2] - 1.0) < 1e-3
+
+
+@pytest.mark.double
+def test_a_mirror_with_leaning_normals_is_as_a_plane_one(device: Device) -> None:
+    """Lines whose ends are within samples: each step of the curved mirror's line has its place and its length."""
+    sensor, scene = sensor_view(12, 24), before_a_wall(0.004)
+    normals = np.repeat(triangle_planes(scene.corners)[:, None, :3], 3, axis=1)
+    normals[:, 0, 0] += 1.5e-6
+    lit = sheet(g_limits=(-0.0131, 0.0043)).illuminate(scene, 0.0)
+    flat, curved = (
+        mirrors_of(scene, MATERIALS, device, view=sensor, normals=each).mirrored_exposure(lit, 0.0)
+        for each in (None, normals)
+    )
+    total = flat.total()
+    assert np.count_nonzero(total) < 12
+    # Steps of half a sample: the power along a step varies by its square.
+    np.testing.assert_allclose(curved.total(), total, rtol=2e-4, atol=1e-4 * total.max())
+    scale = np.abs(flat.first_moment(sensor.u_edges)).max()
+    np.testing.assert_allclose(
+        curved.first_moment(sensor.u_edges), flat.first_moment(sensor.u_edges), atol=2e-4 * scale
+    )
 
 
 def test_a_hollow_mirror_does_not_hide_itself(device: Device) -> None:

@@ -368,9 +368,10 @@ with Trace({str(tmp_path / "t.json")!r}):
 def test_spans_of_a_thread_that_cross_go_to_further_parts() -> None:
     """A span that begins where another one ends follows it; of two that begin together the longer one contains."""
     times = {"a": (0, 10), "b": (5, 15), "c": (6, 9), "d": (10, 12), "e": (11, 20), "f": (30, 40), "g": (30, 50)}
+    times["h"] = (7, 10)  # within "a", but it crosses "c"
     spans = [trace_module._Span("lane", name, *each, {}) for name, each in times.items()]
     parts = [[each.name for each in part] for part in trace_module._nested_parts(spans[::-1])]
-    assert parts == [["a", "c", "d", "g", "f"], ["b"], ["e"]]
+    assert parts == [["a", "c", "d", "g", "f"], ["b", "h"], ["e"]]
     assert trace_module._nested_parts([]) == [[]]
 
 

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pyopencl as cl
@@ -315,3 +316,57 @@ def test_probe_in_its_own_process(device: Device, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     (listed,) = [each for each in discovery.listed_devices() if each.label == device.label]
     assert discovery._ask_probe(listed.platform_index, listed.device_index) == ""
+
+
+@pytest.mark.parametrize(
+    ("until", "is_kept"), [(1001, True), (1000, False), (999, False), (4601, True), (4602, False), (1000 + 3600, True)]
+)
+def test_a_verdict_of_an_hour_ends_between_now_and_then(
+    until: int, is_kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 1000 s; a later end comes from a clock that was set back."""
+    monkeypatch.setattr(discovery.time, "time", lambda: 1000.0)
+    assert discovery._parsed(["hangs", until]) == (("hangs", until) if is_kept else None)
+    assert discovery._parsed("broken") == ("broken", None)
+    for damaged in (["hangs"], ["hangs", until, 1], [until, "hangs"], 7, None, {"a": 1}):
+        assert discovery._parsed(damaged) is None
+
+
+def listed(kind: str, **properties: Any) -> Any:
+    """Return a device with the properties that its rank depends on."""
+    usual = {"type": cl.device_type.GPU, "host_unified_memory": 0, "max_compute_units": 8, "global_mem_size": 1 << 30}
+    handle = SimpleNamespace(**(usual | properties))
+    return discovery.ProbedDevice("label", kind, 3, 5, handle, "key", None, reason="")
+
+
+def test_rank_of_a_device() -> None:
+    cpu = {"type": cl.device_type.CPU}
+    memory = -(1 << 30)
+    assert listed("nvidia").rank == (False, False, 2, False, -8, memory, 3, 5)
+    assert listed("pocl-gpu").rank == (False, True, 2, False, -8, memory, 3, 5)
+    assert listed("rusticl", host_unified_memory=1).rank == (False, True, 2, True, -8, memory, 3, 5)
+    assert listed("pocl", **cpu, host_unified_memory=1).rank == (True, False, 0, False, -8, memory, 3, 5)
+    assert listed("intel", **cpu).rank == (True, False, 1, False, -8, memory, 3, 5)
+    assert listed("rusticl", **cpu, max_compute_units=4).rank == (True, False, 2, False, -4, memory, 3, 5)
+    assert listed("oclgrind", **cpu).rank == (True, False, 4, False, -8, memory, 3, 5)
+
+
+def test_reasons_have_at_most_500_characters_in_a_line() -> None:
+    assert discovery._one_line("a\tb\n c") == "a b c"
+    assert discovery._one_line("x" * 501) == "x" * 500
+
+
+@pytest.mark.parametrize(
+    ("names", "inline"),
+    [
+        (["pthread-epyc", "basic-epyc"], 1),
+        (["basic-epyc", "pthread-epyc", "basic-2"], 0),
+        (["basic-epyc"], None),
+        (["cpu-pthread-x", "basic-epyc"], None),
+        (["pthread-epyc", "other-basic-epyc"], None),
+        ([], None),
+    ],
+)
+def test_the_inline_device_stands_beside_one_with_workers(names: list[str], inline: int | None) -> None:
+    devices = [FakeDevice(name) for name in names]
+    assert discovery._inline_device(devices) is (None if inline is None else devices[inline])

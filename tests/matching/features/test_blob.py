@@ -466,3 +466,53 @@ def test_numbers_of_the_kernel_follow_from_the_shape(shape: Any, ratio: float, w
     least = replace(blobs, min_inlier_fraction=0.01).launch(Device.best(), (64, 64), np.dtype(np.float32))
     assert int(launch.arguments[-7]) == 12
     assert int(least.arguments[-7]) == (5 if shape in ("square", "cross") else 4)
+
+
+@pytest.mark.parametrize("spokes", [16, 24, 40])
+def test_rulers_lie_evenly_on_the_contour(spokes: int) -> None:
+    """Places, normals, heights and weights; one half first, then the opposite rulers; the table ends with weights 0."""
+
+    def rulers(shape: Any, ratio: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+        blobs = FindBlobs(threshold=20.0, shape=shape, ratio=ratio, spokes=spokes, count=2)
+        table = np.array(blobs.launch(Device.best(), (64, 64), np.dtype(np.float32)).arguments[1], np.float64)
+        assert table.shape == (6, 16 * math.ceil(spokes / 16))
+        assert not table[5, spokes:].any()
+        assert np.all(table[5, :spokes] == 1.0)
+        base, normal, height = table[:2, :spokes].T, table[2:4, :spokes].T, table[4, :spokes]
+        np.testing.assert_allclose(height, np.abs(np.sum(base * normal, axis=1)), atol=1e-6)
+        np.testing.assert_array_equal(base[spokes // 2 :], -base[: spokes // 2])
+        np.testing.assert_array_equal(normal[spokes // 2 :], -normal[: spokes // 2])
+        return base, normal
+
+    def angles(places: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sort(np.degrees(np.arctan2(places[:, 1], places[:, 0])) % 359.99999))
+
+    base, normal = rulers("circle")
+    np.testing.assert_allclose(angles(base), np.arange(spokes) * 360.0 / spokes, atol=2e-5)
+    np.testing.assert_array_equal(base, normal)
+    base, normal = rulers("ring", 0.25)
+    is_outer = np.hypot(*base.T) > 0.6
+    np.testing.assert_allclose(np.hypot(*base.T), np.where(is_outer, 1.0, 0.25), rtol=1e-6)
+    np.testing.assert_allclose(normal, np.where(is_outer[:, None], base, -4.0 * base), atol=1e-6)
+    step = 720.0 / spokes
+    np.testing.assert_allclose(angles(base[is_outer]), np.arange(spokes // 2) * step, atol=2e-5)
+    np.testing.assert_allclose(angles(base[~is_outer]), (np.arange(spokes // 2) + 0.5) * step, atol=2e-5)
+    base, normal = rulers("square")
+    side = normal[:, 0] > 0.5
+    along = (2.0 * np.arange(spokes // 4) + 1.0) / (spokes // 4) - 1.0
+    np.testing.assert_allclose(base[side], [(1.0, 0.7 * each) for each in along], rtol=1e-6)
+    is_top = normal[:, 1] > 0.5
+    np.testing.assert_allclose(base[is_top], [(-0.7 * each, 1.0) for each in along], rtol=1e-6)
+    base, normal = rulers("cross", 0.3)
+    # Of the arm along x: 3/8 of the rulers on each flank, in the middle half of it; the others on half of the end.
+    flank = {16: 2, 24: 2, 40: 4}[spokes]
+    end = spokes // 4 - 2 * flank
+    first, normals = base[: spokes // 4], normal[: spokes // 4]
+    np.testing.assert_array_equal(normals, [(1.0, 0.0)] * end + [(0.0, 1.0)] * flank + [(0.0, -1.0)] * flank)
+    out = 0.65 + 0.175 * ((2.0 * np.arange(flank) + 1.0) / flank - 1.0)
+    across = 0.15 * ((2.0 * np.arange(end) + 1.0) / max(end, 1) - 1.0)
+    expected = [(1.0, each) for each in across] + [(each, side * 0.3) for side in (1.0, -1.0) for each in out]
+    np.testing.assert_allclose(first, expected, rtol=1e-6, atol=1e-7)
+    turned = np.array([[0.0, -1.0], [1.0, 0.0]])
+    np.testing.assert_allclose(base[spokes // 4 : spokes // 2], first @ turned.T, atol=1e-7)
+    np.testing.assert_allclose(normal[spokes // 4 : spokes // 2], normals @ turned.T, atol=1e-7)

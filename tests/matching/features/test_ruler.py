@@ -23,6 +23,7 @@ from gpuvision.host.kept import clear_cache
 from gpuvision.matching.features.ruler import RulerEdges, best_smoothing
 from gpuvision.reference import ruler as reference
 from gpuvision.status import Status
+from tiers import variants_of
 
 SHAPE, MIDDLE = (120, 150), (75.0, 60.0)
 VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
@@ -601,3 +602,59 @@ def test_integer_frames_have_the_noise_of_rounding() -> None:
         assert (one is None) == (other is None)
         if one is not None:
             np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+def test_kinds_of_rulers_in_every_direction(device: Device) -> None:
+    """Polarity and spacing are of the ruler, not of its direction; a ruler without a polarity has no edges."""
+    rows, columns = np.indices(SHAPE)
+    image = (60.0 + 100.0 * (np.hypot(columns - MIDDLE[0], rows - MIDDLE[1]) < 10.25)).astype(np.float32)
+    image = cv2.GaussianBlur(image, (0, 0), 1.1)
+    rulers, expected_edges = [], []
+    for angle in np.pi / 8.0 + np.pi / 4.0 * np.arange(8):
+        way = np.array([math.cos(angle), math.sin(angle)])
+        for polarity, nearest, farthest, off, has_edge in (
+            (-1.0, 0.0, 0.0, 30.0, True),
+            (1.0, 0.0, 0.0, 30.0, False),
+            (1.0, 0.0, 0.0, -30.0, True),
+            (0.0, 0.0, 0.0, 30.0, False),
+            (np.nan, 0.0, 0.0, 30.0, False),
+            (1.0, 18.0, 23.0, 0.0, True),
+            (-1.0, 18.0, 23.0, 0.0, False),
+            (1.0, 1.0, 18.0, 0.0, False),
+            (1.0, 23.0, 30.0, 0.0, False),
+        ):
+            rulers.append([*(np.array(MIDDLE) + off * way), *way, polarity, nearest, farthest])
+            expected_edges.append(has_edge)
+    given, there = np.array(rulers, np.float32), np.array(expected_edges)
+    single = there & (given[:, 6] == 0.0)
+    for variant in variants_of(device):
+        found = replace(STRONGEST, per_ruler=True, variant=variant)(image, given, device=device)
+        np.testing.assert_array_equal(found.status == 0, there)
+        np.testing.assert_allclose(found.position[single], np.tile([-20.0, 20.0], 8), rtol=0, atol=0.3)
+        np.testing.assert_allclose(found.spacing[there & ~single], 20.5, rtol=0, atol=0.5)
+        assert np.isnan(found.position[~there]).all()
+
+
+def test_rulers_to_the_last_pixel(device: Device) -> None:
+    """Rulers along and up to the borders of the image have their edges; nothing beyond the last column is read."""
+    length, half, last_x, last_y = 41, 20.0, SHAPE[1] - 1.0, SHAPE[0] - 1.0
+    rows, columns = np.indices(SHAPE)
+    bright = np.where((np.abs(rows - 60.0) < 50.0) & (np.abs(columns - 75.0) < 65.0), 160.0, 60.0)
+    image = cv2.GaussianBlur(bright, (0, 0), 1.1).astype(np.float32)
+    beside = np.where(rows < 100, 160.0, 60.0)
+    beside = cv2.GaussianBlur(beside, (0, 0), 1.1).astype(np.float32)
+    beside[:, 0] = np.nan
+    ends = [[last_x - half, 60, 1, 0], [half, 60, 1, 0], [75, last_y - half, 0, 1], [75, half, 0, 1]]
+    ends += [[last_x - half, 60, -1, 0], [half, 60, -1, 0], [75, last_y - half, 0, -1], [75, half, 0, -1]]
+    outward = np.tile([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], (2, 1))
+    along = np.array([[last_x, 99, 0, 1], [last_x, 99, 0, -1]], np.float32)
+    for variant in variants_of(device):
+        plain = replace(STRONGEST, length=length, width=1, variant=variant)
+        through_lens = replace(plain, model=Lens(k1=-1e-20, centre=(75.0, 60.0)))
+        # Places in the distorted image have rounding errors.
+        for operation, margin in ((plain, 0.0), (through_lens, 1e-3)):
+            for off, status in ((-margin, 0), (0.5, Status.OUT_OF_RANGE)):
+                places = ends + np.column_stack([off * outward, np.zeros((8, 2))])
+                result = operation(image, places.astype(np.float32), device=device)
+                np.testing.assert_array_equal(result.status, status)
+        np.testing.assert_array_equal(plain(beside, along, device=device).status, 0)

@@ -303,6 +303,25 @@ def test_against_opencv(device: Device, border: str, kernel: tuple[Any, Any], rn
     np.testing.assert_allclose(ours.astype(np.float64), theirs, rtol=0, atol=atol)
 
 
+@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("shape", [(1, 7), (7, 1), (1, 1), (2, 3)])
+def test_small_images_are_reflected(
+    device: Device, shape: tuple[int, int], interpolation: Any, rng: np.random.Generator
+) -> None:
+    """Also an image of one row or one column; whole places have the pixels themselves."""
+    image = rng.uniform(0.0, 1.0, shape).astype(np.float32)
+    rows, columns = np.meshgrid(np.arange(-3, 11), np.arange(-5, 9), indexing="ij")
+    positions = np.stack([columns, rows], axis=-1).astype(np.float32)
+
+    def reflected(places: np.ndarray, size: int) -> np.ndarray:
+        return np.pad(np.arange(size), (16, 16), mode="reflect")[places + 16]
+
+    expected = image[reflected(rows, shape[0]), reflected(columns, shape[1])]
+    for variant in variants_of(device):
+        op = UndistortImage(model=positions, interpolation=interpolation, border="reflect", variant=variant)
+        np.testing.assert_allclose(op(image, device=device).image, expected, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("border", BORDERS)
 def test_places_that_are_none_or_far_away(device: Device, border: Any, variant: Any, rng: np.random.Generator) -> None:

@@ -216,3 +216,48 @@ def test_a_failed_test_leaves_its_arrays(folder: Path, tmp_path: Path) -> None:
     with np.load(path) as stored:
         np.testing.assert_array_equal(stored["expected"], [1, 2, 3])
         assert sorted(stored.files) == ["expected", "values"]
+
+
+def test_a_missing_header_hides_no_other_one(tmp_path: Path) -> None:
+    """Lines keep their numbers behind each header; a header is looked for beside the including header first."""
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "more").mkdir()
+    files = {
+        "a.cl": '#include "none.h"\n  #  include "sub/b.h" // b\nint a;\n#include "c.h"\n\n',
+        "sub/b.h": 'int b;\n#include "d.h"\n',
+        "sub/d.h": "int beside;\n",
+        "d.h": "int above;\n",
+        "more/c.h": '#include "d.h"\nint c;\n\n\n',
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    assert debug.flatten_includes(tmp_path, "a.cl", [tmp_path / "more"]) == (
+        '#line 1 "a.cl"\n#include "none.h"\n'
+        '#line 1 "sub/b.h"\nint b;\n#line 1 "d.h"\nint beside;\n#line 3 "sub/b.h"\n'
+        '#line 3 "a.cl"\nint a;\n'
+        '#line 1 "c.h"\n#line 1 "d.h"\nint above;\n#line 2 "c.h"\nint c;\n'
+        '#line 5 "a.cl"\n'
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("#ifndef A\n#define A\nint a;\n#endif\n", True),
+        ("// a comment\n#ifndef A\n#define A\n#ifdef B\nint b;\n#endif\nint a;\n#endif // A", False),
+        ("// a comment\n#ifndef A\n#define A\n#ifdef B\nint b;\n#endif\nint a;\n#endif", True),
+        ("#ifndef A\n#define A\n#endif\nint b;\n", False),
+        ("#ifndef A\n#define A\n#endif\n#ifdef B\n#endif\n", False),
+        ("#ifndef A\n#define B\n#endif\n", False),
+        ("#ifdef A\n#define A\n#endif\n", False),
+        ("int a;\n", False),
+    ],
+)
+def test_guards_that_enclose_a_file(text: str, expected: bool) -> None:
+    assert debug._is_guarded(text) == expected
+
+
+def test_open_conditions_behind_each_directive() -> None:
+    text = "#if A\n#define B\n  # ifdef C\n#else\n#endif\n#endif\n#ifndef D\n"
+    assert debug._depths(text) == [0, 1, 1, 2, 2, 1, 0, 1]
+    assert debug._depths("int a;") == [0]

@@ -19,8 +19,9 @@ LIMITS = {
     "FitLines": (
         equal("status", "inliers", reason="counts and comparisons, except within rounding of the tuning constant"),
         Limit(
-            ("centre",), 3e-7, 6e-16, "extent of the points + the coordinate [unit of the points]",
-            "error model of the docstring: rounding relative to one of the points, and of the coordinates",
+            ("centre",), 3e-7, 6e-16, "extent of the points x (1 + shift by the weights) + coordinate [unit of points]",
+            "error model of the docstring: rounding relative to one of the points, and of the coordinates; an error of "
+            "the distances changes the weights, which moves the centre along the line",
         ),
         Limit(
             ("normal",), 3e-7, 6e-16, "1 + extent over the spread along the line",
@@ -56,24 +57,28 @@ def _case(name: str, loss: Any, outliers: float, size: float, dtype: str, missin
     given = points.astype(dtype)
     operation = FitLines(loss=loss, scale=_SIGMA, max_iterations=60)
     known = np.isfinite(given).all(axis=-1)
-    fitted, centre, weights, margin = _fixed_point(given.astype(np.longdouble), known, middle, along, operation)
+    fitted, centre, weights, change, margin = _fixed_point(given.astype(np.longdouble), known, middle, along, operation)
     inliers = np.sum(weights > 0.0, axis=-1)
     status = np.where(2 * inliers < known.sum(axis=-1), int(Status.AMBIGUOUS), 0)
     at = np.sum((given - centre[:, None]) * fitted[:, None], axis=-1)
     spread = np.sqrt(np.sum(np.where(known, weights * at**2, 0.0), axis=-1) / weights.sum(axis=-1))
+    shift = np.sum(np.where(known, change * np.abs(at), 0.0), axis=-1) / weights.sum(axis=-1)
     upright = fitted * np.sign(fitted[:, :1])
     exact = {"normal": upright[:, ::-1] * (-1.0, 1.0), "centre": centre, "inliers": inliers, "status": status}
     turned = np.repeat((1.0 + 2.0 * _HALF / spread)[:, None], 2, axis=1)
     # Rounding decides at the tuning constant, and for the sign of an upright line.
     undecided = (margin < 1e-2) | (np.abs(fitted[:, 0]) < 1e-5)
-    quantities = {"normal": turned, "centre": 2.0 * _HALF + np.abs(centre)}
+    quantities = {"normal": turned, "centre": 2.0 * _HALF * (1.0 + shift[:, None]) + np.abs(centre)}
     return Case("FitLines", name, operation, (given,), exact, quantities, undecided)
 
 
 def _fixed_point(
     points: Floats, known: npt.NDArray[np.bool_], middle: Floats, along: Floats, operation: FitLines
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return directions, centres, weights, and the least distance of a residual from the tuning constant [sigma]."""
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Return directions, centres, weights, their change by a distance, and the margin of the weights.
+
+    The margin is the least distance of a residual from the tuning constant, in standard deviations.
+    """
     points = np.where(known[..., None], points, 0.0)
     centre, direction = middle, along
     for _ in range(_STEPS):
@@ -86,7 +91,8 @@ def _fixed_point(
         angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
         direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     edge = np.abs(np.abs(z) - (operation.tuning_constant if operation.loss != "least_squares" else np.inf))
-    return direction, centre, weights, np.where(known, edge, np.inf).min(axis=1)
+    change = np.abs(_weight(z + 1e-3, operation) - _weight(z - 1e-3, operation)) / (2e-3 * _SIGMA)
+    return direction, centre, weights, change, np.where(known, edge, np.inf).min(axis=1)
 
 
 def _weight(z: Floats, operation: FitLines) -> Floats:

@@ -1,4 +1,4 @@
-"""Contract of the irradiance of lit lines: random and extreme places of receivers, behind surfaces and holes."""
+"""Contract of the irradiance of lit lines, without and with occluders: random and extreme places, and holes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import numpy.typing as npt
 
 from gpuvision.profiling.contract.agreement import Case, Limit, equal
 from gpuvision.reference import line_irradiance as reference
+from gpuvision.reference import occluded_irradiance as occluded
+from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
+from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
 
 LIMITS = {
     "LineIrradiance": (
@@ -19,9 +22,19 @@ LIMITS = {
             ("irradiance",), 2e-6, 1e-14, "sum of E0 of the segments; in double precision times 1 + D / h [W/m^2]",
             "error model of the docstring",
         ),
-    )
+    ),
+    "OccludedIrradiance": (
+        equal("status", reason="comparisons only"),
+        Limit(
+            ("irradiance",), 1.0, 1.0, "error of LineIrradiance + change by 8 epsilon of the scene's size [W/m^2]",
+            "error model of the docstring: the edge of a shadow is off by a few roundings of positions; the change of "
+            "the irradiance when the receiver moves so far",
+        ),
+    ),
 }  # fmt: skip
 _RECEIVERS, _SEGMENTS = 203, 17
+# Segments, clearance and size of the scene with occluders [m].
+_LIT, _CLEARANCE, _SIZE = 5, 1e-5, 2.0
 
 
 def cases() -> Iterator[Case]:
@@ -36,6 +49,8 @@ def cases() -> Iterator[Case]:
     holes = receivers.astype(np.float32)
     holes[::7, 1], holes[3::11, 4] = np.nan, np.inf
     yield _case("holes, float32", holes, lit)
+    for count in (3, 60):
+        yield _occluded(f"{count} triangles, float32", count)
 
 
 def _scene(rng: np.random.Generator) -> tuple[npt.NDArray[np.float64], LitSegments]:
@@ -68,3 +83,29 @@ def _in_digits(receivers: npt.NDArray[np.float64], lit: LitSegments) -> tuple[An
         value += pairs[:, 0]
         quantity += pairs[:, 1] * reach
     return value, quantity
+
+
+def _occluded(name: str, count: int) -> Case:
+    """Return strips of receivers among triangles."""
+    rng = np.random.default_rng(31)
+    corners = occluded.soup(rng, count, 0.6 if count < 20 else 0.3)
+    scene, strips = Scene(corners), (3, 23)
+    receivers, lit = _scene(rng)
+    places = occluded.single(receivers[: strips[0] * strips[1]])
+    rows = occluded.single(segment_rows(lit)[:_LIT])
+
+    def exact_at(at: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        return np.asarray(occluded.irradiance(corners, at, rows, _CLEARANCE))
+
+    value, largest = exact_at(places)
+    step = 8.0 * float(np.finfo(np.float32).eps) * _SIZE
+    moves = step * np.eye(3, 6)
+    change = np.max(
+        [np.abs(exact_at(places + sign * each)[0] - value) for each in moves for sign in (1.0, -1.0)], axis=0
+    )
+    quantity = LIMITS["LineIrradiance"][1].single * largest + change
+    exact = {"irradiance": value.reshape(strips), "status": np.zeros(strips, np.uint8)}
+    operation = OccludedIrradiance(scene=scene, segments=_LIT, clearance=_CLEARANCE)
+    single = (places.reshape(*strips, 6), np.ones((*strips, 2)), rows)
+    inputs = tuple(np.ascontiguousarray(each, np.float32) for each in single)
+    return Case("OccludedIrradiance", name, operation, inputs, exact, {"irradiance": quantity.reshape(strips)})

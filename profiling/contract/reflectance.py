@@ -16,7 +16,7 @@ LIMITS = {
     "Reflectance": (
         equal("status", reason="comparisons only"),
         roundings(
-            32, "value", of="value x condition of the lobe [1/sr], at least the smallest normal number",
+            32, "value", of="value x condition of the lobe [1/sr], at least its factor x the smallest normal number",
             reason="about 8 epsilon of each direction; exp 3 ulp, pow 16 ulp (OpenCL), quotients and sums of the model",
         ),
     )
@@ -52,10 +52,23 @@ def _case(name: str, model: Brdf, given: npt.NDArray[Any]) -> Case:
     real, limit = np.finfo(given.dtype), LIMITS["Reflectance"][1].factor(given.dtype)
     with np.errstate(invalid="ignore"):
         quantity = value * _condition(model, given.astype(np.float64).reshape(-1, 2, 3))
-    # Devices may flush denormal numbers to 0.
-    quantities = {"value": np.maximum(quantity, float(real.tiny) / limit)}
+    # Devices may flush denormal numbers to 0, also before the lobe is multiplied by its factor.
+    least = float(real.tiny) * _factor(model, given.astype(np.float64).reshape(-1, 2, 3)) / limit
+    quantities = {"value": np.fmax(quantity, least)}
     exact = {"value": value, "status": status}
     return Case("Reflectance", name, Reflectance(model=model), (given,), exact, quantities)
+
+
+def _factor(model: Brdf, pairs: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the number that multiplies the exponential or the power of the lobe, 1 or more."""
+    factor = np.ones(len(pairs))
+    if isinstance(model, Phong):
+        factor *= model.exponent + 2.0
+    if isinstance(model, Ward):
+        with np.errstate(all="ignore"):
+            half = (pairs / np.linalg.norm(pairs, axis=-1, keepdims=True)).sum(axis=1)
+            factor = np.sum(half**2, axis=-1) / half[:, 2] ** 4 / (np.pi * model.alpha_x * model.alpha_y)
+    return np.fmax(factor, 1.0)
 
 
 def _condition(model: Brdf, pairs: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -112,9 +112,10 @@ class FitLines(VisionOperation[LineFits]):
     Notes
     -----
     Error: distances are computed relative to one of the points, so that rounding adds 3e-7 of the points' extent in
-    single precision, and half a unit in the last place of the coordinates. The covariance is the asymptotic one of an
-    M-estimator [1]_, computed from the residuals unless ``scale`` is given. With twenty points its standard deviations
-    are right to 15 %; with six or fewer they are rough; with two points it is NaN.
+    single precision, and half a unit in the last place of the coordinates. The rounding over sigma changes the weights,
+    which moves the centre along the line. The covariance is the asymptotic one of an M-estimator [1]_, computed from
+    the residuals unless ``scale`` is given. With twenty points its standard deviations are right to 15 %; with six or
+    fewer they are rough; with two points it is NaN.
 
     References
     ----------

@@ -203,6 +203,16 @@ def test_bundles_are_neighbours_along_the_morton_curve(
         assert len(set(leaf_of[order[first : first + size]])) == 1
 
 
+def test_the_morton_curve_interleaves_all_bits(rng: np.random.Generator) -> None:
+    """Centres on a lattice of 65536 cells along each axis, many of them in neighbouring cells."""
+    places = np.concatenate(
+        [rng.integers(0, 1 << bits, (60, 3)) for bits in (2, 4, 8, 12, 16)] + [[[0] * 3, [65535] * 3]]
+    )
+    codes = [sum(((int(c[k]) >> bit) & 1) << (3 * bit + k) for bit in range(16) for k in range(3)) for c in places]
+    half = 0.5 * places.T
+    np.testing.assert_array_equal(bvh._morton_order(np.concatenate([half, -half])), np.argsort(codes, kind="stable"))
+
+
 @pytest.mark.parametrize("bits", [1, 15, 16, 17, 33, 48])
 def test_radix_sort_is_stable(bits: int, rng: np.random.Generator) -> None:
     keys = rng.integers(0, 1 << bits, 500)

@@ -20,6 +20,9 @@ def test_solid_angle() -> None:
 def test_image_irradiance() -> None:
     assert image_irradiance(1.0, 1.0) == pytest.approx(math.pi / 4.0, rel=1e-15)
     assert image_irradiance(3.0, 2.0, 1.0) == pytest.approx(3.0 * math.pi / 64.0, rel=1e-15)
+    # Radiance times pi / 4 and cos^4 over the square of N (1 + m), of different numbers.
+    expected = 2.0 * math.pi / 4.0 * math.cos(0.6) ** 4 / (5.0 * 1.25) ** 2
+    assert image_irradiance(2.0, 5.0, 0.25, 0.6) == pytest.approx(expected, rel=1e-14)
     with pytest.raises(ValueError, match="f_number > 0"):
         image_irradiance(1.0, 0.0)
 
@@ -31,4 +34,5 @@ def test_fall_towards_the_edge() -> None:
 def test_responsivity() -> None:
     """One electron per photon at 1239.84198 nm is an ampere per watt."""
     assert responsivity(1.239841984e-6, 1.0) == pytest.approx(1.0, rel=1e-9)
+    assert responsivity(1.239841984e-6 / 4.0, 0.5) == pytest.approx(0.125, rel=1e-9)
     assert responsivity(1.239841984e-6 / 2.0, 0.5) == pytest.approx(0.25, rel=1e-9)

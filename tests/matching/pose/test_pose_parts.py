@@ -66,6 +66,41 @@ kernel void parts(global const real *given, global const real *poses, constant i
         for (int k = 0; k < FREEDOMS; k++) PUT(fit.covariance[i][k]);
 }
 """
+FRAMES = """
+#include "pose/pose_input.h"
+#ifndef IN_GROUP
+#include "pose/pose_rows.h"
+#endif
+#define PUT(value) out[to++] = (value)
+
+kernel void framed(global const PoseRow *rows, global real *out, const int count, const real etch) {
+    int to = 0;
+#ifdef IN_GROUP
+    local real sums[ROOM_FOR(3)];
+    const pose_rows all = framed_rows(rows, count, etch, sums);
+    const pose_frame frame = all.frame;
+    if (get_local_id(0) > 0) return;
+#else
+    real columns[8][ROWS], sum = 0, sum_x = 0, sum_y = 0;
+    for (int i = 0; i < count; i++) {
+        const pose_row row = read_row(rows + i, 1);
+        columns[0][i] = row.nx, columns[1][i] = row.ny, columns[2][i] = row.px, columns[3][i] = row.py;
+        columns[4][i] = row.ex, columns[5][i] = row.ey, columns[6][i] = row.certainty, columns[7][i] = row.etch_factor;
+        sum += row.certainty > 0, sum_x += row.px, sum_y += row.py;
+    }
+    pose_rows all = {columns[0], columns[1], columns[2], columns[3], columns[4],
+                     columns[5], columns[6], columns[7], count,      etch};
+    const pose_frame frame = centre_rows(&all, sum, sum_x, sum_y);
+#endif
+    PUT(frame.x), PUT(frame.y), PUT(frame.size), PUT(frame.per_size), PUT(all.etch);
+    PUT(read_row(rows, 0).certainty);
+    for (int i = 0; i < count; i++) {
+        const laned_row row = row_of(all, i);
+        PUT(row.nx), PUT(row.ny), PUT(row.px), PUT(row.py), PUT(row.ex), PUT(row.ey), PUT(row.certainty);
+        PUT(row.etch_factor);
+    }
+}
+"""
 CAPACITY, TUNING, EFFICIENCY, ROWS = 24, 4.0, 0.9, 21
 BUILDS = [(3, False, 1.5), (4, True, None), (6, True, None)]
 
@@ -275,3 +310,37 @@ def _prior(freedoms: int, problem: Problem, etch: float) -> Reals:
     prior = np.zeros((freedoms, freedoms))
     prior[-1, -1] = etch**2 if problem.has_etch else 0.0
     return prior
+
+
+@pytest.mark.parametrize("group", [0, 16])
+@pytest.mark.parametrize("has_etch", [False, True])
+def test_frames_of_rows(device: Device, group: int, has_etch: bool, rng: np.random.Generator, tmp_path: Path) -> None:
+    """Rows are relative to their centre, in units of their size; rows without numbers or sigma are missing."""
+    count, etch, wrong = 90, 20.0, (0, 5, 9, 14, 17, 22, 31, 40, 44)
+    numbers = rng.uniform([-1, -1, 3, -9, -0.1, -0.2, 0.01, -2], [1, 1, 7, -3, 0.1, 0.2, 0.03, 2], (count, 8))
+    numbers = numbers[:, : 7 + has_etch]
+    for column, row in enumerate(wrong[: 7 + has_etch]):
+        numbers[row, column] = np.nan if column % 2 else np.inf
+    numbers[wrong[-1], 6], numbers[50, 6] = 0.0, -0.01
+    numbers = numbers.astype(np.float32)
+    defines: dict[str, Any] = {"INPUT": "float", "POSE_PARAMETERS": 3, "FREEDOMS": 3 + has_etch, "ROWS": count}
+    defines |= {"CAPACITY": count, "TUNING_CONSTANT": TUNING}
+    defines |= ({"WITH_ETCH_BIAS": None} if has_etch else {}) | ({"GROUP_PER_PROBLEM": None} if group else {})
+    (tmp_path / "frames.cl").write_text(FRAMES)
+    kernel = build(device, tmp_path, "frames.cl", defines, include_folders=(KERNEL_FOLDER,)).framed
+    rows = cl.array.to_device(device.queue, numbers)
+    made = cl.array.zeros(device.queue, 6 + 8 * count, np.float32)
+    size = (group,) if group else (1,)
+    kernel(device.queue, size, size, rows.data, made.data, np.int32(count), np.float32(etch))
+    out = made.get().astype(np.float64)
+    there = np.isfinite(numbers).all(axis=1) & (numbers[:, 6] > 0.0)
+    assert np.sum(~there) == 9 + has_etch
+    expected = np.zeros((count, 8))
+    expected[:, : 7 + has_etch] = np.where(there[:, None], numbers, 0.0)
+    centre = expected[there, 2:4].mean(axis=0)
+    extent = np.sqrt(np.mean(np.sum((expected[there, 2:4] - centre) ** 2, axis=1)))
+    np.testing.assert_allclose(out[:6], [*centre, extent, 1.0 / extent, etch * extent, 0.0], rtol=1e-5)
+    expected[there, 2:4] -= centre
+    expected[:, 2:6] /= extent
+    expected[there, 6] = extent / expected[there, 6]
+    np.testing.assert_allclose(out[6:].reshape(count, 8), expected, rtol=1e-4, atol=1e-5)

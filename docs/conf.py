@@ -43,7 +43,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     ("py:obj", r".*"),
     ("py:.*", r"(?!gpuvision\.).*"),
-    ("py:class", r"gpuvision\.(.*\.)?(_\w+|[RS]|schema\.Section)"),  # private bases, type variables
+    ("py:class", r"gpuvision\.(.*\.)?(_\w+|[RS]|AnyTrial|schema\.Section)"),  # private bases, type variables
 ]
 suppress_warnings = ["ref.citation"]  # a docstring's section References may list works that its text does not cite
 numpydoc_show_class_members = False

@@ -507,5 +507,14 @@ from .simulation.transport.radiosity import (
 from .status import (
     Status as Status,
 )
+from .workflows.planning import (
+    LocationJob as LocationJob,
+)
+from .workflows.planning import (
+    ScanJob as ScanJob,
+)
+from .workflows.planning import (
+    plan as plan,
+)
 
 __version__: str

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -78,12 +79,19 @@ def run_jobs(judge: Callable[[np.random.Generator, Device], Outcome], descriptio
     parser.add_argument("--device", help="label of a device; default: the best one")
     given = parser.parse_args()
     device = Device.best() if given.device is None else Device.named(given.device)
-    outcomes = []
-    for number in range(given.jobs):
-        outcomes.append(judge(np.random.default_rng((given.seed, number)), device))
-        last = outcomes[-1]
-        chosen = "refused" if last.plan is None else last.plan.chosen.name
-        times = f"cost {last.cost:.2f}, {'kept up' if last.keeps_up else 'too slow'}"
-        print(f"{number}: {chosen}, {1e6 * last.error:.3g} of {1e6 * last.tolerance:.3g} um, {times}", flush=True)
+    outcomes: list[Outcome] = []
+    with contextlib.suppress(KeyboardInterrupt):  # the summary holds the jobs up to then
+        for number in range(given.jobs):
+            outcomes.append(judge(np.random.default_rng((given.seed, number)), device))
+            print(f"{number}: {_line(outcomes[-1])}", flush=True)
     print(summary(outcomes))
     return 0
+
+
+def _line(outcome: Outcome) -> str:
+    """Return the outcome of a job in one line."""
+    asked = f"{1e6 * outcome.tolerance:.3g} um"
+    if outcome.plan is None:
+        return f"refused {asked}{', which is possible' if outcome.possible else ''}"
+    times = f"cost {outcome.cost:.2f}, {'kept up' if outcome.keeps_up else 'too slow'}"
+    return f"{outcome.plan.chosen.name}, {1e6 * outcome.error:.3g} of {asked}, {times}"

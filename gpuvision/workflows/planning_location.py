@@ -28,6 +28,7 @@ from gpuvision.matching.features.feature_set import FeatureSet, select_feature_s
 from gpuvision.matching.features.fiducials import Fiducials
 from gpuvision.matching.features.imaging import Imaging
 from gpuvision.matching.pose.bound_features import BoundFeatures
+from gpuvision.matching.pose.feature_pose import FeaturePose
 from gpuvision.status import Status
 from gpuvision.validation import finite
 from gpuvision.workflows.locating_board import locate_board
@@ -45,6 +46,8 @@ _ROUNDS = 15  # of the timing, of which the median counts
 # Standard deviation of errors that all rulers share, such as those of neighbouring edges [px]. Measured: what remains
 # of the true errors of `gpuvision.profiling.location_plans`, up to 0.006 px.
 _COMMON_PX = 0.005
+_UNKNOWNS = 4  # x, y, theta and the etch bias
+_CHANCE = 2.0  # standard deviations of a residual scale that is significantly above 1. Chosen
 _MAX_SHIFT = 4.0  # standard deviations between the pose of a feature set and the located one. Chosen
 
 
@@ -111,12 +114,12 @@ def plan_location(
     Notes
     -----
     The prediction is the covariance of the pose: noise of the pixels at the heights of the edges in the image, bilinear
-    sampling, and the etch bias. Residuals beyond these raise it. Images with additional noise of the same standard
-    deviation, measured from expected poses anywhere in the search range, test it: a larger scatter takes its place. An
-    error of 0.005 px along x and along y, which all rulers share, is added. A feature set is not used if one of these
-    images has no pose, if its pose differs from the located one by more than 4 standard deviations, or if it depends on
-    a single feature (``LocationPlanLimits.max_leverage``). Not covered: a wrong scale, a wrong lens model, and boards
-    that differ from the artwork.
+    sampling, and the etch bias. Residuals that are significantly larger raise it. Images with additional noise of the
+    same standard deviation, measured from expected poses anywhere in the search range, test it: a larger scatter takes
+    its place. An error of 0.005 px along x and along y, which all rulers share, is added. A feature set is not used if
+    one of these images has no pose, if its pose differs from the located one by more than 4 standard deviations, or if
+    it depends on a single feature (``LocationPlanLimits.max_leverage``). Not covered: a wrong scale, a wrong lens
+    model, and boards that differ from the artwork.
     """
     finite(tolerance, "tolerance", above=0.0)
     time_limit(rate, latency, limits.rate_margin, LocationPlan.unit)  # refuses wrong values before the work
@@ -256,7 +259,7 @@ class _Tests:
                 poses[number] = to_numpy(found.pose)
                 leverage = max(leverage, float(to_numpy(found.leverage)))
                 if not number:
-                    covariance = np.asarray(to_numpy(found.covariance), np.float64)
+                    covariance = _covariance(found)
         predicted = pose_error(covariance, self.points)
         if self._is_elsewhere(poses[0], predicted):
             predicted = math.nan
@@ -289,6 +292,15 @@ def pose_error(covariance: Float64, points: Float64) -> float:
     # A turn t about the image centre moves a point at (x, y) by t (-y, x).
     turned = 2.0 * (x * covariance[1, 2] - y * covariance[0, 2]) + covariance[2, 2] * float(np.mean(points**2)) * 2.0
     return math.sqrt(covariance[0, 0] + covariance[1, 1] + turned)
+
+
+def _covariance(found: FeaturePose) -> Float64:
+    """Return the covariance of a pose; a residual scale that few features may have by chance does not raise it."""
+    scale, degrees = float(to_numpy(found.residual_scale)), int(to_numpy(found.inliers)) - _UNKNOWNS
+    # The residual scale has a standard deviation of 1 / sqrt(2 degrees).
+    by_chance = 1.0 + _CHANCE / math.sqrt(2.0 * max(degrees, 1))
+    factor = max(scale, 1.0) if scale <= by_chance else 1.0
+    return np.asarray(to_numpy(found.covariance), np.float64) / factor**2
 
 
 def _with_noise(grey: npt.NDArray[Any], noise: float, draws: int, rng: np.random.Generator) -> npt.NDArray[Any]:

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -216,6 +217,24 @@ def test_the_error_is_the_larger_of_covariance_and_scatter_with_the_common_error
             assert getattr(each, name) == max(each.predicted, each.scatter)
             expected = math.hypot(getattr(each, name), 0.005 * PIXEL, 0.005 * PIXEL)
             assert each.error == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("residual_scale", "inliers", "factor"),
+    [(0.7, 54, 1.0), (1.19, 54, 1.0), (1.21, 54, 1.21), (1.9, 7, 1.9), (1.9, 4, 1.0), (2.5, 4, 2.5)],
+)
+def test_residuals_that_may_be_chance_do_not_raise_the_error(
+    residual_scale: float, inliers: int, factor: float
+) -> None:
+    """50 degrees of freedom: a residual scale of 1 +- 0.1; one or less: 1 +- 0.71."""
+    base = np.diag([4.0, 9.0, 16.0])
+    found: Any = SimpleNamespace(
+        covariance=base * max(residual_scale, 1.0) ** 2,
+        residual_scale=np.array(residual_scale, np.float32),
+        inliers=np.array(inliers, np.int32),
+    )
+    expected = base * (factor**2 if factor > 1.0 else 1.0)
+    np.testing.assert_allclose(planning_location._covariance(found), expected, rtol=1e-6)
 
 
 @pytest.mark.usefixtures("few_features")

@@ -1,0 +1,134 @@
+"""One entry for all plans: the fastest settings of a job that meet a tolerance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, overload
+
+import numpy.typing as npt
+
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.lens import Lens
+from gpuvision.host import Device
+from gpuvision.matching.artwork.artwork import Artwork
+from gpuvision.matching.board.measurement_result import Copper
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.workflows.location_plan import LocationPlan
+from gpuvision.workflows.planning_location import plan_location
+from gpuvision.workflows.planning_scan import plan_scan
+from gpuvision.workflows.scan_plan import ScanPlan
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScanJob:
+    """Scan of a recording, for `plan`.
+
+    Attributes
+    ----------
+    recording : str, Path or numpy.ndarray
+        Camera recording, or frames (frames, rows, columns).
+    sensor : Sensor
+        Sensor of the recording, with the noise of its camera.
+    """
+
+    recording: str | Path | npt.NDArray[Any]
+    sensor: Sensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LocationJob:
+    """Localization of a board, for `plan`; see `gpuvision.workflows.locating_board.locate_board` for the attributes.
+
+    Attributes
+    ----------
+    image, artwork, scale
+        Image of the board, its artwork, and the size of a pixel on the board [m].
+    initial_pose, search_range, model
+        Expected pose and search range, and lens or camera model. Default: as in `locate_board`.
+    blur_px : float
+        Standard deviation of the edges' blur [px]. Default 1.0.
+    etch_bias_sigma : float
+        Standard deviation of the etch bias [m]. Default 1e-05.
+    threshold, noise, copper
+        Least height of an edge, noise of a pixel [grey levels], and grey level of copper. Default: from the image.
+    """
+
+    image: npt.NDArray[Any]
+    artwork: Artwork
+    scale: float
+    initial_pose: tuple[float, float, float] | None = None
+    search_range: tuple[float, float] | None = None
+    model: Lens | Camera | None = None
+    blur_px: float = 1.0
+    etch_bias_sigma: float = 10e-6
+    threshold: float | None = None
+    noise: float | None = None
+    copper: Copper = "auto"
+
+
+@overload
+def plan(
+    job: ScanJob,
+    *,
+    tolerance: float,
+    rate: float | None = ...,
+    latency: float | None = ...,
+    device: Device | None = ...,
+) -> ScanPlan: ...
+
+
+@overload
+def plan(
+    job: LocationJob,
+    *,
+    tolerance: float,
+    rate: float | None = ...,
+    latency: float | None = ...,
+    device: Device | None = ...,
+) -> LocationPlan: ...
+
+
+def plan(
+    job: ScanJob | LocationJob,
+    *,
+    tolerance: float,
+    rate: float | None = None,
+    latency: float | None = None,
+    device: Device | None = None,
+) -> ScanPlan | LocationPlan:
+    """Choose the fastest settings of a job whose predicted error meets a tolerance.
+
+    Parameters
+    ----------
+    job : ScanJob or LocationJob
+        Scan of a recording, or localization of a board.
+    tolerance : float
+        Largest error of the heights, or of the pose at the features of the board [m].
+    rate : float, optional
+        Frame rate that the settings must keep up with [frames/s].
+    latency : float, optional
+        Longest acceptable time from a frame to its result [s]; needs a rate.
+    device : Device, optional
+        Default `Device.best`.
+
+    Returns
+    -------
+    ScanPlan or LocationPlan
+        Chosen settings, all that were tried, and what another tolerance gives.
+
+    Raises
+    ------
+    PlanError
+        No settings meet the tolerance, or none of them keeps up with the rate.
+    TypeError
+        The job is of another type.
+    ValueError
+        As `gpuvision.workflows.planning_scan.plan_scan` and
+        `gpuvision.workflows.planning_location.plan_location`, which also take other options.
+    """
+    if not isinstance(job, ScanJob | LocationJob):
+        raise TypeError(f"job is a {type(job).__name__}, expected a ScanJob or a LocationJob")
+    options: dict[str, Any] = {each.name: getattr(job, each.name) for each in fields(job)}
+    options |= {"tolerance": tolerance, "rate": rate, "latency": latency, "device": device}
+    return plan_scan(**options) if isinstance(job, ScanJob) else plan_location(**options)

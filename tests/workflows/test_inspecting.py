@@ -17,7 +17,7 @@ from gpuvision.formats.height_files import HeightMapFile
 from gpuvision.formats.range_image import write_tiff
 from gpuvision.inspection.apertures import BoardPlacement
 from gpuvision.inspection.paste import PasteSettings
-from gpuvision.workflows import inspecting_paste
+from gpuvision.workflows import inspecting_leads, inspecting_paste
 from gpuvision.workflows.inspecting_leads import inspect_leads
 from gpuvision.workflows.inspecting_paste import inspect_paste
 from paste_maps import Box, Cap, board_grid, circle, paste_map
@@ -282,3 +282,49 @@ def test_a_pose_is_known_or_the_beginning_of_a_search(given: str | None, monkeyp
         assert found.alignment is not None
     with pytest.raises(ValueError, match="pose and initial_pose are both given; expected a known pose or the"):
         inspect_paste(heights, [], "settings", side="top", pose=pose, initial_pose=pose)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("centre", [None, (1e-3, 2e-3)])
+@pytest.mark.parametrize("placed", [False, True])
+@pytest.mark.parametrize("sigma", [None, 4e-6])
+def test_leads_are_moved_with_their_centre_of_gravity(
+    centre: tuple[float, float] | None, placed: bool, sigma: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(
+        inspecting_leads, "measure_coplanarity", lambda *given, **how: asked.append((given, how)) or "leads"
+    )
+    placement: Any = SimpleNamespace(to_map=lambda point: np.add(point, (0.5, 0.25))) if placed else None
+    regions: Any = [SimpleNamespace(moved=lambda where, k=k: (k, where is placement)) for k in range(3)]
+    heights: Any = SimpleNamespace(z="z", grid="grid", sigma=2e-6, phase="phase")
+    found = inspect_leads(
+        heights, regions, placement=placement, sigma=sigma, correlation_area=3.0, centre=centre, maximum=5e-5,
+        files={"a": "b"},
+    )  # fmt: skip
+    ((given, how),) = asked
+    expected = tuple((k, True) for k in range(3)) if placed else tuple(regions)
+    assert given == ("z", "grid", expected)
+    shift = (0.5, 0.25) if placed else (0.0, 0.0)
+    place = None if centre is None else pytest.approx((1e-3 + shift[0], 2e-3 + shift[1]))
+    assert how == {"sigma": sigma or 2e-6, "phase": "phase", "correlation_area": 3.0, "centre": place}
+    assert (found.heights, found.regions, found.leads, found.maximum) == (heights, expected, "leads", 5e-5)
+    assert found.files == {"a": "b"}
+
+
+def test_pads_of_a_part_are_named_by_their_pins() -> None:
+    """Pads without a pin by their number; a part that is not there names those that are."""
+    square = np.array([[0.0, 0.0], [1e-3, 0.0], [1e-3, 1e-3], [0.0, 1e-3]])
+    pads: Any = [SimpleNamespace(part=part, pin=pin, outline=square + k) for k, (part, pin) in enumerate(
+        (("U1", "A1"), ("R1", "1"), ("U1", ""), ("", "7"), ("U1", "B2"))
+    )]  # fmt: skip
+    found = inspecting_leads.pads_of_part(pads, "U1")
+    assert [each.name for each in found] == ["A1", "2", "B2"]
+    for each, k in zip(found, (0, 2, 4), strict=True):
+        np.testing.assert_allclose(each.centroid, [k + 5e-4, k + 5e-4])
+    with pytest.raises(ValueError, match=r"no pad belongs to the part 'U9'; known parts: R1, U1$"):
+        inspecting_leads.pads_of_part(pads, "U9")
+    with pytest.raises(ValueError, match="known parts: none: the files do not name parts"):
+        inspecting_leads.pads_of_part(pads[3:4], "U9")
+    many: Any = [SimpleNamespace(part=f"P{k:02}", pin="1", outline=square) for k in range(14)]
+    with pytest.raises(ValueError, match=r"known parts: P00, .*, P11$"):
+        inspecting_leads.pads_of_part(many, "U9")

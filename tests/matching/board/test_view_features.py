@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -122,3 +123,61 @@ def test_many_edges_are_looked_for_in_five_windows() -> None:
         right = high - size
         expected = [low, [low[0], right[1]], [right[0], low[1]], right, (low + right) / 2]
         np.testing.assert_allclose(first, expected)
+
+
+@pytest.mark.parametrize(
+    ("counts", "ratio", "used"),
+    [
+        ([(2, 1)], 1.25, 1.25),  # three together suffice
+        ([(1, 1), (3, 0)], 1.25, 1.0),
+        ([(1, 1), (2, 0)], 1.001, None),
+        ([(0, 2)], 1.0, None),  # no less smoothing is left
+    ],
+)
+@pytest.mark.parametrize("with_hint", [True, False])
+def test_rulers_smooth_less_where_few_features_have_room(
+    monkeypatch: pytest.MonkeyPatch, counts: list[tuple[int, int]], ratio: float, used: float | None, with_hint: bool
+) -> None:
+    """Numbers of rulers and fiducials of each attempt; the error counts those of the last one."""
+    tried: list[Imaging] = []
+    artwork: Any = SimpleNamespace(side="bottom")
+    found: Any = None
+
+    def find(given: Any, view: Any, imaging: Imaging, placement: Any) -> Any:
+        nonlocal found
+        assert (given, view) == (artwork, VIEW)
+        np.testing.assert_array_equal(placement, (30e-3, 10e-3))
+        tried.append(imaging)
+        rulers, marks = counts[len(tried) - 1]
+        found = SimpleNamespace(sigma=np.ones(rulers)), SimpleNamespace(sigma=np.ones(marks))
+        return found
+
+    def hint(given: Any, bounds: Any, placement: Any, imaging: Imaging) -> str:
+        assert given is artwork
+        np.testing.assert_array_equal(bounds, VIEW.bounds)
+        np.testing.assert_array_equal(placement, (30e-3, 10e-3))
+        assert imaging is tried[-1]
+        return "pixels of 7 um"
+
+    monkeypatch.setattr(view_features, "find_features_in_view", find)
+    monkeypatch.setattr(view_features, "pixel_hint", hint)
+    monkeypatch.setattr(view_features, "select_feature_set", lambda *values, **more: (values, more))
+    imaging = replace(IMAGING, smoothing_ratio=ratio)
+    if used is None:
+        rulers, marks = counts[-1]
+        end = "pixels of 7 um" if with_hint else "see the pixel size"
+        expected = (
+            rf"^{rulers} edges of the bottom artwork .*, and {marks} round pads .*, expected 3 or more together; "
+            rf"check the initial pose, the scale and the blur: {end}$"
+        )
+        with pytest.raises(ValueError, match=expected):
+            view_features.select_features_in_view(artwork, VIEW, imaging, with_hint=with_hint)
+    else:
+        result: Any = view_features.select_features_in_view(artwork, VIEW, imaging, 35.0, with_hint=with_hint)
+        used_imaging = replace(imaging, smoothing_ratio=used)
+        assert result == (
+            (found[0], used_imaging, "bottom"),
+            {"fiducials": found[1], "are_free": True, "budget": 35.0},
+        )
+    assert [each.smoothing_ratio for each in tried] == [ratio, 1.0][: len(counts)]
+    assert all(replace(each, smoothing_ratio=ratio) == imaging for each in tried)

@@ -330,6 +330,29 @@ def test_a_radius_at_the_tolerance_is_the_fiducials(features: FeatureSet, device
     np.testing.assert_array_equal(found.feature_status, [0, 0, 0, Status.AMBIGUOUS, Status.AMBIGUOUS])
 
 
+def test_nothing_is_added_to_the_predicted_sigmas_by_default() -> None:
+    """Any radius of a fiducial is taken, and the solver is the default one."""
+    features = CameraFeatures(
+        rulers=((0.0, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0),) * 3,
+        matched=(),
+        drilled=(),
+        placement=(0.0, 0.0),
+        pixel_size=1e-5,
+        frame_shape=SHAPE,
+    )
+    blobs = FindBlobs(threshold=THRESHOLD)
+    ruler = RulerEdges(threshold=THRESHOLD, length=41, per_ruler=True)
+    made = EstimateFeaturePose(features=features, ruler=ruler, matched=blobs, drilled=blobs)
+    assert made.layout(Device.best(), SHAPE, np.dtype(np.uint8)).stages[-1].operation == SolveFeatures(
+        features=features,
+        solver=SolvePose(),
+        ruler_sigma_px=0.0,
+        matched_sigma_px=0.0,
+        drilled_sigma_px=0.0,
+        size_tolerance=math.inf,
+    )
+
+
 @pytest.mark.parametrize("count", [3, 8])
 def test_exact_edges_have_the_covariance_of_their_sigmas(count: int, device: Device) -> None:
     """A square without noise: the rulers at its sides agree exactly, and three rulers have no residuals."""

@@ -174,6 +174,8 @@ def test_of_many_residuals_every_nth_is_drawn(
     drawn: list[Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(calibration_picture, "_MAX_POINTS", 3)
+    for panel in ("_draw_distortion", "_draw_uncertainty"):
+        monkeypatch.setattr(calibration_picture, panel, lambda *_: None)
     for count, step in ((5, 1), (6, 2), (8, 2), (9, 3)):
         errors = 0.1 * np.arange(1.0, count + 1)
         points = np.stack([np.arange(float(count)), np.arange(float(count))], axis=1)
@@ -183,8 +185,11 @@ def test_of_many_residuals_every_nth_is_drawn(
 
 
 @pytest.mark.parametrize(("least", "lowest"), [(0.01, 0.01), (2e-4, 2e-4), (1e-5, 1.6e-4), (0.16, 0.16)])
-def test_scale_of_the_uncertainty(least: float, lowest: float, drawn: list[Figure], tmp_path: Path) -> None:
+def test_scale_of_the_uncertainty(
+    least: float, lowest: float, drawn: list[Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Logarithmic, from the least one, or a thousandth of the largest one; what is not known is not filled."""
+    monkeypatch.setattr(calibration_picture, "_draw_distortion", lambda *_: None)
     calibration = some_calibration(np.array([0.4, -0.1, 0.3, 0.2]), np.zeros((4, 2)))
     sigma = np.array([[least, 0.02 if least < 0.02 else 0.16, np.nan], [0.16, 0.16, 0.16]])
     calibration.correction_map.sigma_px = sigma

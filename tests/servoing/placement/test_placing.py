@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +14,12 @@ from gpuvision.formats.machine_file import read_machine
 from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.delay_response import settling_frames
 from gpuvision.servoing.frames import Transform
+from gpuvision.servoing.guard import LoopLimits, Outcome
 from gpuvision.servoing.loop import SimulatedClock
 from gpuvision.servoing.observer import LatestPose, PoseMeasurement
+from gpuvision.servoing.placement import placing
 from gpuvision.servoing.placement.budget import noise_gain
-from gpuvision.servoing.placement.control import Control
+from gpuvision.servoing.placement.control import Control, Settling
 from gpuvision.servoing.placement.machine import Machine, PlacementCamera, ThermalDrift, Tolerance
 from gpuvision.servoing.placement.placing import REMAINDER, Placement, ReleaseRule, place_part, predicted_frames
 from gpuvision.servoing.plant import SimulatedPlant
@@ -211,6 +215,82 @@ def test_an_error_of_an_old_pose_does_not_release() -> None:
     assert not any(rule(time, small, COVARIANCE) for time in (0.5, 0.6))
     observer.add(_pose(0.6))
     assert rule(0.61, small, COVARIANCE)
+
+
+@pytest.mark.parametrize(("lag", "needed"), [(0.0, 1), (1.5e-3, math.ceil(MACHINE.delay.frames + 1.5) + 1)])
+def test_errors_in_a_row_release_where_axes_have_a_lag(lag: float, needed: int) -> None:
+    """After the wait by theory: new errors within the tolerance for a latency and a lag; a larger one starts again."""
+    machine = dataclasses.replace(MACHINE, axes=(Axis(), Axis(lag=lag), Axis()), control=Control(gain=0.1))
+    observer: Any = SimpleNamespace(exposed=-math.inf)
+    rule = ReleaseRule(machine, observer)
+    near, far = np.array([0.0, 0.0, 0.99e-3]), np.array([0.0, 0.0, 1.01e-3])
+    assert rule.start is None
+    assert not rule(0.5, near, COVARIANCE)  # no pose yet
+    observer.exposed = 0.0
+    start = np.array([3e-6, -4e-6, 2e-3])
+    assert not rule(1.0, start, COVARIANCE)
+    np.testing.assert_array_equal(rule.start, start)
+    assert rule.frames == predicted_frames(machine, start) > 9
+    end, row = 1.0 + rule.frames * 1e-3, 0
+    for number in range(1, 20 + needed):
+        observer.exposed = float(number)
+        error = far if number <= 10 or number == 12 else near
+        row = row + 1 if error is near else 0
+        released = rule(end + 1e-4 * number, error, COVARIANCE)
+        assert released == (row >= needed)
+    assert row >= needed
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.51, False), (0.49, True)])
+def test_the_wait_ends_at_the_nearest_frame(share: float, expected: bool) -> None:
+    settling = Settling(rule="fixed", wait=20.2e-3)
+    observer: Any = SimpleNamespace(exposed=0.0)
+    rule = ReleaseRule(dataclasses.replace(MACHINE, settling=settling), observer)
+    assert not rule(3.0, TARGET, COVARIANCE)
+    assert rule.frames == 21
+    observer.exposed = 1.0
+    assert rule(3.0 + (21 - share) * 1e-3, TARGET, COVARIANCE) is expected
+
+
+def test_limits_of_the_loop_of_a_placement(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Head without poses: latency, coarse registration and refused frames; overshoot from the edge of the zone."""
+    axes = (Axis(lag=0.5e-3), Axis(lag=2e-3), Axis(lag=1e-3))
+    machine = dataclasses.replace(MACHINE, axes=axes, control=Control(gain=0.3, watchdog=1.5))
+    made: dict[str, Any] = {}
+
+    class Loop:
+        def __init__(self, *parts: Any, **more: Any) -> None:
+            made.update(more, parts=parts)
+
+        def run(self, goal: Any, duration: float, *, settling: Any) -> Any:
+            made.update(goal=goal, duration=duration, rule=settling)
+            return SimpleNamespace(outcome=made["outcome"])
+
+    monkeypatch.setattr(placing, "ServoLoop", Loop)
+    nothing: Any = None
+    for landing, waited in ((0.0, 0), (7.2e-3, 8), (7e-3, 7)):
+        for outcome, reason in ((Outcome.ARRIVED, ""), (Outcome.LOST, "no trusted pose for too long")):
+            made["outcome"] = outcome
+            found = place_part(machine, TARGET, nothing, nothing, SimulatedClock(), landing=landing)
+            assert (found.released, found.reason, found.predicted_frames) == (not reason, reason, waited)
+            assert np.isnan(found.start_error).all()
+        blind = landing + machine.delay.latency + 20 * 1e-3
+        zone = machine.overshoot * (100e-6, 100e-6, 5e-3)
+        assert zone.min() > 1e-6
+        limits: LoopLimits = made["limits"]
+        assert (limits.hold_after, limits.abort_after) == pytest.approx((blind, blind))
+        assert limits.watchdog == pytest.approx(1.5e-3)
+        assert limits.overshoot == pytest.approx(zone)
+        assert limits.lag == (0.5e-3, 2e-3, 1e-3)
+        assert (made["period"], made["duration"]) == (1e-3, 1.0)
+        np.testing.assert_array_equal(made["goal"], TARGET)
+
+
+@pytest.mark.parametrize(("x", "y", "share"), [(90.0, 0.0, 1.0), (0.0, 90.0, 1.0), (90.0, 50.0, math.sqrt(0.5))])
+def test_swings_of_both_axes_share_the_tolerance(x: float, y: float, share: float) -> None:
+    settling = Settling(rule="vibration", frequency=(x, y, 20.0), damping=(0.1, 0.1, 0.1))
+    limits = placing.swing_limit(dataclasses.replace(MACHINE, settling=settling))
+    np.testing.assert_allclose(limits, (3e-6 * share, 3e-6 * share, 1e-3))
 
 
 def _pose(exposed: float) -> PoseMeasurement:

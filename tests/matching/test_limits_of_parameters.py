@@ -164,6 +164,22 @@ def overlap(away: float) -> float:
     return float(np.mean(np.sum(one * other, axis=1)))
 
 
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda **of: FindBlobs(**{"threshold": 1.0} | of), "ratio"),
+        (lambda **of: FindBlobs(**{"threshold": 1.0} | of), "min_inlier_fraction"),
+        (lambda **of: FindBlobs(**{"threshold": 1.0} | of), "search_px"),
+        (lambda **of: RulerEdges(**{"threshold": 1.0, "length": 41} | of), "ambiguity"),
+        (lambda **of: SolvePose(**of), "min_inlier_fraction"),
+        (lambda **of: SolvePose(**of), "max_leverage"),
+    ],
+)
+def test_shares_and_lengths_are_not_negative(make: Any, name: str) -> None:
+    with pytest.raises(ValueError, match=rf"{name} is -0\.5, expected"):
+        make(**{name: -0.5})
+
+
 @pytest.mark.parametrize(("smoothing", "step", "width"), [(1.0, 1.0, 1), (2.3, 1.0, 5), (1.5, 0.5, 3), (4.0, 2.0, 2)])
 def test_table_of_a_ruler(device: Device, smoothing: float, step: float, width: int) -> None:
     """The filter cuts the derivative of a Gaussian at three sigmas; the gradient of a ramp is its slope."""

@@ -176,12 +176,18 @@ def test_covariance_refers_to_the_undistorted_image(
 def test_a_region_of_the_image_gives_the_pose_of_the_image(
     features: FeatureSet, device: Device, rng: np.random.Generator
 ) -> None:
-    whole = image(picture(CAMERA, NEAR), rng)
-    expected = bind(features, device, model=CAMERA)(whole, NEAR).pose.copy()
-    top, left = 3, 4
+    """The features lie 3 px from their expected places, and the region begins far from the corner of the image."""
+    whole = image(picture(CAMERA, NEAR + np.array([-2.5 * PIXEL, 3 * PIXEL, 4e-3])), rng)
+    of_whole = bind(features, device, model=CAMERA)
+    expected = of_whole(whole, NEAR)
+    top, left = 4, 80
     cut = np.ascontiguousarray(whole[top:-2, left:-2])
     found = bind(features, device, shape=cut.shape, frame_shape=SHAPE, model=CAMERA)(cut, NEAR, corner=(left, top))
-    assert (np.abs(found.pose - expected) <= (1e-3 * PIXEL, 1e-3 * PIXEL, 3e-6)).all()
+    assert not found.feature_status.any()
+    assert (np.abs(found.pose - expected.pose) <= (1e-3 * PIXEL, 1e-3 * PIXEL, 3e-6)).all()
+    np.testing.assert_allclose(found.residuals, expected.residuals, rtol=0, atol=2e-3 * PIXEL)
+    unit = np.sqrt(np.outer(np.diag(expected.covariance), np.diag(expected.covariance)))
+    np.testing.assert_allclose(found.covariance / unit, expected.covariance / unit, rtol=0, atol=2e-3)
 
 
 @pytest.mark.slow  # two more builds

@@ -150,7 +150,7 @@ def _contexts_of(path: Path) -> dict[int, list[str]]:
     data = coverage.CoverageData(str(_DATA))
     data.read()
     return {
-        line: [context.partition("|")[0] for context in contexts if context]
+        line: [context.rpartition("|")[0] for context in contexts if context]
         for line, contexts in data.contexts_by_lineno(str(path.relative_to(ROOT))).items()
     }
 

@@ -83,7 +83,7 @@ class MirrorSurfaces:
     @functools.cached_property
     def reflects(self) -> npt.NDArray[np.bool_]:
         """Whether each triangle is a mirror that light can meet."""
-        mirror = np.array([each.mirror for each in self.materials] or [0.0])
+        mirror = np.array([each.mirror for each in self.materials])
         is_mirror = np.zeros(len(self.material), bool)
         is_mirror[self.scene.bvh.numbers] = True
         return is_mirror & (mirror[self.material] > 0.0)

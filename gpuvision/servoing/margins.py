@@ -281,14 +281,14 @@ def observer_matrix(
     return np.vstack([rows, -gain * now[:1], np.eye(size)[4:-1]])
 
 
-@lru_cache(maxsize=256)
+@lru_cache
 def _response(model: MotionModel, step: float) -> tuple[Float64, Float64]:
     """Return the matrices of position and velocity of one axis (2, 2), and of its command (2,), over a time step."""
     state, command, _ = model.transition(step)
     return state[::3, ::3], command[::3, 0]
 
 
-@lru_cache(maxsize=16)
+@lru_cache
 def _steady_gain(model: MotionModel) -> Float64:
     """Return the gain (2,) of the correction by measurements of the variance 1 in every frame."""
     state, _, noise = model.transition(1.0)

@@ -85,3 +85,22 @@ def test_each_sensor_is_simulated_scanned_and_written(
         f"Range image of the part: {out}/camera_line/picture.png. Errors of the PSD strips from light in the corners: "
         f"{out}/{last}/errors.png and causes.png in the same folder; with a mask: {out}/{last}_masked/errors.png.",
     ]
+
+
+def test_solids_of_the_part() -> None:
+    """Bounds and volumes in millimetres: a plate, a box, a disc of 64 sides, a cap of a sphere, three steps."""
+    solids = sorted(demo.make_part().split(), key=lambda each: tuple(np.round(each.bounds[0], 9)))
+    expected = [
+        ((-23.0, -18.0, -2.0), (23.0, 18.0, 0.0), 46.0 * 36.0 * 2.0),
+        ((-19.0, 4.0, 0.0), (-7.0, 14.0, 6.0), 12.0 * 10.0 * 6.0),
+        ((-18.0, -14.0, 0.0), (-8.0, -4.0, 4.0), 4.0 * 32.0 * 25.0 * np.sin(2.0 * np.pi / 64.0)),
+        ((1.0, -15.0, 0.0), (7.0, -3.0, 1.0), 6.0 * 12.0 * 1.0),
+        ((2.0, 0.0, -11.0), (18.0, 16.0, 5.0), 4.0 / 3.0 * np.pi * 8.0**3),
+        ((7.0, -15.0, 0.0), (13.0, -3.0, 2.0), 6.0 * 12.0 * 2.0),
+        ((13.0, -15.0, 0.0), (19.0, -3.0, 3.0), 6.0 * 12.0 * 3.0),
+    ]
+    assert len(solids) == len(expected)
+    for solid, (low, high, volume) in zip(solids, expected, strict=True):
+        np.testing.assert_allclose(1e3 * solid.bounds, [low, high], atol=0.05)
+        is_sphere = volume > 2000.0 and len(solid.faces) > 1000
+        assert 1e9 * solid.volume == pytest.approx(volume, rel=0.01 if is_sphere else 1e-6)

@@ -147,6 +147,17 @@ def test_a_grid_of_any_index_has_rows_and_columns(
     np.testing.assert_array_equal(found, expected)
 
 
+def test_a_patch_ends_where_the_orientation_does_not_alternate() -> None:
+    """Between the fourth and the fifth column neighbours have the same orientation."""
+    row, column = (each.ravel() for each in np.indices((6, 8)))
+    points = np.stack([20.0 * column, 20.0 * row], axis=1)
+    sign = (-1.0) ** (row + column + (column > 3))
+    found = index_patches(points, 6, np.stack([sign, np.zeros(48)], axis=1))
+    halves = [np.flatnonzero(column < 4).tolist(), np.flatnonzero(column > 3).tolist()]
+    assert sorted(sorted(each.members.tolist()) for each in found) == sorted(halves)
+    assert len(index_patches(points, 6)) == 1
+
+
 def test_the_seed_has_the_median_steps() -> None:
     """Of five points with steps that differ in length and in the angle between them, whichever step comes first."""
     bases = np.array(

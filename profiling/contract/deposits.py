@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.inspection.deposits import MeasureDeposits
-from gpuvision.profiling.contract.agreement import Case, equal, roundings
+from gpuvision.profiling.contract.agreement import Case, Limit, equal, roundings
 from gpuvision.reference.deposits import Plane, measure_deposit
 from gpuvision.status import Status
 
@@ -17,7 +17,10 @@ _HEIGHT = "surface and difference: a height has four half epsilons of its distan
 LIMITS = {
     "MeasureDeposits": (
         equal("status", reason="comparisons only, except within rounding of the significance"),
-        roundings(4, "area", of="area [m^2]", reason="weights, sum and product, except for heights at the threshold"),
+        Limit(
+            ("area",), 1e-6, 2e-15, "area [m^2]",
+            "error model of the docstring: sums to about 1e-6; except for heights within rounding of the threshold",
+        ),
         roundings(1, "valid", of="1", reason="quotient of two counts"),
         roundings(4, "volume", of="sum of the distances of the heights from 0 x cell area [m^3]", reason=_HEIGHT),
         roundings(4, "height_mean", of="largest distance of a height from 0 [m]", reason=_HEIGHT),

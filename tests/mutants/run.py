@@ -22,6 +22,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -135,6 +136,7 @@ class _Tree:
     def __init__(self, folder: Path, seconds: int) -> None:
         self.folder = folder
         self.seconds = seconds  # limit of the processor time of a run of tests [s]; 0: no limit
+        self._written = 0  # files written by `_write`
         self.omitted: list[str] = []  # tests that fail without a fault
         shutil.rmtree(folder, ignore_errors=True)
         names = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
@@ -154,13 +156,13 @@ class _Tree:
             return {"state": "survived", "by": "no test runs this line"}
         place = self.folder / fault.file
         text = place.read_text()
-        place.write_text(fault.planted(text))
+        self._write(place, fault.planted(text))
         try:
             status, failed, said = self._pytest(tests)
         except subprocess.TimeoutExpired:
             return {"state": "did not end", "by": " ".join(tests)[:200]}
         finally:
-            place.write_text(text)
+            self._write(place, text)
         if status == 0:
             return {"state": "survived", "by": " ".join(tests)[:200]}
         if status == -signal.SIGXCPU:
@@ -174,6 +176,16 @@ class _Tree:
         if self._pytest(tests, "--collect-only")[0] != 0:
             raise RuntimeError(f"these tests cannot be collected without a fault: {' '.join(tests)}\n{said}")
         return {"state": "not built", "by": said.strip().splitlines()[-1][:200]}
+
+    def _write(self, place: Path, text: str) -> None:
+        """Write a file with a later time than before: compiled code of a file with the same time and size stays valid.
+
+        Python compares whole seconds, and a fault that breaks an import ends the tests within a second.
+        """
+        place.write_text(text)
+        self._written += 1
+        later = time.time() + 2 * self._written
+        os.utime(place, (later, later))
 
     def failing(self, names: set[str]) -> set[str]:
         """Return the tests that fail without a fault."""

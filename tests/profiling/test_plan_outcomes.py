@@ -1,0 +1,127 @@
+"""Plans of random jobs against truth: costs, shares of plans that hold, and the outcome of a job."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpuvision.accuracy.plan import PlanError
+from gpuvision.profiling import location_plans, scan_plans
+from gpuvision.profiling.location_plans import Measured
+from gpuvision.profiling.plan_outcomes import Outcome, cost_of, summary
+
+
+def plan_of(seconds: float) -> Any:
+    return SimpleNamespace(chosen=SimpleNamespace(seconds=seconds, name="a"))
+
+
+def test_the_cost_is_relative_to_the_fastest_setting_that_meets_the_tolerance() -> None:
+    meeting = [SimpleNamespace(seconds=each) for each in (5.0, 2.0, 4.0)]
+    assert cost_of(plan_of(3.0), meeting) == 1.5
+    assert math.isnan(cost_of(plan_of(3.0), []))
+
+
+def test_shares_of_plans_that_hold() -> None:
+    outcomes = [
+        Outcome(plan_of(1.0), 2.0, 1.0, True, 1.0),
+        Outcome(plan_of(1.0), 2.0, 2.0, True, 1.5),
+        Outcome(plan_of(1.0), 2.0, 2.5, False, math.nan, keeps_up=False),
+        Outcome(plan_of(1.0), 2.0, 1.0, True, 1.6),
+        Outcome(None, 2.0, possible=True),
+        Outcome(None, 2.0),
+    ]
+    assert summary(outcomes).splitlines() == [
+        "6 jobs: 4 plans, 2 refused",
+        "error within the tolerance: 3 of 4, largest 1.25 tolerances",
+        "kept up with the rate: 3 of 4",
+        "cost at most 1.5 times the best: 2 of 3, largest 1.60",
+        "refused although a setting is truly accurate and fast enough: 1",
+    ]
+    assert summary([]).splitlines()[0] == "0 jobs: 0 plans, 0 refused"
+
+
+# Times, predicted and true errors of three settings.
+SETTINGS = {"fast": (1.0, 4.0, 3.0), "middle": (2.0, 2.0, 1.9), "slow": (4.0, 1.0, 1.2)}
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "chosen", "error", "cost", "possible"),
+    [(4.5, "fast", 3.0, 1.0, True), (2.2, "middle", 1.9, 1.0, True), (1.95, "slow", 1.2, 2.0, True)],
+)
+def test_outcome_of_a_scan(
+    monkeypatch: pytest.MonkeyPatch, tolerance: float, chosen: str, error: float, cost: float, possible: bool
+) -> None:
+    """The least predicted error is 1, so that the tolerance of the job is a multiple of it."""
+    trials = [SimpleNamespace(readout=name, seconds=each[0], error=each[1]) for name, each in SETTINGS.items()]
+    asked: list[Any] = []
+
+    def plan_scan(frames: Any, sensor: Any, **options: Any) -> Any:
+        asked.append(options)
+        fits = [each for each in trials if 1.1 * each.error <= options["tolerance"]]
+        return SimpleNamespace(trials=trials, chosen=fits[0] if fits else trials[-1])
+
+    job: Any = SimpleNamespace(frames=None, sensor=None, tolerance=tolerance, rate=0.25)
+    monkeypatch.setattr(scan_plans, "random_job", lambda rng: job)
+    monkeypatch.setattr(scan_plans, "plan_scan", plan_scan)
+    monkeypatch.setattr(scan_plans, "usable_trials", lambda trials, limits: trials)
+    monkeypatch.setattr(scan_plans, "true_error", lambda job, readout, device: SETTINGS[readout][2])
+    monkeypatch.setattr(scan_plans, "_lost", lambda job, plan, rate: 3)
+    device: Any = None
+    found = scan_plans.judge(np.random.default_rng(1), device)
+    assert found.plan is not None
+    assert found.plan.chosen.readout == chosen
+    assert (found.tolerance, found.error, found.cost) == (tolerance, error, cost)
+    assert (found.possible, found.keeps_up) == (possible, False)
+    assert (asked[1]["tolerance"], asked[1]["rate"]) == (tolerance, 0.25)
+
+    def refuse(frames: Any, sensor: Any, **options: Any) -> Any:
+        if options["tolerance"] == 1.0:  # the first plan
+            return SimpleNamespace(trials=trials)
+        raise PlanError("none", (), ())
+
+    monkeypatch.setattr(scan_plans, "plan_scan", refuse)
+    assert scan_plans.judge(np.random.default_rng(1), device)[:1] == (None,)
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "rate", "chosen", "possible"),
+    [(2.2, 0.25, "middle", True), (1.95, 0.2, "slow", True), (1.95, 0.3, None, True), (1.05, 0.1, None, False)],
+)
+def test_outcome_of_a_localization(
+    monkeypatch: pytest.MonkeyPatch, tolerance: float, rate: float, chosen: str | None, possible: bool
+) -> None:
+    """The middle setting truly meets 1.95, its prediction times 1.1 does not; 0.3 / s is too fast for the slow one."""
+    trials = [
+        SimpleNamespace(name=name, features=name, seconds=each[0], error=each[1]) for name, each in SETTINGS.items()
+    ]
+    true = {name: Measured(each[2], each[0], 0.0) for name, each in SETTINGS.items()}
+
+    def choose(located: Any, trials: Any, *, tolerance: float, rate: float, limits: Any) -> Any:
+        fits = [each for each in trials if 1.1 * each.error <= tolerance]
+        if not fits or fits[0].seconds * rate > 1.0:
+            raise PlanError("none", (), ())
+        return SimpleNamespace(chosen=fits[0], trials=trials)
+
+    job: Any = SimpleNamespace(image=None, artwork=None, options={}, tolerance=tolerance, rate=rate)
+    free = SimpleNamespace(trials=trials, located=None)
+    monkeypatch.setattr(location_plans, "random_job", lambda rng, device: job)
+    monkeypatch.setattr(location_plans, "plan_location", lambda image, artwork, **_: free)
+    monkeypatch.setattr(location_plans, "choose_features", choose)
+    monkeypatch.setattr(location_plans, "usable_feature_sets", lambda trials, limits: trials)
+    monkeypatch.setattr(location_plans, "measure", lambda job, plan, features, device: true[features])
+    device: Any = None
+    found = location_plans.judge(np.random.default_rng(1), device)
+    assert found.possible == possible
+    if chosen is None:
+        assert found.plan is None
+        return
+    assert found.plan is not None
+    assert (found.plan.chosen.name, found.error, found.keeps_up) == (chosen, SETTINGS[chosen][2], True)
+    assert found.cost == SETTINGS[chosen][0] / 2.0
+    # More than 5 % of the images without a pose count as no accuracy.
+    true[chosen] = Measured(0.1, 1.0, 0.06)
+    assert location_plans.judge(np.random.default_rng(1), device).error == math.inf

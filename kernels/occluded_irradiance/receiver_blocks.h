@@ -106,7 +106,7 @@ static inline void add_part(real start, real stop, receiving *seen) {
 #include "occluded_irradiance/visible_part.h"
 
 // LANES receivers of a strip in structure-of-arrays form: positions from the scene's middle and normals, in place
-// (`wide`; normals scaled to about 1) and in real (`at`; unit normals).
+// (`wide`; normals of any length) and in real (`at`; unit normals).
 typedef struct {
     place wide[6][LANES];
     real at[6][LANES];
@@ -129,7 +129,6 @@ static inline void load_block(global const INPUT *receivers, constant place *mid
     const places longest = fmax(fmax(fabs(nx), fabs(ny)), fabs(nz));
     nx /= longest, ny /= longest, nz /= longest;
     const places per = (place)1 / sqrt(nx * nx + ny * ny + nz * nz);
-    *(places_at *)here->wide[3] = nx, *(places_at *)here->wide[4] = ny, *(places_at *)here->wide[5] = nz;
     for (int k = 0; k < 3; k++) store_private(convert_to_reals(load_places(here->wide[k])), here->at[k]);
     store_private(convert_to_reals(nx * per), here->at[3]);
     store_private(convert_to_reals(ny * per), here->at[4]);

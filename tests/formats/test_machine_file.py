@@ -157,6 +157,10 @@ def test_files_that_a_machine_names(tmp_path: Path) -> None:
             "calibration.pipette_covariance has 2 rows, expected 3",
         ),
         (
+            {"calibration": PRESET["calibration"] | {"pipette_covariance": [[1e-12, 0, 0]] * 4}},
+            "calibration.pipette_covariance has 4 rows, expected 3",
+        ),
+        (
             {"camera": PRESET["camera"] | {"pixel": 10.0}},
             "camera.pixel is 10.0 m, expected a number [m] above 0 and of",
         ),

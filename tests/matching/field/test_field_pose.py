@@ -358,6 +358,7 @@ def test_poses_that_are_none(device: Device, rng: np.random.Generator) -> None:
         np.testing.assert_array_equal(np.isfinite(values.reshape(4, -1)).all(axis=1), [False, False, True, False])
     refined = FieldPoseRefinement(map=field_map)(points[:3], starts[2:3], device=device)
     assert refined.status[0] == Status.LOW_SIGNAL
+    assert np.isnan(refined.poses).all()  # few points alone make the pose invalid; it lies within the map
 
 
 def test_four_exact_points_are_enough(device: Device) -> None:

@@ -326,6 +326,14 @@ def test_ends_do_not_occlude_within_the_clearance(device: Device, variant: Any, 
     assert not AnyHit(scene=both, variant=variant)(touching, device=device).occluded.any()
 
 
+@WAYS
+def test_a_segment_without_length_is_not_occluded(device: Device, variant: Any, dtype: Any) -> None:
+    places = np.array([[0.25, 0.25, 0.0], [0.25, 0.25, 0.5], [7.0, -3.0, 2.0]], dtype)
+    result = AnyHit(scene=Scene(TRIANGLE), variant=variant)(np.hstack([places, places]), device=device)
+    np.testing.assert_array_equal(result.occluded, 0)
+    np.testing.assert_array_equal(result.status, Status.OK)
+
+
 @pytest.mark.double
 def test_far_from_the_origin_in_single(device: Device, rng: np.random.Generator) -> None:
     """The centre of the scene is subtracted in double: details of a micrometre survive at distances of kilometres."""

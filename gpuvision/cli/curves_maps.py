@@ -38,20 +38,26 @@ def measure_stability(
 
 
 def _show(maps: Sequence[StabilityMap], limits: Sequence[float]) -> None:
-    """Print for each map the axes, and the fraction of the places within each limit."""
+    """Print the fraction of the places of each map within each limit, and then the inputs of each operation."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title="places within a relative error", title_justify="left")
-    for heading in ("operation", "device", "inputs", "relative to"):
+    for heading in ("operation", "device"):
         table.add_column(heading, overflow="fold")
     for limit in limits:
         table.add_column(f"{limit:.0e}", justify="right")
         table.add_column("by model", justify="right")
     for each in maps:
-        inputs = escape("\n".join(f"{axis.name} {axis.low:g} to {axis.high:g}" for axis in each.axes))
         shares = (f"{share(limit):.0%}" for limit in limits for share in (each.share, each.allowed))
-        table.add_row(each.operation, each.device, inputs, each.relative_to, *shares)
+        table.add_row(each.operation, each.device, *shares)
     Console().print(table)
+    for line in dict.fromkeys(_inputs(each) for each in maps):
+        echo(line)
+
+
+def _inputs(each: StabilityMap) -> str:
+    """Return a line with the unit of the error and the ranges of the inputs of a map."""
+    ranges = ", ".join(f"{axis.name} {axis.low:g} to {axis.high:g}" for axis in each.axes)
+    return f"{each.operation}: error relative to {each.relative_to}; {ranges}"

@@ -35,7 +35,7 @@ _LARGEST_INTEGER = (1 << 31) - 1  # of a 32-bit integer
 
 
 # Tokens of TOML that matter for the depth of its tables. Possessive quantifiers of characters keep the scan linear in
-# the size; those of groups fail in Python 3.11.2 (CPython issue 106052).
+# the size. A possessive group with a negative lookahead matches too much before Python 3.11.5 (CPython issue 100061).
 _TOKEN = re.compile(
     r"""(?P<part>\"{3}[^"\\]*+(?:(?:\\.|"(?!""))[^"\\]*+)*\"{3}|'{3}.*?'{3}"""
     r"""|"[^"\\\n]*+(?:\\.[^"\\\n]*+)*"|'[^'\n]*+'|[\w+-]++)"""

@@ -1,4 +1,4 @@
-"""Plan of a job: settings that were tried, the fastest that meets the tolerance, and what a little more buys."""
+"""Plan of a job: the tried settings, the fastest that meets the tolerance, and faster and more accurate ones."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class PlanError(GpuVisionError):
     trials : tuple of Trial
         The settings that were tried, fastest first.
     usable : tuple of Trial
-        Those of them that may be chosen.
+        The settings that may be chosen.
     """
 
     def __init__(self, message: str, trials: Sequence[Trial], usable: Sequence[Trial]) -> None:
@@ -69,13 +69,13 @@ class AccuracyPlan(abc.ABC, Generic[AnyTrial]):
 
     @property
     def faster(self) -> AnyTrial | None:
-        """Most accurate setting that is faster by 5 % or more: what a larger tolerance allows. None if none is."""
+        """Most accurate setting that is faster by 5 % or more, for a larger tolerance; None if no setting is faster."""
         quicker = [each for each in self.usable if each.seconds < _SMALL_GAIN * self.chosen.seconds]
         return min(quicker, key=lambda each: each.error, default=None)
 
     @property
     def finer(self) -> AnyTrial | None:
-        """Fastest setting that is more accurate by 5 % or more: what a longer time allows. None if none is."""
+        """Fastest setting that is more accurate by 5 % or more, for a longer time; None if there is no such setting."""
         finer = [each for each in self.usable if each.error < _SMALL_GAIN * self.chosen.error]
         return min(finer, key=lambda each: each.seconds, default=None)
 
@@ -128,18 +128,18 @@ def fastest_within(
     Parameters
     ----------
     trials, usable : sequence of Trial
-        All settings, and those that may be chosen, one or more.
+        All settings, and the settings that may be chosen (at least one).
     tolerance : float
         Largest error [m].
     margin : float
         Least ratio of the tolerance to the predicted error.
     kind : str
-        What a setting is called in messages.
+        Word for a setting in messages, such as "readout".
 
     Raises
     ------
     PlanError
-        None does; the message names the tolerance that the most accurate setting meets.
+        No setting meets it; the message names the tolerance that the most accurate setting meets.
     """
     met = [each for each in usable if margin * each.error <= tolerance]
     if met:
@@ -220,7 +220,7 @@ def check_time(
     Raises
     ------
     PlanError
-        It does not; the message names the most accurate setting that does.
+        It is too slow; the message names the most accurate setting that does.
     """
     if limit is None or chosen.seconds <= limit.seconds:
         return

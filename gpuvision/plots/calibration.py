@@ -98,9 +98,8 @@ def _draw_uncertainty(axes: Axes, calibration: Calibration) -> None:
     largest = float(found.sigma_px[known].max()) if known.any() else 0.0
     if largest > 0.0:
         least = max(float(found.sigma_px[known].min()), 1e-3 * largest)
-        levels = np.geomspace(
-            least, max(largest, 1.001 * least), 13
-        )  # distinct, also where all uncertainties are equal
+        # Distinct levels, also where all uncertainties are equal.
+        levels = np.geomspace(least, max(largest, 1.001 * least), 13)
         shown = axes.contourf(
             x, y, np.ma.masked_where(~known, np.maximum(found.sigma_px, least)), levels=levels,
             cmap="cividis", norm=LogNorm(levels[0], levels[-1]), extend="max",

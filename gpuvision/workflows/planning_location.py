@@ -43,8 +43,8 @@ _BUDGETS = (15, 30, 60, 120, 240, 480)
 _BEST, _DENSE = math.sqrt(5.0), 1.0
 _RULERS = ((3, _BEST), (5, _BEST), (9, _BEST), (5, _DENSE))
 _ROUNDS = 15  # of the timing, of which the median counts
-# Standard deviation of errors that all rulers share, such as those of neighbouring edges [px]. Measured: what remains
-# of the true errors of `gpuvision.profiling.location_plans`, up to 0.006 px.
+# Standard deviation of errors that all rulers share, such as errors by neighbouring edges [px]. Measured: the
+# unexplained part of the true errors in `gpuvision.profiling.location_plans` is up to 0.006 px.
 _COMMON_PX = 0.005
 _UNKNOWNS = 4  # x, y, theta and the etch bias
 _CHANCE = 2.0  # standard deviations of a residual scale that is significantly above 1. Chosen

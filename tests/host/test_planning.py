@@ -159,7 +159,7 @@ def test_throughput_of_a_round(measurement: Any, monkeypatch: pytest.MonkeyPatch
     assert stream.how == {"batch": 4, "ring": 4, "inline": True, "device": "a device", "zero_copy": True}
 
 
-def test_time_of_single_batches(measurement: Any) -> None:
+def test_time_of_single_batches(measurement: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fifteen batches count, after two; each is read when the one before has been delivered."""
     released: list[int] = []
 
@@ -168,11 +168,8 @@ def test_time_of_single_batches(measurement: Any) -> None:
             super().__init__(frames, count)
             self.released = SimpleNamespace(release=lambda: released.append(1))
 
-    planning_stepped, planning._Stepped = planning._Stepped, Stepped  # type: ignore[misc, assignment]
-    try:
-        assert measurement._one_by_one(4, False) == 3e-3
-    finally:
-        planning._Stepped = planning_stepped  # type: ignore[misc]
+    monkeypatch.setattr(planning, "_Stepped", Stepped)
+    assert measurement._one_by_one(4, False) == 3e-3
     (stream,) = FakeStream.made
     assert stream.source.length == 60
     how = {"batch": 4, "ring": 2, "warm_up": 2, "inline": False, "device": "a device", "zero_copy": True}

@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.blob import TUNING_CONSTANT, FindBlobs
-from gpuvision.profiling.harness import Case, Peer
+from gpuvision.profiling.harness import Case, Peer, traffic_of
+from gpuvision.profiling.pose import add_flops, factor_flops, solve_flops
+from gpuvision.profiling.ruler import frame_bytes, ruler_flops
 
 CELL, RADIUS, BLUR, CONTRAST, NOISE, OFF = 40, 8.0, 1.0, 100.0, 2.0, 2.0
 _DIFFERENCE = 0.01  # px: difference of a centre by a match that takes a step more or less
@@ -492,6 +494,22 @@ def scene(count: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[n
     return np.rint(image).astype(np.uint8), nominal.astype(np.float32), true
 
 
+# Operations in kernels/blob of a disc. Of a start circle: three edges 36 in each of 3 steps, solution 54; its loss 14
+# for each edge. Of an edge in a fit: residual and derivatives 17, weight 6, sums 3. Of a pixel in the match: place 7,
+# blurred disc 38, equation 8, weight 5, its squares 4; of the centre of gravity 14.
+_START, _LOSS, _FIT_EDGE, _MATCH_PIXEL, _GRAVITY_PIXEL = 3 * 90, 14, 26, 62, 14
+_FIT_STEPS = 4  # from twice the reach: two to the least scale, two at the estimated scale
+
+
+def blob_flops() -> float:
+    """Return the operations of a disc with one placement of its rulers and one step of the match: the least number."""
+    starts = _TRIPLES * (_START + _LOSS * SPOKES)
+    fit = _FIT_STEPS * (SPOKES * (_FIT_EDGE + add_flops(3)) + factor_flops(3) + solve_flops(3))
+    matched, weighed = (math.pi * (RADIUS + more) ** 2 for more in (5.0 * BLUR + 2.0, 2.5 * BLUR + 3.0))
+    match = matched * (_MATCH_PIXEL + add_flops(_UNKNOWNS)) + factor_flops(_UNKNOWNS) + 4 * solve_flops(_UNKNOWNS)
+    return SPOKES * ruler_flops(LENGTH, 1, REACH) + starts + fit + match + weighed * _GRAVITY_PIXEL
+
+
 def cases(device: Device) -> Iterator[Case]:
     """Yield 16, 100 and 1000 blobs."""
     for count in (16, 100, 1000):
@@ -532,7 +550,11 @@ def _case(device: Device, count: int) -> Case:
         "numba": calls,
         "opencv": lambda: _moments(image, places),
     }
-    return Case("blob", str(count), bound.run, peers, float(np.max(np.abs(ours - true))), metadata=metadata)
+    error = float(np.max(np.abs(ours - true)))
+    taken = frame_bytes(image, math.ceil(count * math.pi * (RADIUS + 5.0 * BLUR + 2.0) ** 2))
+    traffic = (taken + places.nbytes, traffic_of(bound)[1])
+    flops = count * blob_flops()
+    return Case("blob", str(count), bound.run, peers, error, traffic, metadata=metadata, flops=flops, copied=False)
 
 
 # Forms of the Numba peer: how the first circle is found, on all cores or on one.

@@ -106,6 +106,11 @@ def _matrix(placed: Array) -> Array:
     return np.concatenate([linear, (np.array([u, v]) - linear @ [middle, middle])[:, None]], axis=1)
 
 
+# Operations in kernels/board_image. Of a pixel under a sub-pose: place 8, its fractions 2, bilinear value 9, sum 1. Of
+# a pixel: place 1, unit 1, logarithm 16 and cosine 14 as polynomials, radius 2, noise 4, grey level 2.
+_SAMPLE, _PIXEL = 20, 40
+
+
 def cases(device: Device) -> Iterator[Case]:
     """Yield a frame of a camera at rest, and a frame with motion blur."""
     yield _case(device, "256", 1)
@@ -148,4 +153,5 @@ def _case(device: Device, name: str, count: int) -> Case:
     quiet = RenderBoard(board=board, shape=(SIDE, SIDE))(poses[None], np.zeros(1, np.uint32), device=device).image[0]
     # Each pixel lies on four nodes of two bytes; neighbouring pixels share none.
     traffic = (SIDE * SIDE * 8 * count, SIDE * SIDE)
-    return Case("board_image", name, bound.run, peers, float(np.max(np.abs(quiet - exact))), traffic)
+    flops = SIDE * SIDE * (_PIXEL + _SAMPLE * count)
+    return Case("board_image", name, bound.run, peers, float(np.max(np.abs(quiet - exact))), traffic, flops=flops)

@@ -25,8 +25,9 @@ from gpuvision.matching.robust import sample_subsets
 from gpuvision.profiling import pose as of_pose
 from gpuvision.profiling import ruler as of_ruler
 from gpuvision.profiling import ruler_peers
-from gpuvision.profiling.harness import Case, Peer
+from gpuvision.profiling.harness import Case, Peer, traffic_of
 from gpuvision.profiling.line_fit import EFFICIENCY, STEPS, TRIALS, fit_line
+from gpuvision.profiling.line_fit import fit_flops as line_flops
 from gpuvision.profiling.pose import PLACEMENT, fit_pose, numpy_pose, tukey_root
 
 LINES, EACH = 10, 10
@@ -239,11 +240,35 @@ def _fused_pose(device: Device) -> Case:
             raise AssertionError(
                 f"the pose of {name} differs from that in double: {each} and {exact}, standard deviations {sigma}"
             )
+    taken = of_ruler.frame_bytes(image, len(flat) * ruler_peers.LENGTH * ruler_peers.WIDTH)
+    traffic = (taken + rulers.nbytes + lines.nbytes, traffic_of(bound)[1])
     metadata = {"p50_us": _median(bound.run) * 1e6, "sigma_m": float(sigma[0])}
     metadata["numba_error"] = max(_worst(each, exact) for _, each, _ in results)
     metadata["numpy_error"] = _worst(rounded, exact)
     peers: dict[str, Peer] = {"numpy": by_numpy, "numba": forms}
-    return Case("pose", "local-fix", bound.run, peers, _worst(ours, exact), metadata=metadata)
+    return Case(
+        "pose",
+        "local-fix",
+        bound.run,
+        peers,
+        _worst(ours, exact),
+        traffic,
+        metadata=metadata,
+        flops=pose_flops(len(by_numpy.pairs), len(by_numpy.starts)),
+        copied=False,
+    )
+
+
+# Operations in kernels/board_pose: of an edge its place in the frame of its line 9, sigma 4, certainty 1; of a line two
+# rows, each 16.
+_EDGE, _LINE = 14, 32
+
+
+def pose_flops(pairs: int, starts: int) -> int:
+    """Return the operations of a board pose: edges, lines from pairs of edges, the pose from starts."""
+    edge = _EDGE + of_ruler.ruler_flops(ruler_peers.LENGTH, ruler_peers.WIDTH, ruler_peers.REACH)
+    of_lines = LINES * (EACH * edge + line_flops(EACH, pairs) + _LINE)
+    return of_lines + of_pose.fit_flops(2 * LINES, starts)
 
 
 def _worst(pose: NDArray[Any], exact: NDArray[Any]) -> float:

@@ -30,7 +30,7 @@ from gpuvision.profiling import ruler as of_ruler
 from gpuvision.profiling import ruler_peers
 from gpuvision.profiling.harness import Case, Peer
 from gpuvision.profiling.line_fit import STEPS, TRIALS
-from gpuvision.profiling.pose import fit_pose, numpy_pose
+from gpuvision.profiling.pose import fit_flops, fit_pose, numpy_pose
 
 SIZES = (128, 192, 256)
 RULERS, PIXEL, NOISE = 60, 10e-6, 2.0
@@ -123,6 +123,16 @@ def _estimator(measure: Any) -> Any:
     return estimate
 
 
+# Operations in kernels/feature_pose of a ruler: its place and direction in the frame 14, the row of its edge 12.
+_ROW = 26
+
+
+def pose_flops(starts: int) -> int:
+    """Return the operations of a pose of a camera: rulers, and the pose from starts."""
+    ruler = of_ruler.ruler_flops(ruler_peers.LENGTH, ruler_peers.WIDTH, ruler_peers.REACH)
+    return RULERS * (ruler + _ROW) + fit_flops(RULERS, starts)
+
+
 class _Numpy:
     """Pose by NumPy, with samples from OpenCV's remap."""
 
@@ -201,7 +211,11 @@ def _case(device: Device, size: int) -> Case:
         for name, (p50, p99) in zip(names, percentiles(*calls), strict=True):
             metadata |= {f"{name}p50_us": p50, f"{name}p99_us": p99}
     error = float(np.max(np.abs(of_ours[:2] - true[:2])))
-    return Case("servo", str(size), ours, peers, error, metadata=metadata | {"sigma_m": float(sigma[0])})
+    metadata |= {"sigma_m": float(sigma[0])}
+    # The frame is copied to the device, the rulers are not.
+    traffic = (frame.nbytes, sum(np.asarray(each).nbytes for each in result))
+    flops = pose_flops(len(starts))
+    return Case("servo", str(size), ours, peers, error, traffic, metadata=metadata, flops=flops, copied=False)
 
 
 def percentiles(*calls: Callable[[], object]) -> list[tuple[float, float]]:

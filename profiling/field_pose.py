@@ -29,7 +29,7 @@ from gpuvision.host import Device, to_numpy
 from gpuvision.matching.field.distance_map import COST_LEVELS, DistanceMap
 from gpuvision.matching.field.field_pose import FieldPoseRefinement, FieldPoseSearch
 from gpuvision.profiling import distance_map, shift_peers
-from gpuvision.profiling.harness import Case, Peer
+from gpuvision.profiling.harness import Case, Peer, traffic_of
 
 _BLOCK, _RAYS = 64, 64
 
@@ -133,6 +133,11 @@ class _Search:
         self.float_level = field_map.cells.level.astype(np.float32)
 
     @property
+    def flops(self) -> int:
+        """Operations on levels: a sum for each ray of each pose, and its scale."""
+        return self.scores.size * (_RAYS + 1)
+
+    @property
     def traffic(self) -> tuple[int, int]:
         """Bytes read from the map and bytes written."""
         return self.map.cells.level.nbytes, self.scores.nbytes + 2 * self.least.nbytes
@@ -207,9 +212,10 @@ def _global(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> 
     forms = search.numba_forms()
     search.check(*forms.values(), search.numpy_poses, search.numba_poses, search.numpy_shifts)
     peers: dict[str, Peer] = {"numba": forms, "numba-plain": search.numba_poses, "numpy": search.numpy_poses}
-    yield Case("field", "global", search.bound.run, peers, search.error, search.traffic, metadata=metadata)
+    error, traffic, flops = search.error, search.traffic, search.flops
+    yield Case("field", "global", search.bound.run, peers, error, traffic, metadata=metadata, flops=flops)
     peers = {"numpy": search.numpy_shifts}
-    yield Case("field", "global-shifts", search.bound.run, peers, search.error, search.traffic, metadata=metadata)
+    yield Case("field", "global-shifts", search.bound.run, peers, error, traffic, metadata=metadata, flops=flops)
 
 
 def _turns(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> Case:
@@ -219,7 +225,8 @@ def _turns(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> C
     search.check(*forms.values())
     metadata = {"poses": search.scores.size, "rays": _RAYS}
     peers: dict[str, Peer] = {"numba": forms}
-    return Case("field", "turns", search.bound.run, peers, search.error, search.traffic, metadata=metadata)
+    error, traffic, flops = search.error, search.traffic, search.flops
+    return Case("field", "turns", search.bound.run, peers, error, traffic, metadata=metadata, flops=flops)
 
 
 # ---- local ---------------------------------------------------------------------------------------------------
@@ -240,6 +247,27 @@ def _offsets(shapes: NDArray[Any], which: NDArray[Any], x: NDArray[Any], y: NDAr
     away = np.where(straight, across, np.where((radius > 0.0) & ~on_line, far - radius, length))
     nx, ny = np.where(straight, 0.0, ox / length), np.where(straight, 1.0, oy / length)
     return away, c * nx - s * ny, s * nx + c * ny
+
+
+# Operations in kernels/field_pose/field_refinement.h. Of a point at a pose: its place 8, cell 4, distance from a line
+# 9, turn 3, weight 5, cost 2, normal equations 21; in the covariance place, distance and turn, weights 11, two matrices
+# 45. Of a step: damping 12, cofactors 18, solution 24. Of a pose: squared distances 5 for each point; covariance 300.
+_POINT, _OF_COVARIANCE, _STEP, _COVARIANCE, _LINE = 43, 67, 54, 300, 9
+
+
+def refinement_flops(points: int, steps: int) -> int:
+    """Return the operations of a refinement in which the first line of each cell is the nearest: the least number."""
+    evaluations = (steps + 1) * points * (_POINT + _LINE)
+    return evaluations + steps * _STEP + points * (_OF_COVARIANCE + _LINE + 5) + _COVARIANCE
+
+
+def steps_of(device: Device, field_map: DistanceMap, points: NDArray[Any], start: NDArray[Any]) -> int:
+    """Return the number of steps after which the refinement of a start does not change its pose."""
+    refined = [
+        to_numpy(FieldPoseRefinement(map=field_map, max_iterations=steps)(points, start[None], device=device).poses)
+        for steps in range(1, FieldPoseRefinement(map=field_map).max_iterations + 1)
+    ]
+    return 1 + next(steps for steps, pose in enumerate(refined) if np.array_equal(pose, refined[-1]))
 
 
 def _local(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> Case:
@@ -277,4 +305,15 @@ def _local(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> C
         return fit.x, np.linalg.inv(fit.jac.T @ fit.jac)
 
     error = float(np.max(np.abs(to_numpy(ours.poses)[0] - scipy()[0])))
-    return Case("field", "local", bound.run, {"scipy": scipy}, error, metadata={"rays": _RAYS})
+    flops = refinement_flops(_RAYS, steps_of(device, field_map, points, start.astype(np.float32)))
+    return Case(
+        "field",
+        "local",
+        bound.run,
+        {"scipy": scipy},
+        error,
+        traffic_of(bound),
+        metadata={"rays": _RAYS},
+        flops=flops,
+        copied=False,
+    )

@@ -118,7 +118,7 @@ class Case:
     error
         Our largest error compared with float64 on the input of the case, in the unit of the output.
     traffic
-        Least number of bytes (read, written) of the work, for the fraction of the device's limit; None: no fraction.
+        Least number of bytes (read, written) of the work, for its place in the roofline; None: it has none.
     repeats
         Number of times that each function does the work back to back; the times in a row are for one.
     metadata
@@ -127,11 +127,16 @@ class Case:
         Factors, by the name of the peer, that multiply the measured time of a peer which does only a part of the work,
         because all of it would take too long. The module of the case documents the origin of a factor.
     flops
-        Number of floating-point additions, subtractions, multiplications and divisions of the work, counted in its
-        formulas; None: no fraction of the device's FLOP rate. The module of the case documents the count.
+        Number of additions, subtractions, multiplications and divisions of the work, counted in its formulas; None: no
+        fraction of the device's FLOP rate. They are floating-point operations, or operations on pixels and levels where
+        the formulas compute in integers. A root, an exponential and the like count 1. The module of the case documents
+        the count.
     bound
         Bound operation that `ours` launches, for the times on the device. It is found without being given if `ours` is
         a method of it; None: no times on the device.
+    copied
+        Whether a copy with the traffic is timed in turn with the functions, for the fraction of the device's limit. It
+        evicts the caches for the function that is timed next, and not for the others.
     """
 
     operation: str
@@ -145,6 +150,7 @@ class Case:
     factors: Mapping[str, float] = field(default_factory=dict)
     flops: float | None = None
     bound: Bound[Any] | None = None
+    copied: bool = True
 
     @property
     def launched(self) -> Bound[Any] | None:
@@ -183,8 +189,10 @@ class Row:
         functions that launch several operations, and where the runtime gives no times.
     queued_seconds, submitted_seconds
         Median times from the enqueue to the submission and from the submission to the start [s].
+    launched
+        Class of the operation that a call launches; empty for functions that launch several operations.
     flops, bytes
-        Floating-point operations and least traffic of one call, as the case declares them [1], [bytes].
+        Operations and least traffic of one call, as the case declares them [1], [bytes].
     flop_fraction
         Rate of the declared operations over the rate of multiply-adds in single precision that the speed probe has
         measured, also where the operation computes in double precision.
@@ -210,6 +218,7 @@ class Row:
     device_seconds: float | None = None
     queued_seconds: float | None = None
     submitted_seconds: float | None = None
+    launched: str = ""
     flops: float | None = None
     bytes: int | None = None
     flop_fraction: float | None = None
@@ -326,11 +335,17 @@ def bind_with(operation: Operation[R], device: Device, *inputs: NDArray[Any]) ->
     return bound
 
 
+def traffic_of(bound: Bound[Any]) -> tuple[int, int]:
+    """Return the bytes of the inputs and of the outputs of a bound operation: the least traffic of a call."""
+    written = (each.nbytes for each in bound.outputs if each is not None)
+    return sum(each.nbytes for each in bound.inputs), sum(written)
+
+
 def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:
     """Measure our function, the peers and the limit of the device interleaved, for about ``seconds`` [s]."""
     calls = {(name, form): call for name, peer in case.peers.items() for form, call in _forms(peer).items()}
     calls[_OURS] = case.ours
-    if case.traffic is not None:
+    if case.traffic is not None and case.copied:
         calls[_CEILING] = ceiling.move(device, *case.traffic, case.repeats)
     recorder = None if case.launched is None else Recorder(case.launched, device)
     if recorder is not None:
@@ -366,6 +381,7 @@ def _common_columns(
         device_seconds=None if events is None else events.running,
         queued_seconds=None if events is None else events.queued,
         submitted_seconds=None if events is None else events.submitted,
+        launched="" if case.launched is None else type(case.launched.operation).__name__,
         flops=case.flops,
         bytes=None if case.traffic is None else sum(case.traffic),
         metadata=case.metadata,

@@ -148,6 +148,22 @@ _ROWS: Mapping[Method, str] = {"centroid": "whole", "windowed": "windowed"}
 _SETTINGS: Mapping[str, Any] = {"threshold": THRESHOLD, "window": WINDOW, "outputs": OUTPUTS}
 
 
+# Operations of a profile for each sample of it or of its window, and once. Centroid: light 1, sum 1, moment 2;
+# quotient. Gaussian through three samples: light and logarithm 6, vertex 7. Filter of four taps: 3; crossing 3. The
+# likelihood takes as many steps as its data need: no number is stated.
+_SAMPLE_FLOPS: Mapping[Method, tuple[int, int]] = {
+    "centroid": (4, 1), "windowed": (4, 2), "gauss3": (0, 13), "fir": (3, 3)
+}  # fmt: skip
+
+
+def profile_flops(method: Method) -> int | None:
+    """Return the operations of a profile, on levels in integers or real numbers; None if they depend on the data."""
+    if method not in _SAMPLE_FLOPS:
+        return None
+    each, once = _SAMPLE_FLOPS[method]
+    return each * (ROWS if method == "centroid" else 2 * WINDOW + 1) + once
+
+
 def _case(device: Device, readout: LineReadout, count: int, name: str) -> Case:
     frames = line_frames(count)
     if readout.along == "rows":
@@ -156,7 +172,9 @@ def _case(device: Device, readout: LineReadout, count: int, name: str) -> Case:
     across = np.swapaxes(frames, 1, 2) if readout.along == "rows" else frames
     peers = _peers(readout, frames, across, bound.outputs)
     error = _error(bound.outputs, across, readout)
-    return Case("line", name, bound.run, peers, error, (frames.nbytes, 9 * count * COLUMNS))
+    traffic, flops = (frames.nbytes, 9 * count * COLUMNS), profile_flops(readout.method)
+    total = None if flops is None else float(flops * count * COLUMNS)
+    return Case("line", name, bound.run, peers, error, traffic, flops=total)
 
 
 def _peers(readout: LineReadout, frames: Frames, across: Frames, ours: Any) -> dict[str, Peer]:

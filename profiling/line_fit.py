@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.line_fit import FitLines
 from gpuvision.matching.robust import efficiency, sample_subsets
-from gpuvision.profiling.harness import Case
+from gpuvision.profiling.harness import Case, traffic_of
 
 _LINES, _SIGMA = 10_000, 0.05  # px
 _FEW = 100  # lines that OpenCV fits; its time is extrapolated to all lines (equal numbers of points)
@@ -88,6 +88,18 @@ def fit_line(u, v, w, pairs):
     return x, y, c, s, _ONE / (EFFICIENCY * sw), _ONE / (EFFICIENCY * suu)
 
 
+# Operations in kernels/line_fit/line_fit.h with Tukey's loss and a given scale. Of a point in the score of a pair:
+# distance 5, residual 1, loss 7, sum 1. Of a pair: direction 2, its square 3, root and quotient 2, products 2. Of a
+# point in a step: place 2, along and across 6, residual 2, weight 4 and 2, moments 11. Of a step: means 3, turn 32,
+# line 17. Of a point in the middle of all and in the variances: 7 and 19, its certainty and place 3.
+_PAIR_POINT, _PAIR, _STEP_POINT, _STEP, _POINT = 14, 9, 27, 52, 29
+
+
+def fit_flops(count: int, pairs: int) -> int:
+    """Return the operations of a fit to `count` points from `pairs` pairs of them."""
+    return pairs * (_PAIR + _PAIR_POINT * count) + STEPS * (_STEP + _STEP_POINT * count) + _POINT * count
+
+
 @numba.njit(parallel=True, error_model="numpy")
 def _numba(points, sigma, pairs, out):
     """Fit the lines one after another in each thread, with separate buffers per thread."""
@@ -133,4 +145,14 @@ def _case(device: Device, count: int) -> Case:
         away = np.abs(np.sum(to_numpy(exact.normal) * (centre - to_numpy(exact.centre)), axis=-1))
         # If two starts are equally good within rounding, precision decides between them: a few in ten thousand lines.
         error = float(np.quantile(away, 0.99))
-    return Case("line_fit", f"tukey/1e4x{count}", bound.run, peers, error, factors={"opencv": _LINES / _FEW})
+    return Case(
+        "line_fit",
+        f"tukey/1e4x{count}",
+        bound.run,
+        peers,
+        error,
+        traffic=traffic_of(bound),
+        factors={"opencv": _LINES / _FEW},
+        flops=_LINES * fit_flops(count, len(pairs)),
+        copied=False,
+    )

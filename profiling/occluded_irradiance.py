@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from gpuvision.host import Bound, Device, to_numpy
 from gpuvision.profiling import adaptive_shadow_rays as adaptive
-from gpuvision.profiling.harness import Case, Peer
+from gpuvision.profiling.harness import Case, Peer, traffic_of
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LitSegments
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
@@ -113,7 +113,7 @@ def _case(device: Device, board: Board, name: str, samples: int = 1024, **more: 
     truth = _truth(device, board, operation) if device.has_double else np.full(ours.shape, np.nan)
     peer = functools.partial(irradiance_by_samples, board, samples, embree_of(board.scene))
     metadata = {**_sizes(board), "peer_error": error_of(peer(), truth), **more}
-    return _finished_case(name, bound, {"numpy+embreex": peer}, error_of(ours, truth), metadata)
+    return _finished_case(board, name, bound, {"numpy+embreex": peer}, error_of(ours, truth), metadata)
 
 
 def _adaptive_case(device: Device, board: Board, limit: float, name: str) -> Case:
@@ -148,7 +148,7 @@ def _adaptive_case(device: Device, board: Board, limit: float, name: str) -> Cas
             "fast": functools.partial(peer, adaptive.NUMBA, setting, fast),
         },
     }
-    return _finished_case(name, bound, peers, error_of(ours, truth), metadata)
+    return _finished_case(board, name, bound, peers, error_of(ours, truth), metadata)
 
 
 def _bound(device: Device, board: Board) -> tuple[OccludedIrradiance, Bound[Any]]:
@@ -174,7 +174,29 @@ def _sizes(board: Board) -> dict[str, Any]:
     return {"triangles": len(board.scene.corners), "segments": len(board.segments.exitance), "receivers": receivers}
 
 
+# Operations in kernels/occluded_irradiance. Of a receiver and a segment: place 3, height above the segment 5. Of two
+# that face each other: two more coordinates 10, normal in the segment's axes 15, heights of the ends 7; view 90; closed
+# form 45 (gpuvision.profiling.line_irradiance).
+_PAIR, _FACING = 8, 167
+
+
+def pair_flops(board: Board) -> int:
+    """Return the operations of a profile without the search for occluders, whose number depends on the tree.
+
+    It is the least number of a profile.
+    """
+    receivers = board.receivers.reshape(-1, 6).astype(np.float64)
+    start, end = (board.segments.ends[:, number] for number in (0, 1))
+    height = np.einsum("ijk,jk->ij", receivers[:, None, :3] - start, board.segments.normals)
+    toward, toward_end = (
+        np.einsum("ijk,ik->ij", each - receivers[:, None, :3], receivers[:, 3:]) for each in (start, end)
+    )
+    facing = (height > 0.0) & ((toward > 0.0) | (toward_end > 0.0))
+    return int(_PAIR * facing.size + _FACING * facing.sum())
+
+
 def _finished_case(
+    board: Board,
     name: str,
     bound: Bound[Any],
     peers: Mapping[str, Peer],
@@ -188,9 +210,13 @@ def _finished_case(
         functools.partial(_in_a_row, bound),
         peers,
         error,
+        traffic_of(bound),
         repeats=_PROFILES,
         metadata=metadata,
         factors=dict.fromkeys(peers, _PROFILES),
+        flops=pair_flops(board),
+        bound=bound,
+        copied=False,
     )
 
 

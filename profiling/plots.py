@@ -16,6 +16,7 @@ from gpuvision.profiling.harness import Row
 from gpuvision.profiling.roofline import draw_roofline
 
 _SIZE = (8.0, 3.6)  # [in]
+_ROOFLINE_SIZE = (8.0, 6.4)  # its legends have a line for each operation
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _GROWTH = re.compile(r"^growth/(?:(\w+)-)?x(\d+)$")
 
@@ -58,7 +59,7 @@ def figures_of(rows: Sequence[Row], machine: Mapping[str, Any] | None = None) ->
     placed = [row for row in rows if row.flops and row.bytes and _roofs(machine, row.device)]
     if placed:
         devices = {row.device: _roofs(machine, row.device) for row in placed}
-        figures["roofline"] = _figure(lambda axes, some: draw_roofline(axes, some, devices), placed)
+        figures["roofline"] = _figure(lambda axes, some: draw_roofline(axes, some, devices), placed, _ROOFLINE_SIZE)
     return figures
 
 
@@ -69,14 +70,19 @@ def _roofs(machine: Mapping[str, Any] | None, device: str) -> Mapping[str, Any]:
     return found if isinstance(found, Mapping) and {"gflops", "bandwidths"} <= set(found) else {}
 
 
-def _figure(draw: Callable[[Any, Sequence[Row]], None], rows: Sequence[Row]) -> Figure:
+def _figure(
+    draw: Callable[[Any, Sequence[Row]], None], rows: Sequence[Row], size: tuple[float, float] = _SIZE
+) -> Figure:
     devices = list(dict.fromkeys(row.device for row in rows))
-    figure = new_figure(*_SIZE)
+    figure = new_figure(*size)
     for axes, device in zip(figure.subplots(1, len(devices), squeeze=False, sharey=True)[0], devices, strict=True):
         axes.set_title(device, fontsize=9, loc="left")
         draw(axes, [row for row in rows if row.device == device])
         axes.grid(which="both", alpha=0.2)
-        axes.legend(fontsize=6.5, frameon=False)
+        if size == _SIZE:
+            axes.legend(fontsize=6.5, frameon=False)
+        else:
+            axes.legend(fontsize=6.5, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.18))
     return figure
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.pose.pose import SolvePose, line_rows
 from gpuvision.matching.robust import sample_subsets
-from gpuvision.profiling.harness import Case
+from gpuvision.profiling.harness import Case, traffic_of
 from gpuvision.profiling.line_fit import EFFICIENCY, STEPS, TRIALS, TUNING_CONSTANT
 
 PLACEMENT = (2e-3, -1e-3)  # m
@@ -148,6 +148,40 @@ def fit_pose(rows, starts, placement, pose, covariance):
     pose[2] = np.arctan2(best[1], _ONE + best[0])
 
 
+def factor_flops(unknowns: int) -> int:
+    """Return the operations of a Cholesky factorisation in kernels/common/least_squares.h."""
+    return sum(i * i + 2 * i + 2 for i in range(unknowns))
+
+
+def solve_flops(unknowns: int) -> int:
+    """Return the operations of a solution by the factors."""
+    return 2 * unknowns * unknowns
+
+
+def add_flops(unknowns: int) -> int:
+    """Return the operations that add a weighted equation to the normal equations."""
+    return unknowns * (unknowns + 4)
+
+
+# Operations in kernels/pose of a rigid pose with Tukey's loss and a given scale. Of a row at a pose: displacement 10,
+# its inverse rotation 8, residual 3, and the derivatives 5. Of a pose: its inverse 6, a step 34. Of a row in a score:
+# the residual in sigmas 1, loss 7, sum 1; in a sum of normal equations also residual 2, weight 6, psi 12.
+_RESIDUAL, _EQUATION, _INVERSE, _MOVE, _LOSS, _WEIGHED = 21, 26, 6, 34, 9, 20
+# Of a row: the largest leverage: residual 3, weight 4, product with the covariance 29. Of a pose: eigenvalues of two
+# matrices by 15 rotations of 49 operations, their Cholesky factors and quotients 71, covariances 200.
+_LEVERAGE, _QUALITY = _EQUATION + 36, 2 * 15 * 49 + 71 + 200
+_START_STEPS = 3
+
+
+def fit_flops(rows: int, trials: int) -> int:
+    """Return the operations of a pose from rows, with `trials` start candidates through three rows each."""
+    solution = _INVERSE + factor_flops(3) + solve_flops(3) + _MOVE
+    candidate = _START_STEPS * (3 * (_EQUATION + add_flops(3)) + solution) + rows * (_RESIDUAL + _LOSS)
+    normal_equations = rows * (_EQUATION + _WEIGHED + add_flops(3))
+    of_steps = STEPS * (normal_equations + solution)
+    return trials * candidate + of_steps + 2 * normal_equations + rows * _LEVERAGE + _QUALITY
+
+
 def tukey_root(z: NDArray[Any]) -> NDArray[Any]:
     """Return the square root of Tukey's weight at residuals in standard deviations."""
     return np.asarray(np.maximum(1.0 - z * z * (1.0 / TUNING_CONSTANT**2), 0.0))
@@ -248,4 +282,14 @@ def _case(device: Device, count: int) -> Case:
             raise AssertionError(f"the pose of {name} differs from the pose in double: {each} and {exact}")
     error = float(np.max(np.abs(ours[:2] - exact[:2])))
     peers: dict[str, Callable[[], object]] = {"numpy": by_numpy, "numba": by_numba}
-    return Case("pose", f"solve/{count}", bound.run, peers, error, metadata={"sigma_m": float(sigma[0])})
+    return Case(
+        "pose",
+        f"solve/{count}",
+        bound.run,
+        peers,
+        error,
+        traffic=traffic_of(bound),
+        metadata={"sigma_m": float(sigma[0])},
+        flops=fit_flops(count, len(starts)),
+        copied=False,
+    )

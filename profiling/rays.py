@@ -22,8 +22,9 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from gpuvision.host import Device, to_numpy
-from gpuvision.profiling.harness import Case
+from gpuvision.host import Bound, Device, to_numpy
+from gpuvision.profiling.harness import Case, traffic_of
+from gpuvision.profiling.ray_visits import visits
 from gpuvision.simulation.scene.bvh import Bvh
 from gpuvision.simulation.scene.rays import AnyHit, ClosestHit
 from gpuvision.simulation.scene.scene import Scene
@@ -33,6 +34,7 @@ _PARTS, _RECEIVERS, _SAMPLES = 40, 4000, 64
 # 0.25 m with positions in single precision (1.5e-8 m): some 1e-4 of the rays.
 _MOST_DIFFERENT = 1e-3
 _CORES = os.cpu_count() or 1
+_COUNTED = 512  # rays whose boxes and triangles are counted
 _LIFT = 1e-5  # distance of a segment's start from the surface [m]
 
 
@@ -102,7 +104,36 @@ def _any_hit(device: Device, name: str, mesh: Any, shuffled: bool) -> Case:
     if max(disagree, fast) > _MOST_DIFFERENT:
         raise AssertionError(f"Embree occludes {disagree:.1%} (robust) and {fast:.1%} (fast) of the rays differently")
     metadata = {"triangles": len(mesh.faces), "segments": len(segments), "occluded": float(np.mean(occluded))}
-    return Case("bvh", f"any-hit/{name}", bound.run, {"embreex": forms}, disagree, metadata=metadata)
+    tree = _tree_of(device, scene)
+    steps = np.hstack([segments[:, :3], segments[:, 3:] - segments[:, :3]])
+    return Case(
+        "bvh",
+        f"any-hit/{name}",
+        bound.run,
+        {"embreex": forms},
+        disagree,
+        _tree_traffic(bound, tree),
+        metadata=metadata,
+        flops=_traced_flops(tree, steps, end=1.0, any_hit=True),
+        copied=False,
+    )
+
+
+def _tree_of(device: Device, scene: Scene) -> Bvh:
+    """Return the tree that the operations traverse on a device."""
+    return scene.bvh if device.prefers_vectors else scene.gpu_bvh
+
+
+def _tree_traffic(bound: Bound[Any], tree: Bvh) -> tuple[int, int]:
+    """Return the bytes of rays and results, and of the tree, which is read once."""
+    read, written = traffic_of(bound)
+    return read + sum(each.nbytes for each in tree.tables(np.dtype(np.float32))), written
+
+
+def _traced_flops(tree: Bvh, rays: NDArray[Any], *, end: float, any_hit: bool) -> float:
+    """Return the operations of all rays, from the tests of every so many of them."""
+    some = rays[:: max(len(rays) // _COUNTED, 1)]
+    return len(rays) * visits(tree, some, end=end, any_hit=any_hit).mean_flops()
 
 
 def view_rays(mesh: Any) -> NDArray[np.float32]:
@@ -126,8 +157,18 @@ def _closest_hit(device: Device, name: str, mesh: Any) -> Case:
     differs = float(np.mean(np.concatenate(embree()) != to_numpy(bound.outputs.triangle)))
     if differs > _MOST_DIFFERENT:
         raise AssertionError(f"Embree hits another triangle with {differs:.1%} of the rays")
-    metadata = {"triangles": len(mesh.faces), "rays": len(rays)}
-    return Case("bvh", f"closest-hit/{name}", bound.run, {"embreex": embree}, differs, metadata=metadata)
+    metadata, tree = {"triangles": len(mesh.faces), "rays": len(rays)}, _tree_of(device, scene)
+    return Case(
+        "bvh",
+        f"closest-hit/{name}",
+        bound.run,
+        {"embreex": embree},
+        differs,
+        _tree_traffic(bound, tree),
+        metadata=metadata,
+        flops=_traced_flops(tree, rays, end=np.inf, any_hit=False),
+        copied=False,
+    )
 
 
 def _build(mesh: Any, size: str) -> Case:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.profiling import ruler_peers
-from gpuvision.profiling.harness import Case, Peer
+from gpuvision.profiling.harness import Case, Peer, traffic_of
 from gpuvision.profiling.ruler_peers import LENGTH, REACH, WIDTH
 
 ROWS, COLUMNS, RADIUS = 480, 640, 150.0
@@ -105,6 +105,24 @@ def _corrected(rulers: NDArray[np.float64], position: NDArray[Any], width: NDArr
     return np.asarray(position - moved)
 
 
+# Operations in kernels/ruler. Of a sample: place 2, bilinear interpolation 9, sum over the lines 1. Of a tap of a
+# gradient: difference, product, sum. Of an edge: parabola through the logarithms 12, amplitude 6, width 4, sigma 6,
+# place 14. Of the bias of the interpolation along an axis: variances and end 8; of each of the 2 harmonics 42, and 15
+# for each pair of lines.
+_SAMPLE, _TAP, _EDGE, _BIAS, _HARMONIC, _PAIR_OF_LINES = 12, 3, 42, 8, 42, 15
+
+
+def ruler_flops(length: int, width: int, taps: int) -> int:
+    """Return the operations of an edge measurement along a ruler, with `taps` on each side of a gradient."""
+    bias = 2 * (_BIAS + 2 * (_HARMONIC + _PAIR_OF_LINES * (width // 2)))
+    return _SAMPLE * length * width + _TAP * taps * (length - 2 * taps) + _EDGE + bias
+
+
+def frame_bytes(image: NDArray[Any], samples: int) -> int:
+    """Return the least number of bytes of a frame that samples read: a pixel for each sample, or the whole frame."""
+    return min(image.nbytes, samples * image.itemsize)
+
+
 def scene(count: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Return a noisy disc, and rulers across its border at any angle."""
     rng = np.random.default_rng(7)
@@ -165,7 +183,9 @@ def _case(device: Device, count: int) -> Case:
     position = _corrected(rulers.astype(np.float64), exact[0], exact[2])
     error = float(np.max(np.abs(to_numpy(bound.outputs.position) - position)))
     metadata = {"peer_error": peer_error, "rulers": count}
-    return Case("ruler", str(count), bound.run, peers, error, metadata=metadata)
+    traffic = (frame_bytes(image, count * LENGTH * WIDTH) + rulers.nbytes, traffic_of(bound)[1])
+    flops = count * ruler_flops(LENGTH, WIDTH, REACH)
+    return Case("ruler", str(count), bound.run, peers, error, traffic, metadata=metadata, flops=flops, copied=False)
 
 
 def check_peer(name: str, edges: NDArray[Any], status: NDArray[Any], exact: tuple[NDArray[Any], ...]) -> None:

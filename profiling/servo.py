@@ -26,7 +26,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -366,7 +366,7 @@ def cases(device: Device) -> Iterator[Case]:
             highest = loop.highest_rate(_CASE_RATE, _TRIAL_SECONDS)
         rates = {"loop_highest_hz": highest.rate, "loop_highest_limit": highest.limit}
         metadata = {**case.metadata, **times, **rates}
-        yield Case(case.operation, case.name, case.ours, case.peers, case.error, metadata=metadata)
+        yield replace(case, metadata=metadata)
 
 
 def main() -> None:

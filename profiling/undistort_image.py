@@ -63,6 +63,21 @@ def _image(dtype: str, size: int, channels: int) -> NDArray[Any]:
     return image
 
 
+# Operations in kernels/undistort_image. Of a position in the map: cubic polynomials 13. Of a computed one: place 2,
+# radius 3, displacement 6, moved pixel 4, and 2 for each further coefficient. Of a channel: three linear interpolations
+# 9, or five cubic ones of four taps 35; cubic weights of both axes 30.
+_MAPPED, _COMPUTED, _LINEAR, _CUBIC, _CUBIC_WEIGHTS = 13, 13, 9, 35, 30
+
+
+def pixel_flops(operation: UndistortImage) -> int:
+    """Return the operations of a pixel for a camera with radial coefficients of a polynomial."""
+    more = 2 * (int(operation.model.defines()["CAMERA_RADIAL"]) - 1)
+    place = _MAPPED if operation.coordinates == "map" else _COMPUTED + more
+    if operation.interpolation == "bilinear":
+        return place + _LINEAR * operation.channels
+    return place + _CUBIC_WEIGHTS + _CUBIC * operation.channels
+
+
 def _case(device: Device, name: str, camera: Camera, dtype: str, size: int, **options: Any) -> Case:
     interpolation: Interpolation = "bicubic" if "bicubic" in name else "bilinear"
     operation = UndistortImage(model=camera, interpolation=interpolation, **options)
@@ -79,7 +94,10 @@ def _case(device: Device, name: str, camera: Camera, dtype: str, size: int, **op
     numbers = {"rms": _rms(ours), "peer_error": theirs.max(), "peer_rms": _rms(theirs)}
     metadata = {name: float(f"{number:.5g}") for name, number in numbers.items()}
     traffic = (image.nbytes, image.nbytes + bound.outputs.status.nbytes)
-    return Case("undistort", name, bound.run, {"opencv": peer}, float(ours.max()), traffic, metadata=metadata)
+    flops = positions[..., 0].size * pixel_flops(operation)
+    return Case(
+        "undistort", name, bound.run, {"opencv": peer}, float(ours.max()), traffic, metadata=metadata, flops=flops
+    )
 
 
 def _rms(values: Float64) -> float:

@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numba
 import numpy as np
+import numpy.typing as npt
 from numpy.typing import NDArray
 
 from gpuvision.camera.camera import Camera
@@ -127,6 +128,38 @@ def _chunks(points, table, series, steps, ideal):
         _one_thread(points[first:end], table, series, steps, ideal[first:end])
 
 
+# Operations of a point in kernels/common/camera.h: normalised place 4, moved pixel 4, tilt 17 and its sums 4.
+_PLACE, _TILT = 8, 21
+
+
+def _bend_flops(camera: Camera) -> int:
+    """Return the operations of the displacement of an ideal point by the lens."""
+    defines: dict[str, Any] = camera.defines()
+    over, under = (defines[f"CAMERA_{name}"] for name in ("RADIAL", "RATIONAL"))
+    total = 3 + max(2 * over - 1, 0) + 2  # squared radius, polynomial, products
+    if under:
+        total += 2 * under - 1 + 4  # 1 + under and its inverse, difference, product
+    if "CAMERA_DECENTRED" in defines:
+        total += 5 + 2 * 2  # 2 (p1 y + p2 x) and its sum, offsets in x and y
+    return int(total + (4 if "CAMERA_PRISM" in defines else 0))
+
+
+def undistort_flops(camera: Camera, dtype: npt.DTypeLike, *, inverse: bool = False) -> int:
+    """Return the operations of a point that the start polynomials solve: least number for the measured points.
+
+    The start: squared radius 4, two polynomials of 8 terms 31, place 2, slope 2; for a decentred lens polynomials of
+    four vectors 32 and products 12. A step: lens, places 4, residual 3, change 9 and 2; decentred 8 more.
+    """
+    tilt = _TILT if "CAMERA_TILTED" in camera.defines() else 0
+    if inverse:
+        return _PLACE + tilt + _bend_flops(camera)
+    start, step = 39, _bend_flops(camera) + 18
+    if "CAMERA_DECENTRED" in camera.defines():
+        start, step = start + 44, step + 8
+    steps: Any = camera.undistort_defines(dtype)["CAMERA_STEPS"]
+    return int(_PLACE + tilt + start + steps * step)
+
+
 def cases(device: Device) -> Iterator[Case]:
     """Yield cases of 1e5 and 1e6 points for several cameras; also double precision, converged OpenCV and distortion."""
     for count, size in ((100_000, "1e5"), (1_000_000, "1e6")):
@@ -186,9 +219,9 @@ def _case(
     if np.any(to_numpy(bound.outputs.status)):
         raise AssertionError("a point within the invertible region was flagged")
     traffic = (points.nbytes, points.nbytes + len(points))
-    return Case(
-        "points", name, bound.run, peers, _worst(to_numpy(bound.outputs.points), exact), traffic, metadata=metadata
-    )
+    error = _worst(to_numpy(bound.outputs.points), exact)
+    flops = len(points) * undistort_flops(camera, dtype, inverse=inverse)
+    return Case("points", name, bound.run, peers, error, traffic, metadata=metadata, flops=flops)
 
 
 def _numba_peers(points: NDArray[Any], camera: Camera, exact: NDArray[np.float64]) -> dict[str, Peer]:

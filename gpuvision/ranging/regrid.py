@@ -25,8 +25,10 @@ from gpuvision.host import (
     Precision,
     StatusArray,
     WorkSize,
+    capacity,
+    ceil_div,
     flags,
-    padded_groups,
+    group_per_element,
     type_defines,
 )
 from gpuvision.operation import VisionOperation
@@ -34,8 +36,10 @@ from gpuvision.validation import finite, integer
 
 R = TypeVar("R", bound=tuple[Any, ...])
 Direction = Literal["x", "-x", "y", "-y"]
-# Work-items of a group on a GPU: two warps, since lines of unlike length keep each other waiting in larger groups.
-_GROUP = 64
+# Work-items of a group on a GPU, an item for each sample of a tile (chosen: a line of 1000 samples is four tiles). Most
+# lines of a group: MAX_LINES in kernels/regrid/line_group.h. Least lines of a group where lines are adjacent: eight
+# floats fill a sector of 32 bytes.
+_GROUP, _MAX_LINES, _LINES_OF_SECTOR = 256, 16, 8
 _DIRECTIONS = ("x", "-x", "y", "-y")
 MAX_MAP_CELLS = 1 << 26
 """Largest number of cells of a height map. Chosen: bounds the memory, 256 MiB of float32 heights."""
@@ -327,6 +331,7 @@ class RegridCounts(NamedTuple):
     out_cell_pitch: int
     drop_folded: int
     lines: int
+    lines_per_group: int
 
 
 class RegridTable(NamedTuple):
@@ -338,6 +343,11 @@ class RegridTable(NamedTuple):
     max_gap: float
     max_step: float
     fold_tolerance: float
+
+
+def _lines_per_group(samples: int, least: int) -> int:
+    """Return the number of lines of a work-group: short lines share a group, so that most items have a sample."""
+    return min(max(least, _GROUP // capacity(samples)), _MAX_LINES)
 
 
 class _Lines(NamedTuple):
@@ -400,22 +410,28 @@ class _Pass(VisionOperation[R]):
             Sizes and pitches of the inputs and outputs.
         """
         value = (build.shape, build.dtype)
-        with_sigma = self.regrid.sigma
+        with_sigma, in_groups = self.regrid.sigma, not build.device.prefers_vectors
+        groups = ceil_div(lines, counts.lines_per_group)
         made_by_name = {name: made if name != "sigma" or with_sigma else None for name in self.Result._fields}
         return build.launch(
             "regrid/regrid.cl",
             "resample",
             # A CPU runtime that runs several lines in one group spills the state of each line.
-            work=WorkSize((lines,), (1,)) if build.device.prefers_vectors else padded_groups(lines, _GROUP),
+            work=group_per_element(groups, _GROUP) if in_groups else WorkSize((lines,), (1,)),
             more_inputs=[value, value, (build.shape, np.dtype(np.uint8)), *([value] * (with_other + with_sigma))],
             outputs=build.outputs(made_by_name),
-            defines=type_defines("INPUT", build.dtype) | flags(WITH_OTHER=with_other, WITH_SIGMA=with_sigma),
+            defines={
+                **type_defines("INPUT", build.dtype),
+                **flags(WITH_OTHER=with_other, WITH_SIGMA=with_sigma),
+                **({"GROUP": _GROUP} if in_groups else {}),
+            },
             # Without the other coordinate the kernel gets a null pointer for its output, the last one.
             arguments=[
                 *([] if with_other else [None]),
                 np.array(counts, np.uint32),
                 np.array(self._table(), build.real),
             ],
+            problem_per_group=in_groups,
         )
 
 
@@ -439,6 +455,7 @@ class _AlongSamples(_Pass[_Lines]):
             out_cell_pitch=1,
             drop_folded=0,
             lines=profiles,
+            lines_per_group=_lines_per_group(samples, 1),
         )
         return self._resample(build, profiles, (profiles, cells), counts, with_other=True)
 
@@ -465,5 +482,6 @@ class _AlongProfiles(_Pass[HeightMap]):
             out_cell_pitch=cell_pitch,
             drop_folded=int(self.regrid.folded == "drop"),
             lines=lines,
+            lines_per_group=_lines_per_group(profiles, _LINES_OF_SECTOR),
         )
         return self._resample(build, lines, self.regrid.grid.shape, counts, with_other=False)

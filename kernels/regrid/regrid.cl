@@ -13,8 +13,9 @@
 //          count       RegridCounts (uint);  grid  RegridTable (real)
 // Outputs: out_height, out_intensity, out_sigma (null without WITH_SIGMA), out_other (null without WITH_OTHER)  real, NaN
 //          in cells without data; out_status  uchar
-// Build options: INPUT (float or double), REAL_IS_DOUBLE, WITH_OTHER, WITH_SIGMA.
-// Work:    one work-item per line: the order of the samples decides where the line runs backwards. One variant.
+// Build options: INPUT (float or double), REAL_IS_DOUBLE, WITH_OTHER, WITH_SIGMA, GROUP (most work-items of a group).
+// Variants: CPU runtimes, without GROUP: one work-item per line, which takes the samples in their order. GPUs, with
+//          GROUP: a work-group per line or per some neighbouring lines (line_group.h). The results are bit-equal.
 #include "common/real.h"
 #include "common/status.h"
 
@@ -25,7 +26,8 @@
 typedef struct {
     uint samples, line_pitch, sample_pitch, cells, out_line_pitch, out_cell_pitch;
     uint drop_folded; // whether NOT_INVERTIBLE cells have no value
-    uint lines;       // the work-items beyond the last line do nothing
+    uint lines;
+    uint lines_per_group; // lines of a work-group, with GROUP
 } RegridCounts;
 
 // Grid: RegridTable in regrid.py.
@@ -37,11 +39,6 @@ typedef struct {
     real fold_tolerance;    // [cells]
 } RegridTable;
 
-typedef struct {
-    real at, height, intensity, other, sigma;  // at: coordinate [cells]
-    uint status;
-} Sample;
-
 // First and last cell whose centre lies in [low, high]; no cell if first > last. Casts instead of ceil, floor and fmax:
 // these library functions take longer on PoCL than the rest of the kernel.
 static inline int first_cell(real low, int cells) {
@@ -50,6 +47,25 @@ static inline int first_cell(real low, int cells) {
     return cell < kept ? cell + 1 : cell;
 }
 static inline int last_cell(real high, int cells) { return high < 0 ? -1 : high < cells ? (int)high : cells - 1; }
+
+static inline int is_joined(real length, real rise, constant RegridTable *grid) {
+    return !(fabs(length) > grid->max_gap || fabs(rise) > grid->max_step);
+}
+
+// Value at the fraction `part` of the way between two samples, and its standard deviation.
+static inline real value_between(real before, real now, real part) { return before + part * (now - before); }
+static inline real sigma_between(real before, real now, real part) {
+    const real of_before = (1 - part) * before, of_now = part * now;
+    return sqrt(of_before * of_before + of_now * of_now);
+}
+
+#ifdef GROUP
+#include "regrid/line_group.h"
+#else
+typedef struct {
+    real at, height, intensity, other, sigma;  // at: coordinate [cells]
+    uint status;
+} Sample;
 
 // Fill the cells between two neighbouring good samples by the straight line through them, if they are joined.
 //
@@ -60,7 +76,7 @@ static inline void fill_between(Sample before, Sample now, global real *restrict
                                 global real *restrict out_other, global uchar *restrict out_status, ulong out,
                                 constant RegridCounts *count, constant RegridTable *grid) {
     const real length = now.at - before.at, rise = now.height - before.height;
-    if (fabs(length) > grid->max_gap || fabs(rise) > grid->max_step) return;
+    if (!is_joined(length, rise, grid)) return;
     const uint found = (before.status | now.status) & STATUS_INFORMS;
     const int cells = count->cells, last = last_cell(length < 0 ? before.at : now.at, cells);
     for (int cell = first_cell(length < 0 ? now.at : before.at, cells); cell <= last; ++cell) {
@@ -71,13 +87,12 @@ static inline void fill_between(Sample before, Sample now, global real *restrict
         // A cell that has a value keeps the higher surface; within max_step the later value replaces it.
         if (!(old & STATUS_NO_DATA) && out_height[i] > height + grid->max_step) continue;
         out_height[i] = height;
-        out_intensity[i] = before.intensity + part * (now.intensity - before.intensity);
+        out_intensity[i] = value_between(before.intensity, now.intensity, part);
 #ifdef WITH_OTHER
-        out_other[i] = before.other + part * (now.other - before.other);
+        out_other[i] = value_between(before.other, now.other, part);
 #endif
 #ifdef WITH_SIGMA
-        const real of_before = (1 - part) * before.sigma, of_now = part * now.sigma;
-        out_sigma[i] = sqrt(of_before * of_before + of_now * of_now);
+        out_sigma[i] = sigma_between(before.sigma, now.sigma, part);
 #endif
         out_status[i] = (uchar)(found | (old & STATUS_NOT_INVERTIBLE));
     }
@@ -109,6 +124,7 @@ static inline void clear_cells(global real *restrict out_height, global real *re
         out_status[i] = status;
     }
 }
+#endif
 
 kernel void resample(global const INPUT *restrict along, global const INPUT *restrict height,
                      global const INPUT *restrict intensity, global const uchar *restrict given,
@@ -121,8 +137,23 @@ kernel void resample(global const INPUT *restrict along, global const INPUT *res
                      global real *restrict out_height, global real *restrict out_intensity,
                      global uchar *restrict out_status, global real *restrict out_sigma,
                      global real *restrict out_other, constant RegridCounts *count, constant RegridTable *grid) {
+#ifdef GROUP
+    const line_inputs in = {along,
+                            height,
+                            intensity,
+                            given,
+#ifdef WITH_OTHER
+                            other,
+#endif
+#ifdef WITH_SIGMA
+                            sigma,
+#endif
+    };
+    const line_outputs out = {out_height, out_intensity, out_status, out_sigma, out_other};
+    local line_tile tile;
+    resample_lines(&in, &out, &tile, count, grid);
+#else
     const ulong line = get_global_id(0);
-    if (line >= count->lines) return;
     const ulong in = line * count->line_pitch, out = line * count->out_line_pitch;
     const real sense = grid->sense, tolerance = grid->fold_tolerance;
     clear_cells(out_height, out_intensity, out_sigma, out_other, out_status, out, count, 0, STATUS_NO_DATA);
@@ -155,4 +186,5 @@ kernel void resample(global const INPUT *restrict along, global const INPUT *res
     if (count->drop_folded)
         clear_cells(out_height, out_intensity, out_sigma, out_other, out_status, out, count, STATUS_NOT_INVERTIBLE,
                     STATUS_NOT_INVERTIBLE);
+#endif
 }

@@ -191,6 +191,23 @@ def _image(dtype: Any, channels: int = 1) -> NDArray[Any]:
     return image if channels > 1 else image[..., 0]
 
 
+def _surface(profiles: int, samples: int) -> list[NDArray[Any]]:
+    """Return a wavy surface: coordinate along the profile, z, intensity, status, coordinate across the profiles."""
+    profile, sample = np.meshgrid(np.arange(profiles), np.arange(samples), indexing="ij")
+    z = (5e-3 * np.sin(0.008 * sample) * np.cos(0.006 * profile)).astype(np.float32)
+    along, across = (1e-4 * sample + 0.2 * z).astype(np.float32), (1e-4 * profile + 0.1 * z).astype(np.float32)
+    return [along, z, np.ones_like(z), np.zeros(z.shape, np.uint8), across]
+
+
+def _across(profiles: int, samples: int) -> list[NDArray[Any]]:
+    """Return the inputs of the pass along the profiles."""
+    _, *values, across = _surface(profiles, samples)
+    return [across, *values]
+
+
+_GRID = gv.Grid(left=1e-3, top=2.8e-3, cell_x=1e-4, cell_y=1e-4, columns=240, rows=24)
+_ALONG_SAMPLES, _ALONG_PROFILES = gv.Regrid(grid=_GRID, max_gap=1e-3, max_step=1e-3).passes
+_ALONG_X = gv.Regrid(grid=_GRID, max_gap=1e-3, max_step=1e-3, along="y").passes[1]
 _PLANE = gv.Triangulation(homography=_TO_SHEET, region=_REGION, sigma=(0.1, 0.1))
 _U, _V = (RNG.uniform(0.0, 500.0, _POINTS).astype(np.float32) for _ in range(2))
 _XY = RNG.uniform(10.0, 200.0, (_POINTS, 2)).astype(np.float32)
@@ -256,6 +273,9 @@ STREAMS: list[tuple[str, Any, list[NDArray[Any]], float, float, int, int]] = [
         388,
         1662,
     ),
+    ("regrid, samples", _ALONG_SAMPLES, _surface(32, 256), 1.0, 1.04, 2304, 7600),
+    ("regrid, profiles", _ALONG_PROFILES, _across(32, 240), 1.23, 1.33, 1500, 6000),
+    ("regrid, profiles, along y", _ALONG_X, _across(256, 24), 1.15, 1.27, 1438, 5033),
 ]
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "kernel_variants.md"
 

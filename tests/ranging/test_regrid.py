@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 
@@ -12,6 +13,7 @@ import pytest
 from hypothesis.extra import numpy as hnp
 
 from gpuvision import Device, Status
+from gpuvision.profiling.offline.builds import GpuModel
 from gpuvision.ranging.regrid import Grid, HeightMap, Regrid
 from gpuvision.reference import regrid as reference
 
@@ -48,13 +50,63 @@ def test_a_plane_is_resampled_exactly(device, dtype, transposed):
     np.testing.assert_allclose(made.intensity, 10 * x, rtol=0, atol=8 * 10 * np.finfo(dtype).eps)
 
 
-def test_groups_of_a_gpu_skip_the_lines_beyond_the_last(device):
-    """1 000 003 lines run in whole groups; lines that do not fill a group give the same map."""
-    gpu = device.without_vectors()
-    launch = OP.passes[0].launch(gpu, (1_000_003, 8), np.dtype(np.float32))
-    assert (launch.global_size, launch.local_size) == ((1_000_064,), (64,))
-    frames = flat((67, 61), np.float32)
-    close(OP(*frames, device=gpu), OP(*frames, device=device), 0.0)
+def test_groups_of_a_gpu():
+    """Short lines share a group, lines along the profiles are read eight at a time; the last group may have fewer."""
+    gpu = GpuModel()
+    along_samples, along_profiles = OP.passes
+    for operation, shape, groups, lines in (
+        (along_samples, (1_000_003, 8), 62_501, 16),
+        (along_samples, (67, 61), 17, 4),
+        (along_samples, (67, 1000), 67, 1),
+        (along_profiles, (67, 1001), 126, 8),
+    ):
+        launch = operation.launch(gpu, shape, np.dtype(np.float32))
+        counts = next(each for each in launch.arguments if isinstance(each, np.ndarray))
+        assert (launch.global_size, launch.local_size) == ((256 * groups,), (256,))
+        assert (launch.problem_per_group, counts[-1]) == (True, lines)
+
+
+def rough(rng: np.random.Generator, shape: tuple[int, int], dtype: type, fold: float) -> list[np.ndarray]:
+    """Return a scan with noise, steps, folds, samples far ahead of the others, holes of every kind, and flags."""
+    x, y, _, intensity, status = flat(shape)
+    x, y = x + fold * np.sin(7 * x + y), y + 0.1 * x + fold * np.cos(5 * y) * np.sin(3 * x)
+    x, y = x + rng.normal(0, 3e-3, shape), y + rng.normal(0, 3e-3, shape)
+    z = np.sin(3 * x) * np.cos(2 * y) + 0.3 * (rng.random(shape) < 0.05)
+    ahead = rng.random(shape) < 0.005
+    x[ahead] += rng.uniform(-1, 1, int(ahead.sum()))
+    for flag in (1, 2, 16, 18, 64, 128):
+        status[rng.random(shape) < 0.02] = flag
+    for values, hole in ((x, np.inf), (y, np.nan), (z, np.nan)):
+        values[rng.random(shape) < 0.03] = hole
+    frames = [each.astype(dtype) for each in (x, y, z, intensity)]
+    return [*frames, status, rng.uniform(1e-3, 2e-3, shape).astype(dtype)]
+
+
+@pytest.mark.parametrize(
+    ("shape", "along", "across", "fold"),
+    [((37, 611), "x", "y", 0.3), ((259, 33), "-x", "-y", 0.05), ((5, 263), "y", "-x", 0.0), ((271, 9), "-y", "x", 0.3)],
+)
+@pytest.mark.parametrize("folded", ["drop", "top"])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_work_groups_give_the_same_bits_as_one_item_per_line(device, rng, shape, along, across, fold, folded, dtype):
+    grid = Grid(left=-1.0, top=2.0, cell_x=2 / 301, cell_y=3 / 97, columns=302, rows=98)
+    gap = 0.1 if min(shape) > 30 else 0.9
+    op = Regrid(grid=grid, max_gap=gap, max_step=0.2, along=along, across=across, folded=folded, sigma=folded == "top")
+    op = dataclasses.replace(op, fold_tolerance=0.01 if shape[0] < 100 else 0.0)
+    frames = rough(rng, shape, dtype, fold)[: 5 + op.sigma]
+    if along[-1] == "y":
+        frames = [each.T for each in frames]
+    frames = [
+        np.ascontiguousarray(each[:: 1 if len(across) == 1 else -1, :: 1 if len(along) == 1 else -1]) for each in frames
+    ]
+    in_groups = device.without_vectors()
+    one_by_one = copy.copy(in_groups)
+    one_by_one.prefers_vectors = True
+    made, truth = op(*frames, device=in_groups), op(*frames, device=one_by_one)
+    assert 0.05 < np.isfinite(truth.z).mean() < 1.0
+    assert fold == 0.0 or np.any(truth.status & Status.NOT_INVERTIBLE)
+    for field, value in zip(HeightMap._fields, truth, strict=True):
+        np.testing.assert_array_equal(getattr(made, field), value, err_msg=field)
 
 
 @pytest.mark.double

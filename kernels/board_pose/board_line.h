@@ -1,10 +1,18 @@
 // Lines of a board (board_pose.cl): robust fits through the edges of each line, and the rows of the pose that they give.
 //
-// Options: MAX_RULERS_PER_LINE; WITH_ETCH_BIAS: rows have an etch factor; the options of line_fit/line_fit.h.
+// Options: MAX_RULERS_PER_LINE; WITH_ETCH_BIAS: rows have an etch factor; the options of line_fit/line_fit.h; vector
+//          variant: the options of pose/pose.h; work-item variant: INPUT, type of the rows.
 #ifndef BOARD_LINE_H
 #define BOARD_LINE_H
 
 #include "line_fit/line_fit.h"
+#ifdef VECTOR_VARIANT
+#include "pose/pose_rows.h"
+#define LINE_ROWS pose_rows
+#else
+#include "pose/pose_input.h"
+#define LINE_ROWS global PoseRow *
+#endif
 
 // Line of the artwork: LINE in board_pose.py.
 typedef struct {
@@ -16,54 +24,23 @@ typedef struct {
 // Rows per line: two for offset and angle, one for the offset of a line with a single ruler.
 #define ROWS_PER_LINE (MAX_RULERS_PER_LINE > 1 ? 2 : 1)
 
-#ifdef VECTOR_VARIANT
-// Columns of the rows of the pose (pose/pose.h).
-typedef struct {
-    private real *nx;
-    private real *ny;
-    private real *px;
-    private real *py;
-    private real *ex;
-    private real *ey;
-    private real *certainty;
-    private real *etch_factor;
-} line_rows;
-#define LINE_ROWS line_rows
-#else
-// Rows as pose/pose.cl takes them: PoseRow.
-#ifdef WITH_ETCH_BIAS
-#define ROW_NUMBERS 8
-#else
-#define ROW_NUMBERS 7
-#endif
-#define LINE_ROWS global real *
-#endif
-
 // Store row i: at u along the line, the measured line is displaced by v along its normal, with the given variance [m2].
-// The variance of the line's position on the board is added. A variance that is not finite makes a missing row.
-static inline void put_row(LINE_ROWS rows, int i, global const BoardLine *line, real u, real v, real variance) {
-    const int good = variance > 0 && !not_finite(variance) && !not_finite(u + v);
-    const real sigma = sqrt(variance + line->sigma * line->sigma);
+// The variance of the line's position on the board is added. A row with a number that is not finite, or with a variance
+// that is not positive, is missing.
+static inline void put_line_row(LINE_ROWS rows, int i, global const BoardLine *line, real u, real v, real variance) {
+    const real x = line->x + u * line->normal_y, y = line->y - u * line->normal_x;
+    const real moved_x = v * line->normal_x, moved_y = v * line->normal_y;
+    const real sigma = variance > 0 ? sqrt(variance + line->sigma * line->sigma) : REAL_NAN;
 #ifdef VECTOR_VARIANT
-    rows.nx[i] = good ? line->normal_x : 0;
-    rows.ny[i] = good ? line->normal_y : 0;
-    rows.px[i] = good ? line->x + u * line->normal_y : 0;
-    rows.py[i] = good ? line->y - u * line->normal_x : 0;
-    rows.ex[i] = good ? v * line->normal_x : 0;
-    rows.ey[i] = good ? v * line->normal_y : 0;
-    rows.certainty[i] = good ? 1 / sigma : 0;
-    rows.etch_factor[i] = line->etch_factor;
+    put_row(rows, i, row_with_sigma(line->normal_x, line->normal_y, x, y, moved_x, moved_y, sigma, line->etch_factor));
 #else
-    global real *row = rows + ROW_NUMBERS * i;
-    row[0] = line->normal_x;
-    row[1] = line->normal_y;
-    row[2] = line->x + u * line->normal_y;
-    row[3] = line->y - u * line->normal_x;
-    row[4] = v * line->normal_x;
-    row[5] = v * line->normal_y;
-    row[6] = good ? sigma : REAL_NAN;
+    global PoseRow *row = rows + i;
+    row->normal_x = line->normal_x, row->normal_y = line->normal_y;
+    row->x = x, row->y = y;
+    row->displacement_x = moved_x, row->displacement_y = moved_y;
+    row->sigma = sigma;
 #ifdef WITH_ETCH_BIAS
-    row[7] = line->etch_factor;
+    row->etch_factor = line->etch_factor;
 #endif
 #endif
 }
@@ -77,9 +54,9 @@ static inline void put_row(LINE_ROWS rows, int i, global const BoardLine *line, 
 static inline void put_line(LINE_ROWS rows, int i, global const BoardLine *line, real x, real y, real c, real s,
                             real offset_variance, real angle_variance, int has_angle) {
     const real reach = has_angle ? sqrt(offset_variance / angle_variance) : 0, side = c < 0 ? -reach : reach;
-    put_row(rows, ROWS_PER_LINE * i, line, x - side * c, y - side * s, has_angle ? 2 * offset_variance : offset_variance);
+    put_line_row(rows, ROWS_PER_LINE * i, line, x - side * c, y - side * s, has_angle ? 2 * offset_variance : offset_variance);
     if (ROWS_PER_LINE > 1)
-        put_row(rows, ROWS_PER_LINE * i + 1, line, x + side * c, y + side * s, has_angle ? 2 * offset_variance : REAL_NAN);
+        put_line_row(rows, ROWS_PER_LINE * i + 1, line, x + side * c, y + side * s, has_angle ? 2 * offset_variance : REAL_NAN);
 }
 
 // Fit LANES lines from `first` on; store their rows, and the weight of each edge. The least scale is the rounding error

@@ -39,14 +39,14 @@ kernel void board_edges(global const CODE *restrict image, global const BoardRul
 // Robust lines through the edges of a board, as rows of its pose (board_line.h).
 //
 // Inputs:  places (3, lines, each): u, v [m], certainty [1/m]; line (lines,) BoardLine.
-// Outputs: rows (lines * ROWS_PER_LINE, ROW_NUMBERS), as pose/pose.cl takes them; edge_weights (lines, each).
+// Outputs: rows (lines * ROWS_PER_LINE,) PoseRow, as pose/pose.cl takes them; edge_weights (lines, each).
 // Tables:  pairs (pair_trials, 2): edges of the start candidates of a line.
 // Options: BOARD_LINES; the options of board_line.h.
 // Work:    an item per line. The edges of a line are copied to private memory, because the fit reads them many times.
 #include "board_pose/board_line.h"
 
 kernel void board_lines(global const real *restrict places, global const BoardLine *restrict line,
-                        global real *restrict rows, global real *restrict edge_weights, const int lines, const int each,
+                        global PoseRow *restrict rows, global real *restrict edge_weights, const int lines, const int each,
                         constant int *pairs, const int pair_trials, const int steps) {
     const int i = get_global_id(0);
     if (i >= lines) return;
@@ -88,9 +88,9 @@ kernel void board_pose(global const CODE *restrict image, global const BoardRule
                       const int steps, const real rank_tolerance, const real min_inlier_fraction,
                       const real max_leverage, const real max_shift, const real max_turn, const real place_x,
                       const real place_y, const real etch_certainty) {
-    const int count = ROWS_PER_LINE * lines, padded = (count + LANES - 1) / LANES * LANES;
-    real row[8][CAPACITY];
-    const line_rows lined = {row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7]};
+    const int count = ROWS_PER_LINE * lines;
+    real numbers[POSE_COLUMNS][CAPACITY];
+    pose_rows all = rows_in(numbers, (count + LANES - 1) / LANES * LANES, etch_certainty);
     real place[3][MAX_RULERS];
     ruler_edge edge[MAX_EDGES];
     for (int first = 0; first < lines * each; first += LANES) {
@@ -117,21 +117,14 @@ kernel void board_pose(global const CODE *restrict image, global const BoardRule
                 LANE(certainty[k], lane) = place[2][i];
             }
         }
-        const laned_points all = {x, y, certainty, distances, each};
-        fit_lines(all, first, lines, line, pairs, pair_trials, steps, lined, edge_weights);
+        const laned_points points = {x, y, certainty, distances, each};
+        fit_lines(points, first, lines, line, pairs, pair_trials, steps, all, edge_weights);
     }
-    for (int i = count; i < padded; i++) // missing rows
-        for (int k = 0; k < 8; k++) row[k][i] = 0;
-    real sum = 0, sum_x = 0, sum_y = 0;
-    for (int i = 0; i < count; i++) {
-        sum += row[6][i] > 0;
-        sum_x += row[2][i];
-        sum_y += row[3][i];
-    }
+    const pose_row missing = {0, 0, 0, 0, 0, 0, 0, 0};
+    for (int i = count; i < all.count; i++) put_row(all, i, missing);
     reals distances[CAPACITY];
     const pose_room room = {distances, 0};
-    pose_rows all = {row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], padded, etch_certainty};
-    const pose_frame frame = centre_rows(&all, sum, sum_x, sum_y);
+    const pose_frame frame = centre_rows(&all);
     const laned_pose about = {0, 0, 0, 0, 0, 0, 0};
     solved_pose fit;
     fit.pose = about;

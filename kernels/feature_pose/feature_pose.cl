@@ -93,15 +93,11 @@ kernel void feature_pose(global const WIDE *restrict expected, global const real
                          const real max_turn, const real etch_certainty, const real ruler_sigma_px,
                          const real matched_sigma_px, const real drilled_sigma_px, const real tolerance) {
     if (get_global_id(0)) return;
-    real nx[CAPACITY], ny[CAPACITY], px[CAPACITY], py[CAPACITY], ex[CAPACITY], ey[CAPACITY], certainty[CAPACITY];
+    const int count = ruler_count + 2 * (matched_count + drilled_count);
+    real numbers[POSE_COLUMNS][CAPACITY];
     reals distances[CAPACITY];
     const pose_room room = {distances, 0};
-#ifdef WITH_ETCH_BIAS
-    real etch_factor[CAPACITY];
-#else
-    private real *etch_factor = 0;
-#endif
-    const feature_rows rows = {nx, ny, px, py, ex, ey, certainty, etch_factor};
+    pose_rows rows = rows_in(numbers, (count + LANES - 1) / LANES * LANES, etch_certainty);
     const real per_pixel = view->scale;
     const real at_x = expected[0] - view->placement_x, at_y = expected[1] - view->placement_y;
     const int is_pose_finite = !(not_finite(at_x) | not_finite(at_y) | not_finite((real)expected[2]));
@@ -123,20 +119,13 @@ kernel void feature_pose(global const WIDE *restrict expected, global const real
             put_fiducial(rows, ruler_count + 2 * (matched_count + i), fiducial[matched_count + i], by_edges, i, frame,
                          drilled_sigma_px, tolerance);
 #endif
-    const int count = ruler_count + 2 * (matched_count + drilled_count), padded = (count + LANES - 1) / LANES * LANES;
-    for (int i = count; i < padded; i++) put_row(rows, i, 0, 0, 0, 0, 0, 0, 0, 0);
-    real sum = 0, sum_x = 0, sum_y = 0;
-    for (int i = 0; i < count; i++) {
-        sum += certainty[i] > 0;
-        sum_x += px[i];
-        sum_y += py[i];
-    }
-    pose_rows all = {nx, ny, px, py, ex, ey, certainty, etch_factor, padded, etch_certainty};
-    const pose_frame centred = centre_rows(&all, sum, sum_x, sum_y);
+    const pose_row missing = {0, 0, 0, 0, 0, 0, 0, 0};
+    for (int i = count; i < rows.count; i++) put_row(rows, i, missing);
+    const pose_frame centred = centre_rows(&rows);
     const laned_pose about = {0, 0, 0, 0, 0, 0, 0};
     solved_pose fit;
     fit.pose = about;
-    pose_solved(&fit, all, subsets, trials, steps, min_scale, rank_tolerance, room);
+    pose_solved(&fit, rows, subsets, trials, steps, min_scale, rank_tolerance, room);
     const pose_outputs outputs = {motion, 0,         0,    motion_covariance, residuals, weights, scale, residual_scale,
                                   condition, rank, inliers, status,           etch,      inlier_fraction, leverage};
     const pose_limits limits = {min_inlier_fraction, max_leverage, max_shift, max_turn};
@@ -146,7 +135,7 @@ kernel void feature_pose(global const WIDE *restrict expected, global const real
     const real factor = fit.covariance_factor;
     if (factor < 1) fit.covariance_factor = 1;
 #endif
-    store_pose(&fit, all, centred, is_pose_finite, 0, count, limits, at_x, at_y, outputs);
+    store_pose(&fit, rows, centred, is_pose_finite, 0, count, limits, at_x, at_y, outputs);
 #ifdef GIVEN_SCALE
     const real smallest = 1;
 #else

@@ -6,33 +6,6 @@
 #include "feature_pose/feature_lens.h"
 #include "pose/pose_result.h"
 
-// Columns of the rows of the pose (pose/pose.h).
-typedef struct {
-    private real *nx;
-    private real *ny;
-    private real *px;
-    private real *py;
-    private real *ex;
-    private real *ey;
-    private real *certainty;
-    private real *etch_factor;
-} feature_rows;
-
-static inline void put_row(feature_rows rows, int i, real nx, real ny, real px, real py, real ex, real ey, real sigma,
-                           real etch_factor) {
-    const int good = sigma > 0 && !not_finite(sigma + ex + ey);
-    rows.nx[i] = good ? nx : 0;
-    rows.ny[i] = good ? ny : 0;
-    rows.px[i] = good ? px : 0;
-    rows.py[i] = good ? py : 0;
-    rows.ex[i] = good ? ex : 0;
-    rows.ey[i] = good ? ey : 0;
-    rows.certainty[i] = good ? 1 / sigma : 0;
-#ifdef WITH_ETCH_BIAS
-    rows.etch_factor[i] = good ? etch_factor : 0;
-#endif
-}
-
 // Frame and expected view: linear part of the view, pixel size [m], first pixel of the frame in the full image, whether the
 // expected pose is finite, and with a lens its table (feature_lens.h).
 typedef struct {
@@ -117,7 +90,7 @@ static inline undistorted_blob undistort_blob(undistorted_blob blob, global cons
 #endif
 
 // Store the rows and the status of all rulers.
-static inline void put_rulers(feature_rows rows, constant const FeatureRuler *ruler, int count, found_edges found,
+static inline void put_rulers(pose_rows rows, constant const FeatureRuler *ruler, int count, found_edges found,
                               measured_frame frame, real sigma_px, global uchar *status) {
 #ifdef FEATURE_LENS
     real positions[LANES], sigmas[LANES];
@@ -133,8 +106,8 @@ static inline void put_rulers(feature_rows rows, constant const FeatureRuler *ru
         status[i] = found.status[i];
 #endif
         const real moved = position * frame.scale, of = sqrt(sigma * sigma + sigma_px * sigma_px) * frame.scale;
-        put_row(rows, i, from.normal_x, from.normal_y, from.x, from.y, from.normal_x * moved, from.normal_y * moved, of,
-                from.etch_factor);
+        put_row(rows, i, row_with_sigma(from.normal_x, from.normal_y, from.x, from.y, from.normal_x * moved,
+                                        from.normal_y * moved, of, from.etch_factor));
     }
 }
 
@@ -142,7 +115,7 @@ static inline void put_rulers(feature_rows rows, constant const FeatureRuler *ru
 //
 // A blob whose size differs from the drawn one by more than the tolerance is not the fiducial: AMBIGUOUS. The shift of
 // the image [px] and the axes are taken to the board by the inverse of the view's linear part, scale S' R(theta).
-static inline uchar put_fiducial(feature_rows rows, int row, FeatureFiducial from, found_blobs found, int i,
+static inline uchar put_fiducial(pose_rows rows, int row, FeatureFiducial from, found_blobs found, int i,
                                  measured_frame frame, real sigma_px, real tolerance) {
     const feature_matrix to = frame.to;
     const real scale = frame.scale;
@@ -166,8 +139,8 @@ static inline uchar put_fiducial(feature_rows rows, int row, FeatureFiducial fro
     const real nx = back_xx * u + back_xy * v, ny = back_yx * u + back_yy * v;
     const real mx = back_xy * u - back_xx * v, my = back_yy * u - back_yx * v;
     const real none = is_wrong ? REAL_NAN : 0;
-    put_row(rows, row, nx, ny, from.x, from.y, ex, ey, sqrt(mean + root) * scale + none, 0);
-    put_row(rows, row + 1, mx, my, from.x, from.y, ex, ey, sqrt(mean - root) * scale + none, 0);
+    put_row(rows, row, row_with_sigma(nx, ny, from.x, from.y, ex, ey, sqrt(mean + root) * scale + none, 0));
+    put_row(rows, row + 1, row_with_sigma(mx, my, from.x, from.y, ex, ey, sqrt(mean - root) * scale + none, 0));
     return blob.status | (is_wrong ? STATUS_AMBIGUOUS : 0);
 }
 

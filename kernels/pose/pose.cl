@@ -43,30 +43,13 @@ kernel void pose_sets(global const PoseRow *restrict rows,
 #else
     const long item = (long)get_global_id(0);
     if (item >= poses) return;
-    real nx[CAPACITY], ny[CAPACITY], px[CAPACITY], py[CAPACITY], ex[CAPACITY], ey[CAPACITY], certainty[CAPACITY];
+    real numbers[POSE_COLUMNS][CAPACITY];
     reals distances[CAPACITY];
     const pose_room room = {distances, 0};
-#ifdef WITH_ETCH_BIAS
-    real etch_factor[CAPACITY];
-#else
-    private real *etch_factor = 0;
-#endif
-    // The row count is padded with rows of certainty 0 to whole vectors. Missing rows also get certainty 0.
-    const int padded = (count + LANES - 1) / LANES * LANES;
-    real sum = 0, sum_x = 0, sum_y = 0;
-    for (int i = 0; i < padded; i++) {
-        const pose_row row = read_row(rows + item * count + min(i, count - 1), i < count);
-        nx[i] = row.nx, ny[i] = row.ny, px[i] = row.px, py[i] = row.py, ex[i] = row.ex, ey[i] = row.ey;
-        certainty[i] = row.certainty;
-#ifdef WITH_ETCH_BIAS
-        etch_factor[i] = row.etch_factor;
-#endif
-        sum += row.certainty > 0;
-        sum_x += px[i];
-        sum_y += py[i];
-    }
-    pose_rows all = {nx, ny, px, py, ex, ey, certainty, etch_factor, padded, etch_certainty};
-    const pose_frame frame = centre_rows(&all, sum, sum_x, sum_y);
+    pose_rows all = rows_in(numbers, (count + LANES - 1) / LANES * LANES, etch_certainty);
+    for (int i = 0; i < all.count; i++)
+        put_row(all, i, read_row(rows + item * count + min(i, count - 1), i < count));
+    const pose_frame frame = centre_rows(&all);
 #endif
     int all_finite = 1;
     laned_pose about = {0, 0, 0, 0, 0, 0, 0};

@@ -6,7 +6,7 @@
 #ifndef POSE_INPUT_H
 #define POSE_INPUT_H
 #include "common/group.h"
-#include "pose/pose_equation.h"
+#include "pose/pose_row.h"
 
 // Feature row: ROW in pose.py, and the etch factor.
 typedef struct {
@@ -19,40 +19,22 @@ typedef struct {
 #endif
 } PoseRow;
 
-// Row in the real type; zeros where the row is missing.
-typedef struct {
-    real nx, ny, px, py, ex, ey, certainty, etch_factor;
-} pose_row;
-
-// Read a row; a row that is not `there`, not finite or has no positive sigma is missing.
+// Read a row; a row that is not `there` is missing (pose_row.h).
 //
 // By field: Mesa 22.3 drops the index of a pointer to numbers that was cast from a pointer to a struct.
 INLINE pose_row read_row(global const PoseRow *row, int there) {
-    int good = there;
-    good &= !not_finite((real)row->normal_x) & !not_finite((real)row->normal_y) & !not_finite((real)row->x) &
-            !not_finite((real)row->y) & !not_finite((real)row->displacement_x) &
-            !not_finite((real)row->displacement_y) & !not_finite((real)row->sigma);
 #ifdef WITH_ETCH_BIAS
-    good &= !not_finite((real)row->etch_factor);
-#endif
-    good &= row->sigma > 0;
-    pose_row read;
-    read.nx = good ? row->normal_x : 0;
-    read.ny = good ? row->normal_y : 0;
-    read.px = good ? row->x : 0;
-    read.py = good ? row->y : 0;
-    read.ex = good ? row->displacement_x : 0;
-    read.ey = good ? row->displacement_y : 0;
-    read.certainty = good ? 1 / (real)row->sigma : 0;
-#ifdef WITH_ETCH_BIAS
-    read.etch_factor = good ? row->etch_factor : 0;
+    const real etch_factor = row->etch_factor;
 #else
-    read.etch_factor = 0;
+    const real etch_factor = 0;
 #endif
-    return read;
+    return row_with_sigma(row->normal_x, row->normal_y, row->x, row->y, row->displacement_x, row->displacement_y,
+                          there ? (real)row->sigma : 0, etch_factor);
 }
 
 #ifdef IN_GROUP
+#include "pose/pose_equation.h"
+
 // Rows of a pose, and the frame to which `row_of` transforms them.
 typedef struct {
     global const PoseRow *rows;

@@ -3,20 +3,43 @@
 #define POSE_ROWS_H
 #include "common/robust.h"
 #include "pose/pose_equation.h"
+#include "pose/pose_row.h"
+
+// Etch factors have a column with WITH_ETCH_BIAS only.
+#ifdef WITH_ETCH_BIAS
+#define POSE_COLUMNS 8
+#else
+#define POSE_COLUMNS 7
+#endif
 
 // Columns of all rows, padded with rows of certainty 0 to whole vectors.
 typedef struct {
-    private const real *nx;
-    private const real *ny;
-    private const real *px;
-    private const real *py;
-    private const real *ex;
-    private const real *ey;
-    private const real *certainty;
-    private const real *etch_factor; // null without WITH_ETCH_BIAS
+    private real *nx;
+    private real *ny;
+    private real *px;
+    private real *py;
+    private real *ex;
+    private real *ey;
+    private real *certainty;
+    private real *etch_factor; // null without WITH_ETCH_BIAS
     int count;
     real etch; // 1/sigma of the etch bias
 } pose_rows;
+
+// Return the rows in these columns. `count`: padded with missing rows to whole vectors.
+static inline pose_rows rows_in(private real (*columns)[CAPACITY], int count, real etch) {
+    private real *etch_factor = POSE_COLUMNS > 7 ? columns[POSE_COLUMNS - 1] : 0;
+    return (pose_rows){columns[0], columns[1], columns[2], columns[3], columns[4],
+                       columns[5], columns[6], etch_factor, count,      etch};
+}
+
+static inline void put_row(pose_rows all, int i, pose_row row) {
+    all.nx[i] = row.nx, all.ny[i] = row.ny, all.px[i] = row.px, all.py[i] = row.py, all.ex[i] = row.ex;
+    all.ey[i] = row.ey, all.certainty[i] = row.certainty;
+#ifdef WITH_ETCH_BIAS
+    all.etch_factor[i] = row.etch_factor;
+#endif
+}
 
 // Load LANES rows from row i on.
 static inline laned_row row_of(pose_rows all, int i) {
@@ -64,11 +87,15 @@ static inline laned_row gather_rows(pose_rows all, constant const int *at) {
                        gather(all.ex, at), gather(all.ey, at), gather(all.certainty, at), etch_factor};
 }
 
-// Transform rows to their frame, in place. `sum` is the number of rows, (sum_x, sum_y) the sum of their places.
-static inline pose_frame centre_rows(private pose_rows *all, real sum, real sum_x, real sum_y) {
-    private real *px = (private real *)all->px, *py = (private real *)all->py;
-    private real *ex = (private real *)all->ex, *ey = (private real *)all->ey;
-    private real *certainty = (private real *)all->certainty;
+// Transform rows to their frame, in place.
+static inline pose_frame centre_rows(private pose_rows *all) {
+    private real *px = all->px, *py = all->py, *ex = all->ex, *ey = all->ey, *certainty = all->certainty;
+    real sum = 0, sum_x = 0, sum_y = 0; // of the rows that are not missing
+    for (int i = 0; i < all->count; i++) {
+        sum += certainty[i] > 0;
+        sum_x += px[i];
+        sum_y += py[i];
+    }
     const real x = sum_x / max(sum, (real)1), y = sum_y / max(sum, (real)1);
     real square = 0;
     for (int i = 0; i < all->count; i++) {

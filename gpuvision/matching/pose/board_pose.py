@@ -35,6 +35,7 @@ from gpuvision.host import (
     Stage,
     StatusArray,
     capacity,
+    type_defines,
     uses_vectors,
 )
 from gpuvision.matching.features.ruler import RulerEdges
@@ -244,6 +245,7 @@ class FitBoardLines(VisionOperation[BoardLines]):
             outputs=build.outputs({"rows": (rows, numbers), "edge_weights": (lines, rulers)}),
             defines={
                 **{name: value for name, value in options.items() if name not in _OPTIONS_OF_POSE},
+                **type_defines("INPUT", build.real),
                 "MAX_RULERS_PER_LINE": capacity(rulers),
                 "BOARD_LINES": None,
             },

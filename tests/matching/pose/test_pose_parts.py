@@ -81,16 +81,10 @@ kernel void framed(global const PoseRow *rows, global real *out, const int count
     const pose_frame frame = all.frame;
     if (get_local_id(0) > 0) return;
 #else
-    real columns[8][ROWS], sum = 0, sum_x = 0, sum_y = 0;
-    for (int i = 0; i < count; i++) {
-        const pose_row row = read_row(rows + i, 1);
-        columns[0][i] = row.nx, columns[1][i] = row.ny, columns[2][i] = row.px, columns[3][i] = row.py;
-        columns[4][i] = row.ex, columns[5][i] = row.ey, columns[6][i] = row.certainty, columns[7][i] = row.etch_factor;
-        sum += row.certainty > 0, sum_x += row.px, sum_y += row.py;
-    }
-    pose_rows all = {columns[0], columns[1], columns[2], columns[3], columns[4],
-                     columns[5], columns[6], columns[7], count,      etch};
-    const pose_frame frame = centre_rows(&all, sum, sum_x, sum_y);
+    real numbers[POSE_COLUMNS][CAPACITY];
+    pose_rows all = rows_in(numbers, count, etch);
+    for (int i = 0; i < count; i++) put_row(all, i, read_row(rows + i, 1));
+    const pose_frame frame = centre_rows(&all);
 #endif
     PUT(frame.x), PUT(frame.y), PUT(frame.size), PUT(frame.per_size), PUT(all.etch);
     PUT(read_row(rows, 0).certainty);
@@ -323,7 +317,7 @@ def test_frames_of_rows(device: Device, group: int, has_etch: bool, rng: np.rand
         numbers[row, column] = np.nan if column % 2 else np.inf
     numbers[wrong[-1], 6], numbers[50, 6] = 0.0, -0.01
     numbers = numbers.astype(np.float32)
-    defines: dict[str, Any] = {"INPUT": "float", "POSE_PARAMETERS": 3, "FREEDOMS": 3 + has_etch, "ROWS": count}
+    defines: dict[str, Any] = {"INPUT": "float", "POSE_PARAMETERS": 3, "FREEDOMS": 3 + has_etch}
     defines |= {"CAPACITY": count, "TUNING_CONSTANT": TUNING}
     defines |= ({"WITH_ETCH_BIAS": None} if has_etch else {}) | ({"GROUP_PER_PROBLEM": None} if group else {})
     (tmp_path / "frames.cl").write_text(FRAMES)

@@ -1,6 +1,7 @@
-"""Contract of poses from features: every transform, outliers, missing rows, and displacements of a board's size.
+"""Contract of poses: from features with every transform, outliers and missing rows, and from a frame of a board.
 
-The reference is the fixed point of reweighted least squares in extended precision, from the true pose.
+The reference is the fixed point of reweighted least squares in float64, from the true pose. For a frame the edges along
+the rulers are those of the reference in float64, and the lines through them fixed points of total least squares.
 """
 
 from __future__ import annotations
@@ -11,8 +12,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.matching.features.ruler import RulerEdges
+from gpuvision.matching.pose.board_pose import BoardPoseEstimator
 from gpuvision.matching.pose.pose import SolvePose, line_rows
+from gpuvision.matching.robust import efficiency
+from gpuvision.profiling import board_pose as benchmark
 from gpuvision.profiling.contract.agreement import Case, Limit, equal
+from gpuvision.profiling.contract.ruler import strongest_edge
+from gpuvision.profiling.pose import PLACEMENT
 from gpuvision.reference.robust import residuals, transform_of
 
 LIMITS = {
@@ -23,12 +30,23 @@ LIMITS = {
             "error model of the docstring: 3e-7 of the extent and a millionth of the displacement; both grow with the "
             "condition",
         ),
-    )
+    ),
+    "BoardPoseEstimator": (
+        equal(
+            "status", "edge_status", "inliers",
+            reason="counts and comparisons, except within rounding of a threshold",
+        ),
+        Limit(("edges",), 1e-4, 1e-4, "1 px for contrasts above 10 times the threshold", "error of RulerEdges"),
+        Limit(
+            ("placement",), 1e-4, 1e-4, "size of a pixel x (1 + condition) [m]",
+            "error of RulerEdges on each edge; the rounding of the lines and of the pose is a thousandth of it",
+        ),
+    ),
 }  # fmt: skip
 _BOARDS, _EDGES, _SIGMA, _EXTENT = 37, 33, 2e-6, 0.03  # lengths in metres
 _MIDDLE, _PLACEMENT = (0.05, 0.08), (0.06, 0.07)
 _FREEDOMS = {"rigid": 3, "similarity": 4, "affine": 6}
-_STEPS = 60
+_STEPS, _MANY_STEPS = 60, 400  # Huber's loss converges slowly with gross errors, as in the frame
 Floats = npt.NDArray[np.float64]
 
 
@@ -39,6 +57,8 @@ def cases() -> Iterator[Case]:
     yield _case("least squares, affine", loss="least_squares", transform="affine")
     yield _case("missing rows", loss="tukey", missing=0.3)
     yield _case("displacements of the board's size", loss="least_squares", shift=0.03, turn=0.5)
+    for loss in ("tukey", "huber"):
+        yield _frame_case(f"frame, {loss}", SolvePose(placement=PLACEMENT, loss=loss, max_iterations=200))
 
 
 def _case(
@@ -54,10 +74,11 @@ def _case(
     rows[rng.random((_BOARDS, _EDGES)) < missing, 4] = np.nan
     given = rows.astype(np.float32)
     fits = [
-        _fixed_point(each[np.isfinite(each[:, 4])], start, operation)
+        fixed_point(each[np.isfinite(each[:, 4])], start, operation)
         for each, start in zip(given.astype(np.float64), true, strict=True)
     ]
-    places, inliers, conditions, margins = (np.array(each) for each in zip(*fits, strict=True))
+    poses, inliers, conditions, margins = (np.array(each) for each in zip(*fits, strict=True))
+    places = poses[:, :2]
     exact: dict[str, npt.NDArray[Any]] = {
         "placement": places,
         "inliers": inliers,
@@ -81,11 +102,16 @@ def _rows(rng: np.random.Generator, parameters: Floats, bad: int) -> Floats:
     return np.asarray(line_rows(normal, point, (point + error * normal) @ matrix.T + shift, _SIGMA))
 
 
-def _fixed_point(rows: Floats, start: Floats, operation: SolvePose) -> tuple[Floats, int, float, float]:
-    """Return the placement, the number of inliers, the condition, and the least distance from the tuning constant."""
+def fixed_point(
+    rows: Floats, start: Floats, operation: SolvePose, extent: float = _EXTENT, steps: int = _STEPS
+) -> tuple[Floats, int, float, float]:
+    """Return the pose, the number of inliers, the condition, and the least distance from the tuning constant.
+
+    The pose is x and y of the placement point and the further parameters. `extent` is that of the rows [m].
+    """
     pose = start.copy()
-    size = np.array([1.0, 1.0, *(1.0 / _EXTENT,) * (len(pose) - 2)])
-    for _ in range(_STEPS):
+    size = np.array([1.0, 1.0, *(1.0 / extent,) * (len(pose) - 2)])
+    for _ in range(steps):
         z = residuals(pose, rows) / rows[:, 6]
         moves = np.eye(len(pose)) * 1e-30j
         design = np.stack([residuals(pose + each, rows).imag / 1e-30 for each in moves], axis=-1) * size
@@ -98,7 +124,8 @@ def _fixed_point(rows: Floats, start: Floats, operation: SolvePose) -> tuple[Flo
     matrix, shift = transform_of(pose)
     constant = np.inf if operation.loss == "least_squares" else operation.tuning_constant
     margin = float(np.abs(np.abs(z) - constant).min())
-    return matrix @ _PLACEMENT + shift, int(np.sum(root > 0.0)), float(singular[0] / singular[-1]), margin
+    placed = np.concatenate([matrix @ operation.placement + shift, pose[2:]])
+    return placed, int(np.sum(root > 0.0)), float(singular[0] / singular[-1]), margin
 
 
 def _weight(z: Floats, operation: SolvePose) -> Floats:
@@ -108,3 +135,68 @@ def _weight(z: Floats, operation: SolvePose) -> Floats:
     if operation.loss == "huber":
         return np.asarray(np.minimum(1.0, constant / np.maximum(np.abs(z), 1e-300)))
     return np.ones_like(z)
+
+
+def _frame_case(name: str, solver: SolvePose) -> Case:
+    """Return the frame of the benchmark: a line is displaced, and a ruler of each line crosses a brighter spot."""
+    image, rulers, lines = benchmark.scene()
+    ruler = RulerEdges(threshold=20.0, length=64, width=5, smoothing_px=1.0, noise=2.0)
+    operation = BoardPoseEstimator(ruler=ruler, lines=len(lines), rulers_per_line=rulers.shape[1], solver=solver)
+    shape = rulers.shape[:2]
+    found: Any = [strongest_edge(image, each[:4], ruler) for each in rulers.reshape(-1, rulers.shape[-1])]
+    position = np.reshape([each["position"] for each in found], shape)
+    rows = np.concatenate(
+        [
+            _rows_of_line(line, *_places(edges, ruler, each, image.dtype), solver)
+            for line, each, edges in zip(lines.astype(np.float64), rulers, np.reshape(found, shape), strict=True)
+        ]
+    )
+    extent = float(np.max(np.ptp(rows[:, 2:4], axis=0)))
+    pose, inliers, condition, _ = fixed_point(rows, benchmark.TRUE_POSE, solver, extent, _MANY_STEPS)
+    exact: dict[str, npt.NDArray[Any]] = {
+        "placement": pose[:2],
+        "inliers": np.array(inliers),
+        "status": np.array(0),
+        "edges": position,
+        "edge_status": np.zeros(shape, np.uint8),
+    }
+    quantities = {"placement": benchmark.PIXEL * (1.0 + condition), "edges": 1.0}
+    return Case("BoardPoseEstimator", name, operation, (image, rulers, lines), exact, quantities)
+
+
+def edge_sigmas(edges: Any, ruler: RulerEdges, dtype: npt.DTypeLike) -> Floats:
+    """Return the predicted standard deviations of edges [px]: the noise over the gradients beside the peak."""
+    noise = float(ruler._packed(np.dtype(dtype))[2]) / ruler.width
+    return np.array([noise * e["variance"] * np.exp(0.5 / e["variance"]) / abs(e["gradient"]) for e in edges])
+
+
+def _places(edges: Any, ruler: RulerEdges, rows: Floats, dtype: npt.DTypeLike) -> tuple[Floats, Floats]:
+    """Return the places (n, 2) of edges in the frame of their line [m], and one over their sigmas across it."""
+    position = np.array([each["position"] for each in edges])
+    *_, u, v, du, dv, projective = rows.astype(np.float64).T
+    per = 1.0 / (1.0 + position * projective)
+    at = np.stack([(u + position * du) * per, (v + position * dv) * per], axis=-1)
+    return at, 1.0 / (np.abs(dv - at[:, 1] * projective) * per * edge_sigmas(edges, ruler, dtype))
+
+
+def _rows_of_line(line: Floats, points: Floats, certainty: Floats, solver: SolvePose) -> Floats:
+    """Return the two rows of a line through points, where its offset and its angle are independent."""
+    middle, along = np.median(points, axis=0), np.array([1.0, 0.0])
+    for _ in range(_MANY_STEPS):
+        away = points - middle
+        z = (along[0] * away[:, 1] - along[1] * away[:, 0]) * certainty
+        weight = certainty**2 * _weight(z, solver)
+        middle = weight @ points / weight.sum()
+        x, y = (points - middle).T
+        angle = 0.5 * np.arctan2(2.0 * np.sum(weight * x * y), np.sum(weight * (x * x - y * y)))
+        along = np.array([np.cos(angle), np.sin(angle)])
+    constant: Any = solver.tuning_constant
+    counted = np.where(weight > 0.0, certainty**2, 0.0) * efficiency(solver.loss, constant)
+    spread = (points - middle) @ along
+    offset, turn = 1.0 / counted.sum(), 1.0 / np.sum(counted * spread**2)
+    normal, point = line[None, :2], line[2:4]
+    ends = middle + np.sqrt(offset / turn) * along * np.array([[-1.0], [1.0]])
+    way = np.array([line[1], -line[0]])
+    on = point + ends[:, :1] * way
+    sigma = np.sqrt(2.0 * offset + line[4] ** 2)
+    return np.asarray(line_rows(np.repeat(normal, 2, axis=0), on, on + ends[:, 1:] * normal, sigma))

@@ -56,14 +56,15 @@ def _case(name: str, dtype: str, *, angle: float, blur: float = 1.2, holes: bool
     operation = RulerEdges(threshold=_THRESHOLD, count=_COUNT, **parameters)
     position, amplitude = (np.full(_COUNT, np.nan) for _ in range(2))
     for number in np.flatnonzero(status == 0):
-        edge = _strongest(image, given[number], operation)
+        edge = strongest_edge(image, given[number], operation)
         position[number], amplitude[number] = edge["position"], edge["amplitude"]
     exact: dict[str, npt.NDArray[Any]] = {"position": position, "amplitude": amplitude, "status": status}
     quantities = {"position": 1.0, "amplitude": _CONTRAST}
     return Case("RulerEdges", name, operation, (image, given), exact, quantities)
 
 
-def _strongest(image: npt.NDArray[Any], ruler: npt.NDArray[Any], operation: RulerEdges) -> dict[str, float]:
+def strongest_edge(image: npt.NDArray[Any], ruler: npt.NDArray[Any], operation: RulerEdges) -> dict[str, float]:
+    """Return position, amplitude, gradient and variance of the strongest edge of an image along a ruler, in float64."""
     grey, _ = profile(image, ruler, operation.length, operation.width, operation.step_px)
     options = (operation.smoothing_px, operation.threshold, operation.step_px)
     return max(find_edges(grey, *options, ruler, operation.width), key=lambda edge: abs(edge["gradient"]))

@@ -126,9 +126,11 @@ class LaunchBuilder:
     def doubles_positions(self) -> bool:
         """Whether kernels keep positions in double precision; otherwise they keep two floats (``two_float.h``).
 
-        In double-precision work and on float64 input, and in single-precision work where doubles are fast.
+        In double-precision work, and in single-precision work where doubles are fast. The vector variant runs on CPUs,
+        whose doubles are fast: it reads float64 input in doubles only.
         """
-        return np.float64 in (self.real, self.dtype) or self.device.has_fast_double
+        reads_doubles = self.dtype == np.float64 and self.uses_vectors
+        return self.real == np.float64 or reads_doubles or self.device.has_fast_double
 
     @property
     def position_defines(self) -> dict[str, Define]:

@@ -5,7 +5,8 @@
 //
 // Options: DOUBLE_POSITIONS: doubles; TWO_FLOAT_POSITIONS: two floats (two_float.h); neither: floats. Kernels take doubles
 // on devices with fast doubles and two floats on other devices. The vector variants of occluded irradiance and of ray
-// queries take doubles where the device has them, else floats.
+// queries take doubles where the device has them, else floats. INPUT: type of the numbers in memory. With two floats it
+// may be double in the work-item variant: a few operations in double split each number, the rest runs in single.
 #ifndef PLACES_H
 #define PLACES_H
 #include "common/lanes.h"
@@ -30,6 +31,33 @@ INLINE reals real_of_sum(places a, place b) {
 INLINE places place_dot(places x, places y, places z, global const place *row) {
     return two_dot_plus(x, two_floats_of(row[0]), y, two_floats_of(row[1]), z, two_floats_of(row[2]), two_floats_of(row[3]));
 }
+
+// Numbers of the input. sizeof is a constant: builds for float input have no double.
+#ifdef VECTOR_VARIANT
+typedef reals input_numbers; // INPUT is float
+INLINE reals input_reals(input_numbers number) { return number; }
+INLINE places input_minus(input_numbers a, place b) { return place_minus(a, b); }
+#else
+typedef INPUT input_numbers;
+#define INPUT_IS_WIDE (sizeof(INPUT) > sizeof(real))
+INLINE real input_reals(INPUT number) { return (real)number; }
+INLINE places input_places(INPUT number) {
+    const real high = (real)number;
+    return (places){high, INPUT_IS_WIDE ? (real)(number - (INPUT)high) : 0};
+}
+INLINE places input_minus(INPUT a, place b) {
+    return INPUT_IS_WIDE ? two_plus(input_places(a), two_floats_of(-b)) : place_minus((real)a, b);
+}
+INLINE places input_difference(INPUT a, INPUT b) {
+    return INPUT_IS_WIDE ? input_places(a - b) : two_plus(input_places(a), input_places(-b));
+}
+// Direction of any length, times a power of two: a double may lie outside the range of a float.
+INLINE void load_direction(global const INPUT *from, private places *to) {
+    const INPUT longest = fmax(fmax(fabs(from[0]), fabs(from[1])), fabs(from[2]));
+    const int power = INPUT_IS_WIDE && longest > 0 && longest < INFINITY ? ilogb(longest) : 0;
+    for (int k = 0; k < 3; k++) to[k] = input_places(INPUT_IS_WIDE ? ldexp(from[k], -power) : from[k]);
+}
+#endif
 
 INLINE places load_place(place value) { return two_floats_of(value); }
 #ifndef VECTOR_VARIANT
@@ -73,6 +101,16 @@ typedef places places_at __attribute__((aligned(sizeof(place))));
 
 INLINE places convert_places(reals value) { return LANED(convert_place)(value); }
 INLINE reals convert_to_reals(places value) { return LANED(convert_real)(value); }
+typedef places input_numbers;
+INLINE reals input_reals(places number) { return convert_to_reals(number); }
+INLINE places input_minus(places a, place b) { return a - b; }
+#ifndef VECTOR_VARIANT
+INLINE places input_places(INPUT number) { return (places)number; }
+INLINE places input_difference(INPUT a, INPUT b) { return (places)a - (places)b; }
+INLINE void load_direction(global const INPUT *from, private places *to) {
+    for (int k = 0; k < 3; k++) to[k] = from[k];
+}
+#endif
 INLINE places load_places(const place *from) { return *(const places_at *)from; }
 INLINE void store_places(places value, place *to) { *(places_at *)to = value; }
 

@@ -7,7 +7,7 @@
 //          same axes; `firsts` (frames + 1,) first segment of each frame, the first `alone` frames having one segment;
 //          `starts` (segments, 4) shift from the frame to the segment, and its length; `lines` (segments, 3) length,
 //          its square, exitance / (2 pi). `middle`: subtracted from positions first.
-// Options: INPUT, REAL_IS_DOUBLE, DOUBLE_POSITIONS or, with INPUT float, TWO_FLOAT_POSITIONS (see common/places.h).
+// Options: INPUT, REAL_IS_DOUBLE, DOUBLE_POSITIONS or TWO_FLOAT_POSITIONS (see common/places.h).
 // Variants: vector: 16 receivers in a vector, `each` receivers per work-item; work-item: one receiver per item.
 //
 // A receiver is transformed into a frame once and shifted to each of its segments: most of the arithmetic is shared.
@@ -18,15 +18,12 @@
 
 #define FEW 16 // terms summed in single precision before they are added in `place`
 
-// Columns of the receivers: of the type of positions, or single-precision numbers as they are.
+// Columns of the receivers: of the type of positions, or with two floats the numbers as they are.
+#define COLUMN_TYPE input_numbers
 #ifdef TWO_FLOAT_POSITIONS
-#define COLUMN_TYPE reals
 #define CONVERT_COLUMN LANED(convert_real)
-#define column_reals(column) (column)
 #else
-#define COLUMN_TYPE places
 #define CONVERT_COLUMN LANED(convert_place)
-#define column_reals convert_to_reals
 #endif
 #include "common/six_columns.h"
 
@@ -43,13 +40,13 @@ AS_IT_IS kernel void line_irradiance(global const INPUT *restrict receivers, glo
         const ulong i = whole_vector(next, count);
         COLUMN_TYPE columns[6];
         load_columns(receivers + 6 * i, columns);
-        const places x = place_minus(columns[0], middle[0]), y = place_minus(columns[1], middle[1]);
-        const places z = place_minus(columns[2], middle[2]);
+        const places x = input_minus(columns[0], middle[0]), y = input_minus(columns[1], middle[1]);
+        const places z = input_minus(columns[2], middle[2]);
         // Scale normals of any length before squaring: no overflow, no underflow.
         const COLUMN_TYPE ax = fabs(columns[3]), ay = fabs(columns[4]), az = fabs(columns[5]);
         const COLUMN_TYPE two = ax > ay ? ax : ay, scale = (COLUMN_TYPE)1 / (two > az ? two : az);
-        const reals nx = column_reals(columns[3] * scale), ny = column_reals(columns[4] * scale);
-        const reals nz = column_reals(columns[5] * scale);
+        const reals nx = input_reals(columns[3] * scale), ny = input_reals(columns[4] * scale);
+        const reals nz = input_reals(columns[5] * scale);
         const reals per = (real)1 / sqrt(nx * nx + ny * ny + nz * nz);
         const reals normal_x = nx * per, normal_y = ny * per, normal_z = nz * per;
         places sum = convert_places((reals)0);

@@ -43,11 +43,10 @@
 #define BAD_OF(counts) ((counts) & (ONE_BEYOND - ONE_BAD))
 #define BEYOND_OF(counts) ((counts) & ~(ONE_BEYOND - 1))
 
+// Type of the normals of receivers and of exitances.
 #ifdef TWO_FLOAT_POSITIONS
-#define place_of_number(number) convert_places(number)
-typedef real wide_number;
+typedef INPUT wide_number;
 #else
-#define place_of_number(number) ((places)(number))
 typedef place wide_number;
 #endif
 
@@ -127,11 +126,11 @@ static inline real scale_to_one(places *vector) {
 
 // Frame of a segment. Returns whether it emits; `is_bad`: a number is not finite, or it emits without a normal.
 static inline int frame_of(global const INPUT *row, constant place *middle, segment_frame *of, real *exitance, int *is_bad) {
-    of->x = place_minus(row[0], middle[0]), of->y = place_minus(row[1], middle[1]);
-    of->z = place_minus(row[2], middle[2]);
+    of->x = input_minus(row[0], middle[0]), of->y = input_minus(row[1], middle[1]);
+    of->z = input_minus(row[2], middle[2]);
     places u[3], n[3];
-    for (int k = 0; k < 3; k++) u[k] = places_minus(place_of_number(row[k + 3]), place_of_number(row[k]));
-    for (int k = 0; k < 3; k++) n[k] = place_of_number(row[k + 6]);
+    for (int k = 0; k < 3; k++) u[k] = input_difference(row[k + 3], row[k]);
+    load_direction(row + 6, n);
     scale_to_one(n);
     const real unit = scale_to_one(u);
     const places square = places_dot(u[0], u[0], u[1], u[1], u[2], u[2]);
@@ -178,7 +177,7 @@ INLINE segment_frame load_frame(local const place *from) {
 // ---- receivers -------------------------------------------------------------------------------------------------------
 
 INLINE void load_receiver(global const INPUT *row, constant place *middle, uint number, local pair_memory *memory) {
-    for (int k = 0; k < 3; k++) memory->at[3 * number + k] = as_place(place_minus(row[k], middle[k]));
+    for (int k = 0; k < 3; k++) memory->at[3 * number + k] = as_place(input_minus(row[k], middle[k]));
     wide_number nx = row[3], ny = row[4], nz = row[5];
     const wide_number longest = fmax(fmax(fabs(nx), fabs(ny)), fabs(nz));
     nx /= longest, ny /= longest, nz /= longest;

@@ -7,7 +7,7 @@
 //          surface normal, exitance [W/m2]; with SELECTED also starts (lists + 1) and selected, the segments of each list
 //          (list: SELECTION_BLOCK receivers; a pick ~k is segment k, which no surface can hide).
 // Outputs: irradiance (strips, each) [W/m2]; left, right (strips,); status (strips, each) flags.
-// Options: INPUT (type of the inputs), REAL_IS_DOUBLE, DOUBLE_POSITIONS or, in the work-item variant with INPUT float,
+// Options: INPUT (type of the inputs), REAL_IS_DOUBLE, DOUBLE_POSITIONS or, in the work-item variant,
 //          TWO_FLOAT_POSITIONS (common/places.h), SELECTED, GROUP (size of a work-group), BVH_DEPTH;
 //          INTERVALS (exact visibility, visible.h), RAYS (shadow rays to `samples` parts of a segment); without both:
 //          no occlusion.
@@ -127,8 +127,8 @@ kernel void occluded_irradiance(
             const ulong at = row + item;
             const places light = store_result(&memory, flag, irradiance + at, status + at);
             if (!memory.is_none[item]) {
-                to_left = places_plus(to_left, places_times(light, place_of_number(weights[2 * at])));
-                to_right = places_plus(to_right, places_times(light, place_of_number(weights[2 * at + 1])));
+                to_left = places_plus(to_left, places_times(light, input_places(weights[2 * at])));
+                to_right = places_plus(to_right, places_times(light, input_places(weights[2 * at + 1])));
             }
         }
         barrier(CLK_LOCAL_MEM_FENCE);

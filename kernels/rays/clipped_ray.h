@@ -34,11 +34,13 @@ typedef struct {
 #ifdef TWO_FLOAT_POSITIONS
 static inline real as_number(coordinate value) { return value.high; }
 static inline amount as_amount(coordinate value) { return value.high; }
-static inline spot load_spot(global const INPUT *three) {
-    return (spot){convert_places(three[0]), convert_places(three[1]), convert_places(three[2])};
+static inline spot direction_at(global const INPUT *three) {
+    places to[3];
+    load_direction(three, to);
+    return (spot){to[0], to[1], to[2]};
 }
 static inline spot from_middle(global const INPUT *three, constant place *middle) {
-    return (spot){place_minus(three[0], middle[0]), place_minus(three[1], middle[1]), place_minus(three[2], middle[2])};
+    return (spot){input_minus(three[0], middle[0]), input_minus(three[1], middle[1]), input_minus(three[2], middle[2])};
 }
 static inline amount dot_of(spot a, spot b) { return a.x.high * b.x.high + a.y.high * b.y.high + a.z.high * b.z.high; }
 static inline spot moved(spot a, spot b, amount by) {
@@ -61,11 +63,14 @@ static inline amount size_of(spot direction) {
     const real length = length_of(direction, &power);
     return ldexp(length, power);
 }
+static inline two_floats unit_part(two_floats part, int power, real per) {
+    return two_times_real((two_floats){ldexp(part.high, -power), ldexp(part.low, -power)}, per);
+}
 static inline spot unit_of(spot direction) {
     int power;
     const real per = 1 / length_of(direction, &power);
-    return (spot){two_product(ldexp(direction.x.high, -power), per), two_product(ldexp(direction.y.high, -power), per),
-                  two_product(ldexp(direction.z.high, -power), per)};
+    return (spot){unit_part(direction.x, power, per), unit_part(direction.y, power, per),
+                  unit_part(direction.z, power, per)};
 }
 static inline part part_within(spot origin, spot direction, amount radius) {
     const real whole = dot_of(direction, direction), first = -dot_of(origin, direction) / whole;
@@ -85,12 +90,12 @@ static inline amount after_start(amount value, amount less, part within) {
 #else
 static inline real as_number(coordinate value) { return (real)value; }
 static inline amount as_amount(coordinate value) { return value; }
-static inline spot load_spot(global const INPUT *three) { return (spot){three[0], three[1], three[2]}; }
+static inline spot direction_at(global const INPUT *three) { return (spot){three[0], three[1], three[2]}; }
 static inline amount dot_of(spot a, spot b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 static inline spot moved(spot a, spot b, amount by) { return (spot){a.x + b.x * by, a.y + b.y * by, a.z + b.z * by}; }
 static inline spot scaled(spot a, amount by) { return moved((spot){0, 0, 0}, a, by); }
 static inline spot from_middle(global const INPUT *three, constant place *middle) {
-    return moved(load_spot(three), (spot){middle[0], middle[1], middle[2]}, -1);
+    return moved(direction_at(three), (spot){middle[0], middle[1], middle[2]}, -1);
 }
 static inline amount size_of(spot direction) { return sqrt(dot_of(direction, direction)); }
 static inline spot unit_of(spot direction) { return scaled(direction, 1 / size_of(direction)); }

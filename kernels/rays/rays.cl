@@ -4,7 +4,7 @@
 // Outputs: closest_hit: triangle (count,) index or -1, distance (count,) [m], barycentric (count, 2), status (count,);
 //          any_hit: occluded (count,) 0 or 1, status (count,).
 // Options: ANY_HIT (any_hit), INPUT, REAL_IS_DOUBLE, BVH_DEPTH, FOUR_WIDE (common/bvh.h); DOUBLE_POSITIONS or, in the
-//          work-item variant with INPUT float, TWO_FLOAT_POSITIONS (common/places.h).
+//          work-item variant, TWO_FLOAT_POSITIONS (common/places.h).
 // Variants: vector: a strip of `each` rays per work-item, each ray against 16 boxes at once; work-item: a ray per item,
 //          against the four boxes of a node at once (FOUR_WIDE).
 //
@@ -61,7 +61,7 @@ AS_IT_IS kernel void closest_hit(global const INPUT *restrict rays, global int *
     const ulong first = get_global_id(0) * each, end = min(first + each, count);
     for (ulong i = first; i < end; i++) {
         spot origin = from_middle(rays + 6 * i, middle);
-        const spot direction = load_spot(rays + 6 * i + 3);
+        const spot direction = direction_at(rays + 6 * i + 3);
         const amount size = size_of(direction);
         const int good = finite_spot(origin) && finite_spot(direction) && size > 0 && !not_finite((real)size);
         bvh_hit hit = {REAL_NAN, REAL_NAN, REAL_NAN, NO_HIT};

@@ -113,6 +113,9 @@ def test_fast_doubles_run_at_more_than_a_32nd_of_the_float_rate(
     assert gpu.has_fast_double is is_fast
 
 
+WIDE_INPUT = [("work_item", "single", False), ("work_item", None, True), ("vector", "single", True)]
+
+
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_positions_of_single_precision_follow_the_rate(device: Device, precision: Any) -> None:
     slow = copy.copy(device)
@@ -123,5 +126,16 @@ def test_positions_of_single_precision_follow_the_rate(device: Device, precision
     assert set(build.position_defines) == {"DOUBLE_POSITIONS" if in_double else "TWO_FLOAT_POSITIONS"}
     table = build.positions(np.array([[0.1, 2.0]]))
     assert (table.shape, table.dtype) == (((1, 2), np.float64) if in_double else ((1, 2, 2), np.float32))
-    wide = LaunchBuilder(READOUT, slow, (3, 2), np.dtype(np.float64), precision="single", narrows=True)
-    assert wide.doubles_positions
+
+
+@pytest.mark.parametrize(("variant", "precision", "in_double"), WIDE_INPUT)
+def test_positions_of_float64_input_follow_the_rate(
+    device: Device, variant: Any, precision: Any, in_double: bool
+) -> None:
+    """Work-items split the numbers into two floats, where doubles are slow; vectors run on CPUs."""
+    slow = copy.copy(device)
+    slow.has_double, slow.has_fast_double, slow.takes_vectors = True, False, True
+    build = LaunchBuilder(
+        READOUT, slow, (3, 2), np.dtype(np.float64), precision=precision, narrows=True, variant=variant
+    )
+    assert build.doubles_positions is in_double

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, to_numpy
+from gpuvision.host import Device, Precision, to_numpy
 from gpuvision.simulation.scene.rays import ClosestHit
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import Irradiance, LitSegments
@@ -78,7 +78,8 @@ class Radiosity:
     scene : Scene, optional
         Triangles that may occlude; None: nothing occludes (the inside of a convex room).
     device : Device, optional
-        Device of the form factors, in double where it has it; None: `Device.best`.
+        Device of the form factors, in double where doubles are fast (`Device.has_fast_double`), else in single; None:
+        `Device.best`.
     max_dense : int
         Up to this number of patches the matrix is kept in double and factored once for all lights. With more patches it
         is kept in single, four bytes per pair of patches, and each light is solved iteratively (GMRES). Default 4096.
@@ -216,7 +217,7 @@ class Radiosity:
         Parameters
         ----------
         receivers : numpy.ndarray
-            (..., 6), float32 or float64: position [m] and normal. Computed as float32 on a device without doubles.
+            (..., 6), float32 or float64: position [m] and normal. Computed in single where doubles are slow or missing.
         exitance : numpy.ndarray
             (count,): exitance of the patches [W/m^2].
         min_exitance : float
@@ -224,10 +225,12 @@ class Radiosity:
             because its form factors to patches that do not overlap add up to at most 1; sampled visibility
             (`FormFactors`) may exceed that. Default 0.0.
         """
-        operation = PatchLight(patches=self.patches, scene=self.scene)
-        real = self._real if receivers.dtype == np.float64 else np.float32
-        strong = np.where(exitance >= min_exitance, exitance, 0.0).astype(real)
-        return operation(receivers.astype(real, copy=False), strong, device=self.device)
+        is_double = receivers.dtype == np.float64
+        operation = PatchLight(patches=self.patches, scene=self.scene, precision=self._precision)
+        strong = np.where(exitance >= min_exitance, exitance, 0.0).astype(self._real if is_double else np.float32)
+        return operation(
+            receivers.astype(self._input if is_double else np.float32, copy=False), strong, device=self.device
+        )
 
     @functools.cached_property
     def form_factors(self) -> Reals:
@@ -245,10 +248,10 @@ class Radiosity:
 
     def _form_factor_rows(self, receivers: Reals) -> Iterator[tuple[Reals, int]]:
         """Yield form factors of batches of receivers, and the index of each batch's first receiver."""
-        operation, real = FormFactors(patches=self.patches, scene=self.scene), self._real
+        operation = FormFactors(patches=self.patches, scene=self.scene, precision=self._precision)
         for begin in range(0, len(receivers), _ROWS_PER_BATCH):
             some = receivers[begin : begin + _ROWS_PER_BATCH]
-            padded = np.resize(some, (-(-len(some) // _ROW_MULTIPLE) * _ROW_MULTIPLE, 6)).astype(real)
+            padded = np.resize(some, (-(-len(some) // _ROW_MULTIPLE) * _ROW_MULTIPLE, 6)).astype(self._input)
             yield operation(padded, device=self.device).factors[: len(some)].astype(np.float64), begin
 
     @functools.cached_property
@@ -266,21 +269,34 @@ class Radiosity:
         """Return whether points see only backs of surfaces: such points are inside a body."""
         extent = float(np.ptp(scene.bvh.corners, axis=(0, 1)).max())
         clearance = self.limits.clearance * float(np.finfo(self._real).eps) * extent
-        hits = ClosestHit(scene=scene, clearance=clearance)(points.astype(self._real), device=self.device)
+        closest = ClosestHit(scene=scene, clearance=clearance, precision=self._precision)
+        hits = closest(points.astype(self._input), device=self.device)
         hit = to_numpy(hits.triangle)
         a, b, c = np.moveaxis(scene.corners[hit], 1, 0)
         back_hits = np.flatnonzero((hit >= 0) & (np.sum(np.cross(b - a, c - a) * points[:, 3:], axis=1) > 0.0))
         everything = np.ones(self.patches.count, self._real)
-        light = PatchLight(patches=self.patches, scene=scene)
-        received = light(np.ascontiguousarray(points[back_hits], self._real), everything, device=self.device).irradiance
+        light = PatchLight(patches=self.patches, scene=scene, precision=self._precision)
+        seen = np.ascontiguousarray(points[back_hits], self._input)
+        received = light(seen, everything, device=self.device).irradiance
         covered = np.zeros(len(points), bool)
         covered[back_hits] = received < self.limits.covered_view
         return covered
 
     @property
     def _real(self) -> Any:
+        """Type of the arithmetic: double where doubles are fast."""
+        assert self.device is not None
+        return np.float64 if self.device.has_fast_double else np.float32
+
+    @property
+    def _input(self) -> Any:
+        """Type of receivers: with slow doubles the kernels subtract positions in double, and compute in single."""
         assert self.device is not None
         return np.float64 if self.device.has_double else np.float32
+
+    @property
+    def _precision(self) -> Precision:
+        return "single" if self._real == np.float32 else None
 
     def _solve_system(self, emitted: Reals) -> Reals:
         if self.patches.count > self.max_dense:

@@ -377,40 +377,45 @@ def test_rays_from_afar(device: Device, variant: Any, dtype: Any, rng: np.random
 
 
 @pytest.mark.parametrize("distance", [0.0, 30.0, 1e3, 1e6])
-def test_rays_without_doubles(device: Device, distance: float, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.double)])
+def test_rays_without_doubles(device: Device, distance: float, dtype: Any, rng: np.random.Generator) -> None:
     """Two floats keep the digits of rays from a distance, and of a scene far from the origin."""
     slow = copy.copy(device)
     slow.has_fast_double = False
     away = np.array([5000.0, -3000.0, 1000.0])
     corners = soup(rng, 200) + away
-    starts = (away + distance * random_directions(rng, 600)).astype(np.float32)
-    rays = np.hstack([starts, (away + rng.uniform(-0.7, 0.7, (600, 3)) - starts).astype(np.float32)])
+    starts = (away + distance * random_directions(rng, 600)).astype(dtype)
+    rays = np.hstack([starts, (away + rng.uniform(-0.7, 0.7, (600, 3)) - starts).astype(dtype)])
+    closest = ClosestHit(scene=Scene(corners), variant="work_item", precision="single")
+    any_hit = AnyHit(scene=Scene(corners), variant="work_item", precision="single")
+    assert "TWO_FLOAT_POSITIONS" in closest.launch(slow, rays.shape, np.dtype(dtype)).defines
     exact = rays.astype(np.float64)
     sure = far_from_edges(corners, exact, 3e-4)
     triangle, far, u, v = reference.closest(corners, exact)
-    hits = ClosestHit(scene=Scene(corners), variant="work_item")(rays, device=slow)
+    hits = closest(rays, device=slow)
     np.testing.assert_array_equal(hits.triangle[sure], triangle[sure])
     hit = sure & (triangle >= 0)
     assert hit.mean() > (0.3 if distance < 1e6 else 0.1)
     # The sine of incidence and the size of the triangle magnify the rounding of the scene's size.
     np.testing.assert_allclose(hits.barycentric[hit], np.column_stack([u, v])[hit], atol=3e-4)
     np.testing.assert_allclose(hits.distance[hit], far[hit], rtol=4 * eps_of(np.float32), atol=2e-5)
-    segments = np.hstack([starts, (away + rng.uniform(-1.0, 1.0, (600, 3))).astype(np.float32)])
+    segments = np.hstack([starts, (away + rng.uniform(-1.0, 1.0, (600, 3))).astype(dtype)])
     ends = segments.astype(np.float64)
     expected = reference.occluded(corners, ends)
     sure = far_from_edges(corners, np.hstack([ends[:, :3], ends[:, 3:] - ends[:, :3]]), 3e-4)
     by = 1e-4 / max(distance, 1.0)
     sure &= reference.occluded(corners, ends, -by) == reference.occluded(corners, ends, by)
-    result = AnyHit(scene=Scene(corners), variant="work_item")(segments, device=slow)
+    result = any_hit(segments, device=slow)
     np.testing.assert_array_equal(result.occluded[sure], expected[sure])
     assert 0.2 < expected[sure].mean() < 0.95
-    # Rays that point away have no hit; lengths beyond the squares of single precision are directions, too.
-    rays[:, 3:] *= np.float32(2.0**80)
-    again = ClosestHit(scene=Scene(corners), variant="work_item")(rays, device=slow)
+    # Rays that point away have no hit; lengths beyond the squares of their type are directions, too.
+    long = dtype(2.0**80 if dtype == np.float32 else 2.0**600)
+    rays[:, 3:] *= long
+    again = closest(rays, device=slow)
     np.testing.assert_array_equal(again.triangle[hit], hits.triangle[hit])
     if distance:
-        rays[:, 3:] *= np.float32(-(2.0**-80))
-        assert (ClosestHit(scene=Scene(corners), variant="work_item")(rays, device=slow).triangle[sure] == -1).all()
+        rays[:, 3:] /= -long
+        assert (closest(rays, device=slow).triangle[sure] == -1).all()
 
 
 def random_directions(rng: np.random.Generator, count: int) -> np.ndarray:

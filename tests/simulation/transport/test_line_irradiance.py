@@ -257,7 +257,10 @@ def test_at_a_millionth_of_its_length(
 
 @TWO_WAYS
 @pytest.mark.parametrize("alike", [False, True])
-def test_positions_without_doubles(device: Device, variant: Any, alike: bool, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.double)])
+def test_positions_without_doubles(
+    device: Device, variant: Any, alike: bool, dtype: Any, rng: np.random.Generator
+) -> None:
     """Two floats keep the digits of positions where single precision would lose all of them."""
     slow = copy.copy(device)
     slow.has_fast_double = False
@@ -266,11 +269,14 @@ def test_positions_without_doubles(device: Device, variant: Any, alike: bool, rn
     if not alike:  # each in a frame of its direction
         scene = [(start, start + rng.normal(size=3) * [1.0, 1.0, 0.0], normal) for start, _, normal in scene]
     rounded, segments = moved_scene(np.array(receivers), [FLOOR, *scene], random_rotation(rng), 1.0)
-    rounded = rounded.astype(np.float32)
+    rounded = rounded.astype(dtype)
     frames = len(segments.tables(np.dtype(np.float32))[1])
     assert frames == (1 if alike else 20)
     value, most = reference.irradiance(rounded.astype(float), segments.ends, segments.normals, segments.exitance)
-    result = LineIrradiance(segments=segments, variant=variant)(np.tile(rounded, (16, 1)), device=slow)
+    operation = LineIrradiance(segments=segments, precision="single", variant=variant)
+    result = operation(np.tile(rounded, (16, 1)), device=slow)
+    if variant == "work_item":
+        assert "TWO_FLOAT_POSITIONS" in operation.launch(slow, rounded.shape, np.dtype(dtype)).defines
     worst = most * np.max(reach(rounded.astype(float), segments), axis=1)
     error = np.abs(result.irradiance.reshape(16, -1) - value)
     assert np.all(error <= 2e-6 * most + 2.0**-42 * worst), f"{np.max(error / most)} of the whole light"

@@ -35,6 +35,7 @@ ON_DEVICES = settings(max_examples=8, deadline=None, suppress_health_check=[Heal
 WAYS = pytest.mark.parametrize(
     ("variant", "dtype"), [("vector", np.float32), ("vector", np.float64), ("work_item", np.float32)]
 )
+INPUTS = pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.double)])
 FLOOR = np.array([-0.5, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0])
 NO_TRIANGLES = np.zeros((0, 3, 3))
 
@@ -339,10 +340,15 @@ def test_more_segments_than_a_tile(device: Device, each: int, rng: np.random.Gen
 
 
 @pytest.mark.parametrize("count", [3, 60])
-def test_light_with_slow_doubles(device: Device, count: int) -> None:
+@INPUTS
+def test_light_with_slow_doubles(device: Device, count: int, dtype: Any) -> None:
     corners, segments, receivers, value, largest = lit_soup(count)
-    slow, single = without_fast_doubles(device), receivers.astype(np.float32)
-    result = light_of(corners, single, segments, slow, variant="work_item", clearance=1e-5)
+    slow, given = without_fast_doubles(device), receivers.astype(dtype)
+    result = light_of(corners, given, segments, slow, variant="work_item", precision="single", clearance=1e-5)
+    assert result.irradiance.dtype == np.float32
+    if device.kind != "rusticl":
+        operation = OccludedIrradiance(scene=Scene(corners), segments=5, precision="single", variant="work_item")
+        assert "TWO_FLOAT_POSITIONS" in operation.launch(slow, given.shape, given.dtype).defines
     assert not result.status.any()
     error = np.abs(result.irradiance.ravel() - value) / np.where(largest > 0.0, largest, 1.0)
     assert np.quantile(error, 0.95) <= 5e-6
@@ -352,31 +358,38 @@ def test_light_with_slow_doubles(device: Device, count: int) -> None:
         np.testing.assert_allclose(current, sums, rtol=4 * np.finfo(np.float32).eps)
 
 
-@pytest.mark.parametrize("exponent", [0, 60, -60])
-def test_positions_with_slow_doubles(device: Device, exponent: int, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(
+    ("exponent", "dtype"),
+    [
+        *((power, np.float32) for power in (0, 60, -60)),
+        *(pytest.param(power, np.float64, marks=pytest.mark.double) for power in (0, 400, -400)),
+    ],
+)
+def test_positions_with_slow_doubles(device: Device, exponent: int, dtype: Any, rng: np.random.Generator) -> None:
     """Two floats keep the digits of positions a millionth of the length from a segment; normals of any length."""
     if device.kind == "rusticl":
         pytest.skip("positions are floats on rusticl")
     start, along = rng.uniform(0.5, 1.5, 3).astype(np.float32), rng.normal(size=3).astype(np.float32)
     normal = np.cross(along, rng.normal(size=3)).astype(np.float32)
-    rows = np.array([[*start, *(start + along), *(normal * np.float32(2.0**exponent)), 1.0]], np.float32).astype(float)
+    rows = np.array([[*start, *(start + along), *(normal * dtype(2.0) ** exponent), 1.0]], dtype).astype(float)
     begin, step, normal = rows[0, :3], rows[0, 3:6] - rows[0, :3], rows[0, 6:9] * 2.0**-exponent
     normal -= step * (step @ normal) / (step @ step)
     normal /= np.linalg.norm(normal)
     # Rounding to float32 moves the receivers: as many as lie above the segment stay.
     heights = np.repeat([3e-7, 1e-6, 1e-5, 1e-3], 16)
-    places = single(begin + rng.uniform(0.1, 0.9, (64, 1)) * step + heights[:, None] * normal)
+    places = (begin + rng.uniform(0.1, 0.9, (64, 1)) * step + heights[:, None] * normal).astype(dtype).astype(float)
     facing = -normal + 0.3 * rng.normal(size=(64, 3))
-    receivers = np.hstack([places, single(facing)])
+    receivers = np.hstack([places, facing.astype(dtype).astype(float)])
     receivers = receivers[(places - begin) @ normal > 1e-7]
     assert len(receivers) > 40
     value, most = closed_form.irradiance(receivers, rows[:, :6].reshape(1, 2, 3), normal[None], rows[:, 9])
     result = light_of(
         NO_TRIANGLES,
-        receivers[None].astype(np.float32),
+        receivers[None].astype(dtype),
         rows,
         without_fast_doubles(device),
         variant="work_item",
+        precision="single",
         visibility="none",
     )
     far = np.linalg.norm(receivers[:, None, :3] - rows[:, :6].reshape(1, 2, 3), axis=-1).max(axis=1)

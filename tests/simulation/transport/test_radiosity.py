@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from itertools import pairwise
 from typing import Any
 
@@ -120,14 +121,16 @@ def test_many_short_segments_are_as_one(device: Device) -> None:
     np.testing.assert_allclose(arrived, expected, atol=0.02 * expected.max())
 
 
-def test_single_precision_serves_where_there_is_no_double(device: Device) -> None:
-    class Single(Radiosity):
-        _real = np.float32
-
+@pytest.mark.double
+@pytest.mark.parametrize("has_double", [False, True])
+def test_single_precision_serves_where_doubles_are_slow_or_missing(device: Device, has_double: bool) -> None:
+    without = copy.copy(device)
+    without.has_double, without.has_fast_double = has_double, False
     double = solved(0.3, [0.9], device)
-    single = Single(patches=double.patches, albedo=double.albedo, device=device)
-    iterated = Single(patches=double.patches, albedo=double.albedo, device=device, max_dense=0)
+    single = Radiosity(patches=double.patches, albedo=double.albedo, device=without)
+    iterated = Radiosity(patches=double.patches, albedo=double.albedo, device=without, max_dense=0)
     arrival = double.direct_irradiance(stripe())
+    assert np.abs(single.form_factors - double.form_factors).max() > 1e-12  # computed in single
     np.testing.assert_allclose(single.direct_irradiance(stripe()), arrival, atol=1e-5 * arrival.max())
     exact = double.solve(arrival)
     np.testing.assert_allclose(single.solve(arrival), exact, rtol=1e-4)

@@ -30,7 +30,8 @@ typedef struct {
 static inline void put_line_row(LINE_ROWS rows, int i, global const BoardLine *line, real u, real v, real variance) {
     const real x = line->x + u * line->normal_y, y = line->y - u * line->normal_x;
     const real moved_x = v * line->normal_x, moved_y = v * line->normal_y;
-    const real sigma = variance > 0 ? sqrt(variance + line->sigma * line->sigma) : REAL_NAN;
+    const int is_known = variance > 0 && !not_finite(variance);
+    const real sigma = is_known ? sqrt(variance + line->sigma * line->sigma) : REAL_NAN;
 #ifdef VECTOR_VARIANT
     put_row(rows, i, row_with_sigma(line->normal_x, line->normal_y, x, y, moved_x, moved_y, sigma, line->etch_factor));
 #else

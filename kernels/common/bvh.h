@@ -35,6 +35,7 @@ INLINE uint node_bits(node_masks mask) {
     const node_masks set = mask & (node_masks)(1, 2, 4, 8);
     return (uint)(set.x | set.y | set.z | set.w);
 }
+INLINE int node_any(node_masks mask) { return node_bits(mask) != 0; }
 #define mask_of_nodes(comparison) (comparison)
 #else
 #define WIDTH 16
@@ -44,6 +45,7 @@ typedef masks node_masks;
 #define node_max lane_max
 #define node_min lane_min
 #define node_bits lane_bits
+#define node_any any_compared
 #define mask_of_nodes mask_of
 #endif
 typedef node_reals node_reals_at __attribute__((aligned(sizeof(real))));
@@ -176,7 +178,7 @@ INLINE uint bvh_met(const bvh_ray *ray, real end, global const real *node) {
 INLINE int bvh_leaf_any(const bvh_ray *ray, global const real *leaf) {
     node_reals t, u, v, det;
 #if defined(VECTOR_VARIANT) || defined(FOUR_WIDE)
-    return node_bits(bvh_triangles(ray, ray->end, leaf, &t, &u, &v, &det)) != 0;
+    return node_any(bvh_triangles(ray, ray->end, leaf, &t, &u, &v, &det));
 #else
     for (int lane = 0; lane < WIDTH; lane++)
         if (bvh_triangles(ray, ray->end, leaf + lane, &t, &u, &v, &det)) return 1;

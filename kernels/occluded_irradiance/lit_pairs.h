@@ -262,7 +262,7 @@ INLINE void list_pairs(uint facing, uint first, local pair_memory *memory) {
 }
 
 // (3) Light of a pair, with the sign bit set where the visible parts are incomplete.
-static inline real light_of(uint pair, const bvh_tree *tree, real clearance, uint samples, int *hint,
+static inline real light_of(uint pair, const bvh_tree *tree, real clearance, uint samples,
                      local pair_memory *memory) {
     const uint segment = pair / BLOCK;
     const segment_frame frame = load_frame(memory->frames + segment);
@@ -284,7 +284,7 @@ static inline real light_of(uint pair, const bvh_tree *tree, real clearance, uin
 #ifdef HIDDEN_GROUP
         dark.low = memory->room + get_local_id(0), dark.high = dark.low + HIDDEN_AT(MAX_HIDDEN);
 #endif
-        is_whole = add_visible(tree, &from, &v, hint, &dark, &seen);
+        is_whole = add_visible(tree, &from, &v, &dark, &seen);
 #else
         add_sampled(tree, &of, &from, &at, clearance, samples, &seen);
 #endif

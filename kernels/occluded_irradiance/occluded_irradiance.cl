@@ -39,7 +39,7 @@ AS_IT_IS kernel void occluded_irradiance(
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
     const ulong group = get_group_id(0), groups = get_num_groups(0);
     chunk lit;
-    int hint = NO_HINT, loaded = -1; // first segment of the chunk that is loaded
+    int loaded = -1; // first segment of the chunk that is loaded
     for (ulong strip = strips * group / groups; strip < strips * (group + 1) / groups; strip++) {
         place to_left = 0, to_right = 0;
         for (uint first = 0; first < each; first += LANES) {
@@ -55,13 +55,13 @@ AS_IT_IS kernel void occluded_irradiance(
             const int end = min(starts[list + 1], (int)pick_count);
             for (int next = max(starts[list], 0); next < end;) {
                 next = load_selected(segments, selected, next, end, segment_count, middle, &lit, &flag);
-                light_chunk(&tree, &lit, clearance, samples, &hint, &here, &waiting, &flag);
+                light_chunk(&tree, &lit, clearance, samples, &here, &waiting, &flag);
             }
 #else
             for (int next = 0; next < (int)segment_count; next += SEGMENTS) {
                 if (loaded != next) load_from(segments, next, (int)segment_count, middle, &lit);
                 loaded = next;
-                light_chunk(&tree, &lit, clearance, samples, &hint, &here, &waiting, &flag);
+                light_chunk(&tree, &lit, clearance, samples, &here, &waiting, &flag);
             }
 #endif
             finish(&waiting, here.sums);
@@ -82,7 +82,6 @@ kernel void occluded_irradiance(
     const ulong strip = get_group_id(0);
     const uint item = get_local_id(0);
     local pair_memory memory;
-    int hint = NO_HINT;
     places to_left = convert_places(0), to_right = convert_places(0);
     for (uint first = 0; first < each; first += BLOCK) {
         const ulong row = strip * each + first;
@@ -115,7 +114,7 @@ kernel void occluded_irradiance(
             barrier(CLK_LOCAL_MEM_FENCE);
             memory.counts[item] = place_in_list << 16 | facing;
             for (uint pair = item; pair < PAIRS_OF(all); pair += GROUP)
-                memory.list[pair] = light_of((uint)memory.list[pair], &tree, clearance, samples, &hint, &memory);
+                memory.list[pair] = light_of((uint)memory.list[pair], &tree, clearance, samples, &memory);
             if (BAD_OF(all)) flag |= STATUS_NOT_FINITE;
             if (BEYOND_OF(all)) flag |= STATUS_OUT_OF_RANGE;
             barrier(CLK_LOCAL_MEM_FENCE);

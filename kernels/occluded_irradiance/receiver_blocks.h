@@ -179,7 +179,7 @@ static inline observer observer_of(const block *here, int lane) {
 
 // Append the visible parts of a line that the receiver of a lane faces.
 static inline void add_light(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, real clearance,
-                      uint samples, int *hint, block *here, pieces *waiting) {
+                      uint samples, block *here, pieces *waiting) {
     const uint members = lit->members[line];
 #if defined(INTERVALS)
     if (!(members & lit->unseen)) {
@@ -189,7 +189,7 @@ static inline void add_light(const bvh_tree *tree, const chunk *lit, int line, c
         const observer at = observer_of(here, lane);
         view v = view_from(&of, &from, &at, clearance);
         hidden dark;
-        if (!add_visible(tree, &from, &v, hint, &dark, &seen)) here->flags[lane] = STATUS_AMBIGUOUS;
+        if (!add_visible(tree, &from, &v, &dark, &seen)) here->flags[lane] = STATUS_AMBIGUOUS;
         return;
     }
 #endif
@@ -212,7 +212,7 @@ static inline void add_light(const bvh_tree *tree, const chunk *lit, int line, c
 }
 
 // Append the visible parts of a line for all receivers of a block.
-static inline void light_block(const bvh_tree *tree, const chunk *lit, int line, real clearance, uint samples, int *hint, block *here,
+static inline void light_block(const bvh_tree *tree, const chunk *lit, int line, real clearance, uint samples, block *here,
                  pieces *waiting) {
     before all;
     uint lanes = face(here, &lit->lines, line, &all.whole);
@@ -224,7 +224,7 @@ static inline void light_block(const bvh_tree *tree, const chunk *lit, int line,
         else all.lanes[k] = face(here, &lit->each, k, all.own + k);
     }
     for (; lanes; lanes &= lanes - 1)
-        add_light(tree, lit, line, &all, lowest_bit(lanes), clearance, samples, hint, here, waiting);
+        add_light(tree, lit, line, &all, lowest_bit(lanes), clearance, samples, here, waiting);
 }
 
 static inline int has_no_number(place value) { return not_finite((real)value); }
@@ -252,11 +252,11 @@ static inline void store_block(const block *here, uchar flag, global real *irrad
 }
 
 // Add the light of a chunk of segments to a block of receivers.
-static inline void light_chunk(const bvh_tree *tree, const chunk *lit, real clearance, uint samples, int *hint, block *here,
+static inline void light_chunk(const bvh_tree *tree, const chunk *lit, real clearance, uint samples, block *here,
                         pieces *waiting, uchar *flag) {
     if (!lit->is_good) *flag |= STATUS_NOT_FINITE;
     for (int line = 0; line < lit->line_count; line++)
-        light_block(tree, lit, line, clearance, samples, hint, here, waiting);
+        light_block(tree, lit, line, clearance, samples, here, waiting);
 }
 
 #endif

@@ -13,7 +13,6 @@
 #include "common/bvh.h"
 
 #define VIEW_HALVES 6 // half-spaces that bound the view: start and end of the window, both sides of the plane, both surfaces
-#define NO_HINT 0     // hints are leaves (negative child indices); 0 is the root node
 // Capacity for hidden intervals. A segment with more of them is traced in halves, down to this fraction of its length.
 #define MAX_HIDDEN 32
 #define SMALLEST_WINDOW ((real)0.0001)
@@ -170,15 +169,16 @@ INLINE masks view_lines(const view *view, global const real *leaf, reals *deep, 
     const reals along_a = lane_dot(view->along_x, view->along_y, view->along_z, ax, ay, az), along_b = lane_dot(view->along_x, view->along_y, view->along_z, bx, by, bz), along_c = lane_dot(view->along_x, view->along_y, view->along_z, cx, cy, cz);
     const reals far_a = fabs(off_a), far_b = fabs(off_b), far_c = fabs(off_c);
     const reals unknown_zero = view->from - view->from; // no constant: the difference of NaN is NaN
-    // Exactly two of the three edges are cut.
-    const reals deep_bc = view_mix(deep_b, far_b, deep_c, far_c, unknown_zero);
-    const reals along_bc = view_mix(along_b, far_b, along_c, far_c, unknown_zero);
-    deep[0] = cuts_ab ? view_mix(deep_a, far_a, deep_b, far_b, unknown_zero) : deep_bc;
-    deep[1] = cuts_ca ? view_mix(deep_a, far_a, deep_c, far_c, unknown_zero) : deep_bc;
-    along[0] = cuts_ab ? view_mix(along_a, far_a, along_b, far_b, unknown_zero) : along_bc;
-    along[1] = cuts_ca ? view_mix(along_a, far_a, along_c, far_c, unknown_zero) : along_bc;
-    weight[0] = far_b + (cuts_ab ? far_a : far_c);
-    weight[1] = far_c + (cuts_ca ? far_a : far_b);
+    // Exactly two of the three edges are cut: one that ends at corner b, one that ends at corner c.
+    const reals deep_to_b = cuts_ab ? deep_a : deep_c, deep_to_c = cuts_ca ? deep_a : deep_b;
+    const reals along_to_b = cuts_ab ? along_a : along_c, along_to_c = cuts_ca ? along_a : along_b;
+    const reals far_to_b = cuts_ab ? far_a : far_c, far_to_c = cuts_ca ? far_a : far_b;
+    deep[0] = view_mix(deep_b, far_b, deep_to_b, far_to_b, unknown_zero);
+    deep[1] = view_mix(deep_c, far_c, deep_to_c, far_to_c, unknown_zero);
+    along[0] = view_mix(along_b, far_b, along_to_b, far_to_b, unknown_zero);
+    along[1] = view_mix(along_c, far_c, along_to_c, far_to_c, unknown_zero);
+    weight[0] = far_b + far_to_b;
+    weight[1] = far_c + far_to_c;
     return apart;
 }
 
@@ -206,17 +206,20 @@ INLINE void view_shadows(const view *view, global const real *leaf, shadows *cas
     const reals zero = (reals)0;
     const reals deep1 = deep[0], deep2 = deep[1], along1 = along[0], along2 = along[1];
     const reals weight1 = weight[0], weight2 = weight[1];
-    // Keep triangles with a part before the segment's surface, beyond the near limit, above the receiver, in the window.
+    // Keep triangles with a part before the segment's surface, beyond the near limit, above the receiver.
     const reals far1 = view->far * weight1 - deep1, far2 = view->far * weight2 - deep2;
     const reals near1 = deep1 - view->near * weight1, near2 = deep2 - view->near * weight2;
     const reals lift1 = view->lift_deep * deep1 + view->lift_along * along1 - view->lift * weight1;
     const reals lift2 = view->lift_deep * deep2 + view->lift_along * along2 - view->lift * weight2;
     hides &= mask_of(lane_max(far1, far2) >= zero) & mask_of(lane_max(near1, near2) >= zero) &
              mask_of(lane_max(lift1, lift2) >= zero);
+    cast->low = (reals)1, cast->high = zero;
+#ifndef VECTOR_VARIANT
+    // A work-item saves the cuts of a triangle that is out of the window. Few vectors have no triangle in the window.
     hides &= mask_of(along1 >= view->from * deep1) | mask_of(along2 >= view->from * deep2);
     hides &= mask_of(along1 <= view->to * deep1) | mask_of(along2 <= view->to * deep2);
-    cast->low = (reals)1, cast->high = zero;
-    if (!any_compared(hides)) return;
+    if (!hides) return;
+#endif
     reals enter = zero, leave = (reals)1;
     view_cut(far1, far2, &enter, &leave);
     const reals least = lane_min(lane_min(near1, near2), lane_min(lift1, lift2));
@@ -279,89 +282,65 @@ INLINE void hidden_sort(hidden *all) {
 
 INLINE int hidden_is_done(const hidden *all) { return all->is_full || all->from >= all->to; }
 
-// Add the shadows of a leaf. Returns their total length (overlaps count twice): a measure of the leaf's usefulness.
-INLINE real hidden_add_all(hidden *all, const shadows *cast) {
+// Add the shadows of a leaf.
+INLINE void hidden_add_all(hidden *all, const shadows *cast) {
     const reals low = cast->low, high = cast->high;
     masks hides = mask_of(low < high) & mask_of(low < all->to) & mask_of(high > all->from);
     for (int n = 0; n < all->count; n++) hides &= mask_of(low < all->low[HIDDEN_AT(n)]) | mask_of(high > all->high[HIDDEN_AT(n)]);
-    real gone = 0;
-    if (!any_compared(hides)) return gone;
 #ifdef VECTOR_VARIANT
     const real *lows = (const real *)&cast->low, *highs = (const real *)&cast->high;
     for (uint left = lane_bits(hides); left; left &= left - 1) {
         const int lane = lowest_bit(left);
-        gone += highs[lane] - lows[lane];
         hidden_add(all, lows[lane], highs[lane]);
     }
 #else
-    if (hides) gone = high - low, hidden_add(all, low, high);
+    if (hides) hidden_add(all, low, high);
 #endif
-    return gone;
 }
 
-INLINE real view_leaf(const bvh_tree *tree, const view *view, int child, hidden *all) {
-    global const real *leaf = tree->leaves + (size_t)~child * (9 * WIDTH);
-    shadows cast;
-    real gone = 0;
+// Add the shadows of the leaves among a node's children. Returns the children that are nodes.
+INLINE uint view_leaves(const bvh_tree *tree, const view *view, int node, uint met, hidden *all) {
+    global const int *children = tree->children + node * WIDTH;
 #ifdef VECTOR_VARIANT
-    view_shadows(view, leaf, &cast);
-    gone = hidden_add_all(all, &cast);
-#else
-    for (int lane = 0; lane < WIDTH; lane++) {
-        view_shadows(view, leaf + lane, &cast);
-        gone += hidden_add_all(all, &cast);
-    }
-#endif
-    return gone;
-}
-
-// Add the shadows of the leaves among a node's children, except leaf `known`. Returns the children that are nodes.
-// `hint` becomes the leaf that hides most, if that is more than `most`.
-INLINE uint view_leaves(const bvh_tree *tree, const view *view, int node, uint met, int known, hidden *all,
-                            real *most, int *hint) {
-    uint inner = 0;
-#ifdef VECTOR_VARIANT
-    int count = 0, leaves[WIDTH];
-    for (; met; met &= met - 1) {
-        const int child = tree->children[node * WIDTH + lowest_bit(met)];
-        if (child >= 0) inner |= met & -met;
-        else if (child != known) leaves[count++] = child;
-    }
+    const uint leaves = met & lane_bits(to_masks(*(global const ints_at *)children < 0));
     // Compute all shadows before any is merged: merging branches on the data and would stall the arithmetic of the next.
     shadows cast[WIDTH];
-    for (int n = 0; n < count; n++) view_shadows(view, tree->leaves + (size_t)~leaves[n] * (9 * WIDTH), cast + n);
-    for (int n = 0; n < count && !hidden_is_done(all); n++) {
-        const real gone = hidden_add_all(all, cast + n);
-        if (gone > *most) *most = gone, *hint = leaves[n];
-    }
+    int count = 0;
+    for (uint left = leaves; left; left &= left - 1)
+        view_shadows(view, tree->leaves + (size_t)~children[lowest_bit(left)] * (9 * WIDTH), cast + count++);
+    for (int n = 0; n < count && !hidden_is_done(all); n++) hidden_add_all(all, cast + n);
+    return met & ~leaves;
 #else
+    uint inner = 0;
     for (; met; met &= met - 1) {
-        const int child = tree->children[node * WIDTH + lowest_bit(met)];
+        const int child = children[lowest_bit(met)];
         if (child >= 0) inner |= met & -met;
-        else if (child != known && !hidden_is_done(all)) {
-            const real gone = view_leaf(tree, view, child, all);
-            if (gone > *most) *most = gone, *hint = child;
+        else if (!hidden_is_done(all)) {
+            global const real *leaf = tree->leaves + (size_t)~child * (9 * WIDTH);
+            for (int lane = 0; lane < WIDTH; lane++) {
+                shadows cast;
+                view_shadows(view, leaf + lane, &cast);
+                hidden_add_all(all, &cast);
+            }
         }
     }
-#endif
     return inner;
+#endif
 }
 
-// Find the hidden intervals of the window. Stop when all of it is hidden, or when they exceed the capacity. Visit first
-// the leaf that hid most from the previous point: it often does again.
-INLINE void view_trace(const bvh_tree *tree, view *view, hidden *all, int *hint) {
+// Add the shadows of the leaves among a node's children that the view meets. Returns the other children that it meets.
+INLINE uint view_node(const bvh_tree *tree, view *view, int node, hidden *all) {
+    if (all->from > view->from || all->to < view->to) view_set_window(view, all->from, all->to);
+    return view_leaves(tree, view, node, view_met(view, tree->nodes + (size_t)node * (6 * WIDTH)), all);
+}
+
+// Add the shadows of the leaves below a node.
+INLINE void view_walk(const bvh_tree *tree, view *view, int node, hidden *all) {
     int nodes[BVH_DEPTH];
     uint left[BVH_DEPTH];
-    int node = 0, depth = 0;
-    const int known = *hint;
-    real most = 0;
-    view_set_window(view, all->from, all->to);
-    view_set_box(view);
-    if (known < 0) view_leaf(tree, view, known, all);
+    int depth = 0;
     while (!hidden_is_done(all)) {
-        if (all->from > view->from || all->to < view->to) view_set_window(view, all->from, all->to);
-        const uint met = view_met(view, tree->nodes + (size_t)node * (6 * WIDTH));
-        const uint inner = view_leaves(tree, view, node, met, known, all, &most, hint);
+        const uint inner = view_node(tree, view, node, all);
         if (inner) nodes[depth] = node, left[depth++] = inner;
         if (!depth) return;
         const uint lane = lowest_bit(left[depth - 1]);
@@ -369,6 +348,41 @@ INLINE void view_trace(const bvh_tree *tree, view *view, hidden *all, int *hint)
         left[depth - 1] &= left[depth - 1] - 1;
         if (!left[depth - 1]) depth--;
     }
+}
+
+#ifdef VECTOR_VARIANT
+// Sort a set of the root's children by the distance of their boxes' middles from the point, the nearest last. Return their
+// number.
+INLINE int view_order(const bvh_tree *tree, const view *view, uint set, int *order) {
+    global const real *low = tree->nodes, *high = low + 3 * WIDTH;
+    const reals x = load_reals(low) + load_reals(high) - (real)2 * view->x;
+    const reals y = load_reals(low + WIDTH) + load_reals(high + WIDTH) - (real)2 * view->y;
+    const reals z = load_reals(low + 2 * WIDTH) + load_reals(high + 2 * WIDTH) - (real)2 * view->z;
+    real far[WIDTH], sorted[WIDTH];
+    store_private(x * x + y * y + z * z, far);
+    int count = 0;
+    for (; set; set &= set - 1) {
+        const int lane = lowest_bit(set);
+        int at = count++;
+        for (; at > 0 && sorted[at - 1] < far[lane]; at--) sorted[at] = sorted[at - 1], order[at] = order[at - 1];
+        sorted[at] = far[lane], order[at] = tree->children[lane];
+    }
+    return count;
+}
+#endif
+
+// Find the hidden intervals of the window. Stop when all of it is hidden, or when they exceed the capacity. The vector
+// variant visits the root's children in the order of their distance: near triangles hide more, so that the window shrinks
+// sooner, and fewer leaves are visited (a tenth less on a board with 40 parts).
+INLINE void view_trace(const bvh_tree *tree, view *view, hidden *all) {
+    view_set_window(view, all->from, all->to);
+    view_set_box(view);
+#ifdef VECTOR_VARIANT
+    int order[WIDTH];
+    for (int left = view_order(tree, view, view_node(tree, view, 0, all), order); left;) view_walk(tree, view, order[--left], all);
+#else
+    view_walk(tree, view, 0, all);
+#endif
 }
 
 #endif

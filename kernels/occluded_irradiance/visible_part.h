@@ -9,7 +9,7 @@
 #ifdef INTERVALS
 // Pass the visible parts to add_seen. Returns 0 if the hidden intervals exceed the capacity even in the smallest window:
 // the result is then incomplete (AMBIGUOUS).
-static inline int add_visible(const bvh_tree *tree, const placement *from, view *v, int *hint, hidden *dark, receiving *to) {
+static inline int add_visible(const bvh_tree *tree, const placement *from, view *v, hidden *dark, receiving *to) {
     // Part above the receiver's plane, widened by rounding; the closed form cuts it exactly.
     const real toward = from->toward, toward_end = from->toward_end;
     const real slack = (real)8 * (real)REAL_EPSILON, horizon = toward / (toward - toward_end);
@@ -19,7 +19,7 @@ static inline int add_visible(const bvh_tree *tree, const placement *from, view 
     real low = begin, high = end;
     while (low < end) {
         hidden_begin(dark, low, high);
-        view_trace(tree, v, dark, hint);
+        view_trace(tree, v, dark);
         if (dark->is_full && high - low > SMALLEST_WINDOW) {
             high = (real)0.5 * (low + high);
             continue;

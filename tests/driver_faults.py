@@ -51,7 +51,7 @@ FAULTS = (
     DriverFault(
         "rusticl",
         "22.3",
-        r"test_blob(_accuracy)?\.py::",
+        r"test_blob(_accuracy)?\.py::|test_maps\.py::test_\w+\[\w+-blob",
         "Mesa 22.3 does not compile the blob kernel within a minute",
         ends_process=True,
     ),

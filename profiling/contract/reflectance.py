@@ -82,7 +82,8 @@ def _condition(model: Brdf, pairs: npt.NDArray[np.float64]) -> npt.NDArray[np.fl
         if isinstance(model, OrenNayar):
             return np.asarray(1.0 + 1.0 / np.maximum(light[:, 2], eye[:, 2]))
         if isinstance(model, Ggx):
-            return np.full(len(pairs), 1.0 + 1.0 / model.alpha)
+            # The half vector of grazing, mirrored directions is short: their rounding turns it more.
+            return np.asarray(1.0 + 1.0 / (model.alpha * np.minimum(0.5 * np.linalg.norm(half, axis=-1), 1.0)))
         if isinstance(model, Ward):
             x, y = half[:, 0] / (model.alpha_x * half[:, 2]), half[:, 1] / (model.alpha_y * half[:, 2])
             away = np.hypot(x, y)

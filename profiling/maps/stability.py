@@ -12,7 +12,10 @@ import numpy.typing as npt
 
 from gpuvision.host import Device
 
-OPERATIONS = ("psd", "triangulation", "line", "undistort_points", "ruler", "line_fit", "pose")
+OPERATIONS = (
+    *("psd", "triangulation", "line", "undistort_points", "ruler", "line_fit", "pose"),
+    *("range_image", "merge_heights", "deposits", "reflectance", "line_irradiance", "rays", "blob", "board_image"),
+)
 """Operations with a map: names of the modules of this package."""
 LIMITS = (1e-6, 1e-3)
 """Relative errors that bound the regions of a map."""

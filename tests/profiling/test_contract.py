@@ -24,7 +24,7 @@ EPS = float(np.finfo(np.float32).eps)
 LIMITS = (equal("status", reason="compared"), roundings(2, "value", of="value", reason="sum and product"))
 # Cheap operations, for the fast tier.
 CHEAP = ("MergeHeights", "PsdReadout", "Triangulation")
-# Operations and drivers that break their limits: kind of the device, and start of the driver's version. Mesa 22.3 ends the
+# Operations and drivers that break their limits: kind of the device, and start of the version. Mesa 22.3 ends the
 # match of the pixels of a blob early; PoCL and Intel's runtime keep the limits with the same variant of the kernel.
 FAULTY = {"FindBlobs": ("rusticl", "22.3")}
 COSTLY = sorted(set(agreement.stated_limits()) - set(CHEAP))

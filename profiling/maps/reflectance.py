@@ -1,0 +1,45 @@
+"""Reflectance of a metal (GGX): width of its lobe, and elevation of the directions above the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpuvision.host import Device, to_numpy
+from gpuvision.profiling.maps.stability import Axis, Floats, Problem
+from gpuvision.simulation.scene.reflectance import Ggx, Reflectance
+
+_EPS = float(np.finfo(np.float32).eps)
+
+
+def problem() -> Problem:
+    """Return the error of the reflectance over the roughness and the elevation of both directions."""
+    return Problem(
+        (Axis("roughness alpha", 1e-3, 1.0), Axis("cosine of incidence", 1e-3, 0.999)), "value", _errors, _bound
+    )
+
+
+def _errors(device: Device, places: Floats, rng: np.random.Generator) -> Floats:
+    upright = places[:, 1:]
+    along = np.sqrt(1.0 - upright**2)
+    turn = rng.uniform(-np.pi, np.pi, (len(places), 1))
+    # The eye near the mirrored light, as far away as the lobe is wide.
+    other = turn + np.pi + places[:, :1] * rng.normal(size=turn.shape)
+    pairs = np.concatenate(
+        [along * np.cos(turn), along * np.sin(turn), upright, along * np.cos(other), along * np.sin(other), upright],
+        axis=1,
+    ).astype(np.float32)
+    errors = np.empty(len(places))
+    for alpha in np.unique(places[:, 0]):
+        chosen = places[:, 0] == alpha
+        model = Ggx(alpha=float(alpha), f0=0.5)
+        value = to_numpy(Reflectance(model=model)(pairs[chosen], device=device).value)
+        exact = model.value(pairs[chosen].astype(np.float64))
+        errors[chosen] = np.abs(value / exact - 1.0)
+    return errors
+
+
+def _bound(places: Floats) -> Floats:
+    # Each direction is scaled to length 1 with up to 2 epsilon. Where two grazing ones nearly cancel, the half vector,
+    # twice the cosine long, turns by 2 epsilon over the cosine. The value changes by two over alpha of this turn. The
+    # model has 32 roundings.
+    return np.asarray(16.0 * _EPS + 4.0 * _EPS / (places[:, 0] * places[:, 1]))

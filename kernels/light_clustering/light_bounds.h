@@ -12,15 +12,28 @@
 // Factor that covers the rounding of the bounds themselves.
 #define UP ((real)1 + (real)256 * (real)REAL_EPSILON)
 
-// Receivers of a block with a cost: box and its centre, mean normal, largest deviation of a normal (spread), heights of the
-// centre above their planes, largest distance from the mean plane (slab).
+// Memory of the receivers: a work-item's own, or local where a work-group processes a block.
+#ifdef VECTOR_VARIANT
+#define BLOCK_SPACE private
+#define load_lanes load_private
+#else
+#define BLOCK_SPACE local
+#define load_lanes(from) (*(from))
+#endif
+
+// Receivers of a block with a cost.
+typedef struct {
+    real places[3 * BLOCK], normals[3 * BLOCK];
+    real lanes[7 * WIDTH]; // x, y, z of places, then of normals, and costs, side by side; no cost behind the last
+} block_receivers;
+
+// Bounds of these receivers: box and its centre, mean normal, largest deviation of a normal (spread), heights of the centre
+// above their planes, largest distance from the mean plane (slab).
 typedef struct {
     real centre[3], low[3], high[3], normal[3];
     real radius, spread, most_height, least_height, slab, cost;
-    real places[3 * BLOCK], normals[3 * BLOCK];
-    real lanes[7 * WIDTH]; // x, y, z of places, then of normals, and costs, side by side; no cost behind the last
     int count;
-} receivers_block;
+} block_bounds;
 
 typedef struct {
     real bound; // the largest cos cos / (pi r^2) of any two points
@@ -40,10 +53,11 @@ static inline void cross3(const real *a, const real *b, real *c) {
     c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-// Skip receivers without cost, which do not affect the reading, and receivers with a zero normal.
-static inline receivers_block block_of(global const INPUT *receivers, global const real *costs, int count,
-                                global const INPUT *middle) {
-    receivers_block block;
+// Store the receivers of a block and return their bounds. Skip receivers without cost, which do not affect the reading, and
+// receivers with a zero normal.
+static inline block_bounds block_of(global const INPUT *receivers, global const real *costs, int count,
+                                    global const INPUT *middle, BLOCK_SPACE block_receivers *all) {
+    block_bounds block;
     int kept = 0;
     block.cost = 0;
     for (int k = 0; k < 3; k++) block.low[k] = INFINITY, block.high[k] = -INFINITY, block.normal[k] = 0;
@@ -51,8 +65,8 @@ static inline receivers_block block_of(global const INPUT *receivers, global con
         real size = 0;
         for (int k = 0; k < 3; k++) size += (real)receivers[6 * i + 3 + k] * (real)receivers[6 * i + 3 + k];
         if (!(costs[i] > 0 && size > 0)) continue;
-        block.lanes[6 * WIDTH + kept] = costs[i], block.cost += costs[i];
-        real *place = block.places + 3 * kept, *normal = block.normals + 3 * kept;
+        all->lanes[6 * WIDTH + kept] = costs[i], block.cost += costs[i];
+        BLOCK_SPACE real *place = all->places + 3 * kept, *normal = all->normals + 3 * kept;
         for (int k = 0; k < 3; k++) {
             place[k] = (real)(receivers[6 * i + k] - middle[k]);
             normal[k] = (real)receivers[6 * i + 3 + k];
@@ -68,25 +82,26 @@ static inline receivers_block block_of(global const INPUT *receivers, global con
     for (int i = 0; i < WIDTH; i++) {
         const int from = i < kept ? i : 0;
         for (int k = 0; k < 3; k++) {
-            block.lanes[k * WIDTH + i] = block.places[3 * from + k];
-            block.lanes[(3 + k) * WIDTH + i] = block.normals[3 * from + k];
+            all->lanes[k * WIDTH + i] = all->places[3 * from + k];
+            all->lanes[(3 + k) * WIDTH + i] = all->normals[3 * from + k];
         }
-        if (i >= kept) block.lanes[6 * WIDTH + i] = 0;
+        if (i >= kept) all->lanes[6 * WIDTH + i] = 0;
     }
     const real size = length3(block.normal);
     for (int k = 0; k < 3; k++) {
         block.centre[k] = (real)0.5 * (block.low[k] + block.high[k]);
-        block.normal[k] = size > 0 ? block.normal[k] / size : block.normals[k];
+        block.normal[k] = size > 0 ? block.normal[k] / size : all->normals[k];
     }
     block.radius = block.spread = block.slab = 0;
     block.most_height = -INFINITY, block.least_height = INFINITY;
     for (int i = 0; i < kept; i++) {
-        real from[3], off[3];
+        real from[3], off[3], normal[3];
         for (int k = 0; k < 3; k++) {
-            from[k] = block.places[3 * i + k] - block.centre[k];
-            off[k] = block.normals[3 * i + k] - block.normal[k];
+            normal[k] = all->normals[3 * i + k];
+            from[k] = all->places[3 * i + k] - block.centre[k];
+            off[k] = normal[k] - block.normal[k];
         }
-        const real height = -dot3(block.normals + 3 * i, from);
+        const real height = -dot3(normal, from);
         block.radius = higher(block.radius, length3(from));
         block.spread = higher(block.spread, length3(off));
         block.slab = higher(block.slab, fabs(dot3(block.normal, from)));
@@ -96,7 +111,7 @@ static inline receivers_block block_of(global const INPUT *receivers, global con
     return block;
 }
 
-static inline meeting meeting_of(const receivers_block *block, global const real *row, int single, real rounding) {
+static inline meeting meeting_of(const block_bounds *block, global const real *row, int single, real rounding) {
     real to[3], side[3], reach = 0, back = 0, front = 0;
     const real normal[3] = {row[NODE_NORMAL], row[NODE_NORMAL + 1], row[NODE_NORMAL + 2]};
     for (int k = 0; k < 3; k++) {
@@ -142,7 +157,7 @@ static inline meeting meeting_of(const receivers_block *block, global const real
 }
 
 // Largest error of the representing segment: irradiance per watt (third-order expansion of the kernel, light_tree.py).
-static inline real error_of(const receivers_block *block, global const real *row, real rounding) {
+static inline real error_of(const block_bounds *block, global const real *row, real rounding) {
     real gap = 0;
     for (int k = 0; k < 3; k++) {
         const real apart =
@@ -158,12 +173,12 @@ static inline real error_of(const receivers_block *block, global const real *row
 }
 
 // Largest cost of a watt of a segment at the receiver of each lane, times pi.
-INLINE reals most_of_lane(const real *lane, global const real *lit, real length, real rounding) {
+INLINE reals most_of_lane(BLOCK_SPACE const real *lane, global const real *lit, real length, real rounding) {
     const reals zero = (reals)0, one = (reals)1;
-    const reals nx = load_private(lane + 3 * WIDTH), ny = load_private(lane + 4 * WIDTH);
-    const reals nz = load_private(lane + 5 * WIDTH), cost = load_private(lane + 6 * WIDTH);
-    const reals x = load_private(lane) - lit[SEGMENT_START], y = load_private(lane + WIDTH) - lit[SEGMENT_START + 1];
-    const reals z = load_private(lane + 2 * WIDTH) - lit[SEGMENT_START + 2];
+    const reals nx = load_lanes(lane + 3 * WIDTH), ny = load_lanes(lane + 4 * WIDTH);
+    const reals nz = load_lanes(lane + 5 * WIDTH), cost = load_lanes(lane + 6 * WIDTH);
+    const reals x = load_lanes(lane) - lit[SEGMENT_START], y = load_lanes(lane + WIDTH) - lit[SEGMENT_START + 1];
+    const reals z = load_lanes(lane + 2 * WIDTH) - lit[SEGMENT_START + 2];
     const real dx = lit[SEGMENT_END] - lit[SEGMENT_START], dy = lit[SEGMENT_END + 1] - lit[SEGMENT_START + 1], dz = lit[SEGMENT_END + 2] - lit[SEGMENT_START + 2];
     const reals up = x * lit[SEGMENT_NORMAL] + y * lit[SEGMENT_NORMAL + 1] + z * lit[SEGMENT_NORMAL + 2];
     const reals start = -(nx * x + ny * y + nz * z);
@@ -178,15 +193,15 @@ INLINE reals most_of_lane(const real *lane, global const real *lit, real length,
 }
 
 // Largest cost of a segment, summed over receivers: finite even where the block touches the lit surface.
-static inline real most_of_segment(const receivers_block *block, global const real *lit, real length, real power,
+static inline real most_of_segment(BLOCK_SPACE const real *lanes, global const real *lit, real length, real power,
                             real rounding) {
     real sum = 0;
 #ifdef VECTOR_VARIANT
     real each[WIDTH];
-    *(reals_at *)each = most_of_lane(block->lanes, lit, length, rounding);
+    *(reals_at *)each = most_of_lane(lanes, lit, length, rounding);
     for (int i = 0; i < WIDTH; i++) sum += each[i];
 #else
-    for (int i = 0; i < WIDTH; i++) sum += most_of_lane(block->lanes + i, lit, length, rounding);
+    for (int i = 0; i < WIDTH; i++) sum += most_of_lane(lanes + i, lit, length, rounding);
 #endif
     return sum * power * PER_PI * UP;
 }

@@ -38,8 +38,8 @@ class ResourceLimits:
     spills : int
         Spilled registers of a build in single precision on NVIDIA [bytes]: none.
     spills_amd : int
-        The same on AMD [bytes]. Its compiler keeps up to 51 of 256 vector registers of ``light_clustering.cl`` and the
-        crosses of ``blob.cl`` in memory around their loops (gfx1100).
+        The same on AMD [bytes]. Its compiler keeps up to 51 of 256 vector registers of the crosses of ``blob.cl`` in
+        memory around their loops (gfx1100).
     spills_double : int
         Spilled registers of a build in double precision [bytes]. A double takes two of the 255 registers that a
         work-item of NVIDIA has; the measurement of deposits spills 552 bytes on sm_90. Choose single for speed.

@@ -19,6 +19,7 @@ from gpuvision.host import (
     capacity,
     ceil_div,
     flags,
+    group_per_element,
     table_offsets,
     to_numpy,
     type_defines,
@@ -41,7 +42,8 @@ _POSITION_ROUNDING, _OCCLUDER_MARGIN = 4.0 * 2.0**-23, 32.0 * 2.0**-23
 # Columns of a segment in kernels/light_clustering/light_clustering.cl: normal, height of its plane, start, end.
 _SEGMENT_SIZES = {"normal": 3, "height": 1, "start": 3, "end": 3}
 _SEGMENT_COLUMNS = sum(_SEGMENT_SIZES.values())
-# Work-items of a work-group; strips of receivers per core, several to balance the load (speed only).
+# Work-items of a work-group, which processes a block; strips of receivers per core, several to balance the load (speed
+# only).
 _GROUP, _STRIPS_PER_CORE = 64, 8
 # Bit of a selected segment that no surface can occlude, as the kernel sets it.
 _UNOCCLUDED_BIT = 1 << 30
@@ -77,7 +79,8 @@ class LightClustering:
     clusters
         Whether one segment may represent several. Default True.
     variant
-        "vector" (16 boxes at a time, for CPU runtimes), "work_item" (a work-item per block, for GPUs), or "auto".
+        "vector" (16 boxes at a time, for CPU runtimes), "work_item" (a work-group per block, whose items compute bounds
+        of clusters and test triangles side by side, for GPUs), or "auto".
 
     Raises
     ------
@@ -253,7 +256,7 @@ class _SelectLights(VisionOperation[_Selection]):
         of_strip = ceil_div(count, BLOCK)
         blocks = strips * of_strip
         each = max(build.share(blocks, per_core=_STRIPS_PER_CORE), 1)
-        work = build.work(blocks, each=each, group=_GROUP)
+        work = build.work(blocks, each=each, group=_GROUP) if build.uses_vectors else group_per_element(blocks, _GROUP)
         tree = None if self.scene is None else self.scene.bvh
         reach = 0.0 if self.scene is None else _scene_reach(self.scene, dtype)
         margin = max(self.clearance, _OCCLUDER_MARGIN * reach)
@@ -279,12 +282,13 @@ class _SelectLights(VisionOperation[_Selection]):
                 **table_offsets("SEGMENT", _SEGMENT_SIZES),
                 "BVH_DEPTH": MIN_STACK_SIZE if tree is None else tree.stack_size,
                 "BLOCK": BLOCK,
+                **({} if work.vectors else {"GROUP": _GROUP}),
                 **flags(OCCLUDERS=tree is not None, CLUSTERS=self.clusters),
             },
             arguments=[
                 *([None] * 5 if tree is None else tree.tables(_REAL)),
                 _REAL.type(margin),
-                *map(np.uint32, (self.capacity, blocks, of_strip, count, work.each)),
+                *map(np.uint32, (self.capacity, blocks, of_strip, count, work.each, self.nodes)),
             ],
         )
 

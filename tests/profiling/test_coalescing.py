@@ -352,6 +352,23 @@ def test_a_smaller_group_solves_a_problem(group_size: int) -> None:
 
 
 @needs_compilers
+@pytest.mark.slow
+@pytest.mark.parametrize("group_size", [64, 16])
+@pytest.mark.parametrize(("name", "inputs"), [("samples", _surface(3, 300)), ("profiles", _across(40, 11))])
+def test_smaller_groups_resample_lines_in_shorter_tiles(name: str, inputs: list[NDArray[Any]], group_size: int) -> None:
+    """A tile of 16 lines in a group of 16 has one sample of each line."""
+    grid = replace(_GRID, columns=11 if name == "profiles" else 240)
+    regrid = gv.Regrid(grid=grid, max_gap=1e-3, max_step=1e-3)
+    operation = regrid.passes[0 if name == "samples" else 1]
+    inputs[3][:, ::7] = gv.Status.LOW_SIGNAL
+    expected = trace(operation, inputs).outputs
+    outputs = trace(operation, inputs, group_size=group_size).outputs
+    assert np.isfinite(expected["z"]).mean() > 0.2
+    for field, value in outputs.items():
+        np.testing.assert_array_equal(value, expected[field], err_msg=field)
+
+
+@needs_compilers
 @pytest.mark.parametrize(
     ("name", "columns", "offset"),
     [

@@ -15,9 +15,9 @@ typedef struct {
 } BoardRuler;
 #define RULER_NUMBERS (int)(sizeof(BoardRuler) / sizeof(real))
 
-// Measured edge: place in the frame of its line [m], and certainty 1/sigma (0: no edge).
+// Measured edge: place in the frame of its line [m], and sigma across the line [m] (NaN: no edge).
 typedef struct {
-    real u, v, certainty;
+    real u, v, sigma;
 } board_edge;
 
 // Return the edge of a ruler from its position and sigma on the ruler [px].
@@ -27,6 +27,6 @@ static inline board_edge board_edge_of(real position, real sigma, global const B
     // Sigma across the line: |dv/ds| sigma, with dv/ds = (dv - v k) / (1 + s k).
     const real across = fabs(ruler->v_per_px - at_v * ruler->projective) * per * sigma;
     const int good = !not_finite(at_u) & !not_finite(at_v) & !not_finite(across) & across > 0;
-    return (board_edge){good ? at_u : 0, good ? at_v : 0, good ? 1 / across : 0};
+    return (board_edge){good ? at_u : 0, good ? at_v : 0, good ? across : REAL_NAN};
 }
 #endif

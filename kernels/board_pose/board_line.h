@@ -1,7 +1,7 @@
 // Lines of a board (board_pose.cl): robust fits through the edges of each line, and the rows of the pose that they give.
 //
-// Options: MAX_RULERS_PER_LINE; WITH_ETCH_BIAS: rows have an etch factor; the options of line_fit/line_fit.h; vector
-//          variant: the options of pose/pose.h; work-item variant: INPUT, type of the rows.
+// Options: WITH_ETCH_BIAS: rows have an etch factor; the options of line_fit/line_fit.h; vector variant: the options of
+//          pose/pose.h; work-item variant: INPUT, type of the rows.
 #ifndef BOARD_LINE_H
 #define BOARD_LINE_H
 
@@ -22,7 +22,7 @@ typedef struct {
 } BoardLine;
 
 // Rows per line: two for offset and angle, one for the offset of a line with a single ruler.
-#define ROWS_PER_LINE (MAX_RULERS_PER_LINE > 1 ? 2 : 1)
+static inline int rows_of_line(int rulers) { return rulers > 1 ? 2 : 1; }
 
 // Store row i: at u along the line, the measured line is displaced by v along its normal, with the given variance [m2].
 // The variance of the line's position on the board is added. A row with a number that is not finite, or with a variance
@@ -46,39 +46,36 @@ static inline void put_line_row(LINE_ROWS rows, int i, global const BoardLine *l
 #endif
 }
 
-// Store the rows of line i, fitted through (x, y) along (c, s).
+// Store the rows of line i with `rulers` rulers, fitted through (x, y) along (c, s).
 //
 // Offset and angle are uncorrelated at (x, y). At the distance +-sigma(offset) / sigma(angle) from it the offsets have
 // the variance 2 sigma(offset)^2 and the covariance sigma(offset)^2 - reach^2 sigma(angle)^2 = 0: two independent rows
 // carry the same information as offset and angle. A line with one edge, or with all edges in one place, has no angle
 // and gives one row.
-static inline void put_line(LINE_ROWS rows, int i, global const BoardLine *line, real x, real y, real c, real s,
-                            real offset_variance, real angle_variance, int has_angle) {
+static inline void put_line(LINE_ROWS rows, int i, int rulers, global const BoardLine *line, real x, real y, real c,
+                            real s, real offset_variance, real angle_variance, int has_angle) {
     const real reach = has_angle ? sqrt(offset_variance / angle_variance) : 0, side = c < 0 ? -reach : reach;
-    put_line_row(rows, ROWS_PER_LINE * i, line, x - side * c, y - side * s, has_angle ? 2 * offset_variance : offset_variance);
-    if (ROWS_PER_LINE > 1)
-        put_line_row(rows, ROWS_PER_LINE * i + 1, line, x + side * c, y + side * s, has_angle ? 2 * offset_variance : REAL_NAN);
+    const int first = rows_of_line(rulers) * i;
+    put_line_row(rows, first, line, x - side * c, y - side * s, has_angle ? 2 * offset_variance : offset_variance);
+    if (rulers > 1)
+        put_line_row(rows, first + 1, line, x + side * c, y + side * s, has_angle ? 2 * offset_variance : REAL_NAN);
 }
 
-// Fit LANES lines from `first` on; store their rows, and the weight of each edge. The least scale is the rounding error
-// of the places, in sigmas.
-static inline void fit_lines(laned_points all, int first, int lines, global const BoardLine *line, constant int *pairs,
-                             int trials, int steps, LINE_ROWS rows, global real *edge_weights) {
-    reals reach = 0;
-    for (int k = 0; k < all.count; k++) {
-        const reals far = (FABS(all.x[k]) + FABS(all.y[k])) * all.certainty[k];
-        reach = far > reach ? far : reach;
-    }
+// Fit LANES lines from `first` on, or in a work-group one line; store their rows, and the weight of each edge. `reach`:
+// largest |u| + |v| in sigmas. The least scale is the rounding error of the places, in sigmas.
+INLINE void fit_lines(laned_points all, reals reach, int first, int lines, global const BoardLine *line,
+                      constant int *pairs, int trials, int steps, LINE_ROWS rows, global real *edge_weights) {
     const laned_fit fit = line_fit(all, pairs, trials, steps, (reals)REAL_EPSILON * reach + (reals)1e-30f);
-    for (int lane = 0; lane < LANES && first + lane < lines; lane++) {
+    for (int lane = 0; lane < LANES && first + lane < lines && GROUP_ITEM == 0; lane++) {
         const int has_angle = LANE_BITS(fit.points, lane) > 1 && !LANE_BITS(fit.coincide, lane);
-        put_line(rows, first + lane, line + first + lane, LANE(fit.line.x, lane), LANE(fit.line.y, lane),
+        put_line(rows, first + lane, all.count, line + first + lane, LANE(fit.line.x, lane), LANE(fit.line.y, lane),
                  LANE(fit.line.c, lane), LANE(fit.line.s, lane), LANE(fit.variance_of_offset, lane),
                  LANE(fit.variance_of_angle, lane), has_angle);
     }
-    for (int k = 0; k < all.count; k++) {
-        const reals z = line_distance(fit.line, all.x[k], all.y[k]) * all.certainty[k];
-        const reals weight = kept_where(mask_of(all.certainty[k] > (reals)0), loss_weight(z / fit.scale));
+    for (int k = GROUP_ITEM; k < all.count; k += GROUP_ITEMS) {
+        const laned_point at = point_at(all, k);
+        const reals z = line_distance(fit.line, at.x, at.y) * at.certainty;
+        const reals weight = kept_where(mask_of(at.certainty > (reals)0), loss_weight(z / fit.scale));
         for (int lane = 0; lane < LANES && first + lane < lines; lane++)
             edge_weights[(first + lane) * all.count + k] = LANE(weight, lane);
     }

@@ -13,7 +13,7 @@
 //          WITH_ETCH_BIAS, CAPACITY, START_STEPS, GIVEN_SCALE, EFFICIENCY (pose.h), loss options (common/robust.h).
 // Variants: vector: a work-item per pose, 16 rows or 16 start candidates in a vector; work-item: a group of up to 64
 //          items per pose; the items share the rows and the start candidates. Each pass reads the rows from global
-//          memory (pose_input.h). The results do not depend on the size of the group (common/group.h).
+//          memory (pose_group_rows.h). The results do not depend on the size of the group (common/group.h).
 #ifndef VECTOR_VARIANT
 #define GROUP_PER_PROBLEM
 #endif

@@ -4,7 +4,7 @@
 #include "common/group.h"
 #include "pose/pose_equation.h"
 #ifdef IN_GROUP
-#include "pose/pose_input.h"
+#include "pose/pose_group_rows.h"
 #else
 #include "pose/pose_rows.h"
 #endif

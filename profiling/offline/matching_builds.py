@@ -102,10 +102,9 @@ def _board_poses() -> Iterator[Example]:
     edges = MeasureBoardEdges(ruler=ruler, lines=12, rulers_per_line=6)
     yield Example("edges, 12 lines x 6", edges, _IMAGE, np.uint8)
     yield Example("edges, lens", replace(edges, ruler=replace(ruler, model=LENSES["lens k1"])), _IMAGE, np.uint8)
-    for lines, rulers in ((12, 6), (40, 1), (300, 4), (8, 256)):
-        yield Example(f"fits, {lines} lines x {rulers}", FitBoardLines(solver=SolvePose()), (3, lines, rulers))
+    yield Example("fits", FitBoardLines(solver=SolvePose()), (12, 6, 2))
     biased = FitBoardLines(solver=SolvePose(loss="huber", etch_bias_sigma=1e-5, scale=None))
-    yield Example("fits, etch bias, free scale", biased, (3, 12, 6))
+    yield Example("fits, etch bias, free scale", biased, (12, 6, 2))
 
 
 def _feature_poses() -> Iterator[Example]:

@@ -158,13 +158,16 @@ class BoardEdges(NamedTuple):
         Positions of the edges along the rulers [px]; NaN where no edge was found.
     status : uint8, (lines, rulers_per_line)
         `Status` flags of the rulers.
-    places : float32, (3, lines, rulers_per_line)
-        Positions along and across their lines [m]; one over the standard deviation across [1/m], 0 for no edge.
+    places : float32, (lines, rulers_per_line, 2)
+        Positions along and across their lines [m].
+    sigmas : float32, (lines, rulers_per_line)
+        Standard deviations across the lines [m]; NaN where no edge was found.
     """
 
     edges: FloatArray
     status: StatusArray
     places: FloatArray
+    sigmas: FloatArray
 
 
 class BoardLines(NamedTuple):
@@ -210,7 +213,12 @@ class MeasureBoardEdges(VisionOperation[BoardEdges]):
             source="board_pose/board_pose.cl",
             kernel="board_edges",
             inputs=[edges.inputs[0], ((*found, len(RULER)), real)],
-            outputs={"edges": (found, real), "status": (found, np.dtype(np.uint8)), "places": ((3, *found), real)},
+            outputs={
+                "edges": (found, real),
+                "status": (found, np.dtype(np.uint8)),
+                "places": ((*found, 2), real),
+                "sigmas": (found, real),
+            },
             defines={**edges.defines, "BOARD_EDGES": None},
             arguments=[*edges.arguments[:4], np.uint32(math.prod(found))],
         )
@@ -218,7 +226,9 @@ class MeasureBoardEdges(VisionOperation[BoardEdges]):
 
 @dataclass(frozen=True, kw_only=True)
 class FitBoardLines(VisionOperation[BoardLines]):
-    """Lines through the edges of a board: ``op(places, lines) -> BoardLines``; second stage of `BoardPoseEstimator`.
+    """Lines through the edges of a board: ``op(places, sigmas, lines) -> BoardLines``.
+
+    Second stage of `BoardPoseEstimator`.
 
     Parameters
     ----------
@@ -233,20 +243,21 @@ class FitBoardLines(VisionOperation[BoardLines]):
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         build = LaunchBuilder(self, device, shape, dtype, variant="work_item")
-        solver, (_, lines, rulers) = self.solver, shape
+        solver, (lines, rulers, _) = self.solver, shape
         rows, pairs = lines * rows_of_line(rulers), start_pairs(rulers, solver.max_trials)
         options = solver.defines(rows, vectors=False)
         numbers = 7 + (solver.etch_bias_sigma is not None)
         return build.launch(
             "board_pose/board_pose.cl",
             "board_lines",
-            work=build.work(lines, each=1, group=_GROUP),
-            more_inputs=[((lines, len(LINE)), build.real)],
+            work=build.work(lines, each=1, group=_GROUP, grouping="per_element"),
+            problem_per_group=True,
+            more_inputs=[((lines, rulers), build.real), ((lines, len(LINE)), build.real)],
             outputs=build.outputs({"rows": (rows, numbers), "edge_weights": (lines, rulers)}),
             defines={
                 **{name: value for name, value in options.items() if name not in _OPTIONS_OF_POSE},
                 **type_defines("INPUT", build.real),
-                "MAX_RULERS_PER_LINE": capacity(rulers),
+                **({"CAPACITY": capacity(rulers)} if solver.scale is None else {}),
                 "BOARD_LINES": None,
             },
             arguments=[
@@ -301,7 +312,7 @@ class BoardPoseEstimator(OperationSequence[BoardPoseEstimate]):
     expected to the measured position; 0 if the board is at the expected position.
 
     On CPU runtimes one launch computes everything. On GPUs three launches follow one another: edges, in work-groups of
-    four rulers; lines, an item for each; and the pose, as `SolvePose` computes it.
+    four rulers; lines, a work-group for each; and the pose, as `SolvePose` computes it.
 
     Parameters
     ----------
@@ -404,7 +415,7 @@ class BoardPoseEstimator(OperationSequence[BoardPoseEstimate]):
         measure = MeasureBoardEdges(ruler=self.ruler, lines=self.lines, rulers_per_line=self.rulers_per_line)
         stages = [
             Stage("edges", measure, ("image", "rulers")),
-            Stage("fits", FitBoardLines(solver=self.solver), ("edges.places", "lines")),
+            Stage("fits", FitBoardLines(solver=self.solver), ("edges.places", "edges.sigmas", "lines")),
             Stage("pose", SolveBoardLines(solver=self.solver, lines=self.lines), ("fits.rows",)),
         ]
         outputs = {name: f"pose.{name}" for name in BoardPose._fields}
@@ -436,9 +447,9 @@ class BoardPoseEstimator(OperationSequence[BoardPoseEstimate]):
         return rows_of_line(self.rulers_per_line)
 
     def _capacities(self) -> dict[str, Define]:
-        """Return the sizes of the arrays; with one ruler per line the code differs."""
+        """Return the sizes of the arrays."""
         rulers = self.rulers_per_line
         return {
-            "MAX_RULERS_PER_LINE": capacity(rulers, least=_MIN_RULERS_PER_LINE if rulers > 1 else 1),
+            "MAX_RULERS_PER_LINE": capacity(rulers, least=_MIN_RULERS_PER_LINE),
             "MAX_RULERS": capacity(self.lines * rulers, least=_MIN_RULERS),
         }

@@ -24,7 +24,7 @@ SOURCE = """
 kernel void edges(global const real *measured, global const BoardRuler *rulers, global real *made) {
     const size_t n = get_global_id(0);
     const board_edge edge = board_edge_of(measured[2 * n], measured[2 * n + 1], rulers + n);
-    made[3 * n] = edge.u, made[3 * n + 1] = edge.v, made[3 * n + 2] = edge.certainty;
+    made[3 * n] = edge.u, made[3 * n + 1] = edge.v, made[3 * n + 2] = edge.sigma;
 }
 """
 
@@ -55,8 +55,8 @@ def test_edges_in_the_frames_of_their_lines(device: Device, rng: np.random.Gener
     across = (ruler["v"] + position * ruler["v_per_px"]) / seen
     slope = (ruler["v_per_px"] - ruler["v"] * ruler["projective"]) / seen**2
     result = made.get()
-    np.testing.assert_array_equal(result[:8], 0.0)
-    np.testing.assert_allclose(result[8:].T, [along, across, 1.0 / (np.abs(slope) * sigma)], rtol=2e-4, atol=1e-8)
+    np.testing.assert_array_equal(result[:8], np.tile([0.0, 0.0, np.nan], (8, 1)))
+    np.testing.assert_allclose(result[8:].T, [along, across, np.abs(slope) * sigma], rtol=2e-4, atol=1e-8)
 
 
 def lines_of(rng: np.random.Generator, count: int, each: int) -> tuple[Reals, Reals]:
@@ -68,6 +68,14 @@ def lines_of(rng: np.random.Generator, count: int, each: int) -> tuple[Reals, Re
     angle = rng.uniform(-np.pi, np.pi, count)
     numbers = [np.cos(angle), np.sin(angle), *rng.normal(0.0, 4.0, (2, count)), *rng.uniform(0.01, 0.2, (2, count))]
     return np.stack([u, v, 1.0 / sigma]), np.stack(numbers, axis=-1)
+
+
+def inputs_of(places: Reals, lines: Reals) -> tuple[NDArray[np.float32], ...]:
+    """Return places, sigmas and lines as `FitBoardLines` takes them; edges of certainty 0 are missing."""
+    with np.errstate(divide="ignore"):
+        sigma = 1.0 / places[2]
+    sigma[::2][np.isinf(sigma[::2])] = np.nan  # both are missing
+    return tuple(np.ascontiguousarray(each, np.float32) for each in (np.moveaxis(places[:2], 0, -1), sigma, lines))
 
 
 def huber(z: Reals, constant: float) -> Reals:
@@ -96,14 +104,14 @@ def test_rows_of_lines(device: Device, etch_bias_sigma: float | None, rng: np.ra
     places[2, 3, np.arange(each) != 5] = 0.0  # one edge
     places[2, 4] = 0.0  # none
     places[:2, 5] = places[:2, 5, :1]  # all edges in one place
-    places, lines = places.astype(np.float32), lines.astype(np.float32)
+    inputs, lines = inputs_of(places, lines), lines.astype(np.float32)
     solver = SolvePose(loss="huber", scale=scale, tuning_constant=constant, etch_bias_sigma=etch_bias_sigma)
-    result = FitBoardLines(solver=solver)(places, lines, device=device)
+    result = FitBoardLines(solver=solver)(*inputs, device=device)
     rows = result.rows.reshape(count, 2, -1).astype(np.float64)
     if etch_bias_sigma is not None:
         np.testing.assert_array_equal(rows[..., 7], np.repeat(lines[:, 5:], 2, axis=1))
-    everything = FitBoardLines(solver=SolvePose(loss="least_squares", scale=scale))(places, lines, device=device)
-    all_edges, sigma = np.moveaxis(places, 0, -1).astype(np.float64), lines[:, LINE.index("sigma")].astype(np.float64)
+    everything = FitBoardLines(solver=SolvePose(loss="least_squares", scale=scale))(*inputs, device=device)
+    all_edges, sigma = np.moveaxis(places, 0, -1), lines[:, LINE.index("sigma")].astype(np.float64)
     offsets = everything.rows.reshape(count, 2, -1)[:, 0, 6].astype(np.float64) ** 2 - sigma**2
     assert np.sum(result.edge_weights[places[2] > 0.0] < 0.95) > 5
     for number, (edges, row, weights) in enumerate(zip(all_edges, rows, result.edge_weights, strict=True)):
@@ -138,6 +146,14 @@ def test_rows_of_lines(device: Device, etch_bias_sigma: float | None, rng: np.ra
             assert one[6] == row[0, 6] > sigma[number]
 
 
+def test_boards_of_all_sizes_share_a_program(device: Device) -> None:
+    """Numbers of lines and rulers are arguments, not build options."""
+    fits = FitBoardLines(solver=SolvePose())
+    sizes = [(40, 1), (12, 6), (300, 4), (8, 256)]
+    defines = [fits.launch(device, (*size, 2), np.dtype(np.float32)).defines for size in sizes]
+    assert defines[1:] == defines[:-1]
+
+
 @pytest.mark.parametrize("upright", [False, True])
 def test_the_least_scale_is_the_rounding_error_of_the_places(device: Device, upright: bool) -> None:
     """All edges but one lie exactly on a line: the scale is the rounding error of the farthest place, in sigmas."""
@@ -145,10 +161,10 @@ def test_the_least_scale_is_the_rounding_error_of_the_places(device: Device, upr
     scale = np.finfo(np.float32).eps * 28.0
     v, tuning = np.zeros(8), 6.0
     v[6] = 5.0 * scale / certainty[6]
-    places = np.stack([v, u, certainty] if upright else [u, v, certainty])[:, None].astype(np.float32)
-    lines = np.array([[0.0, 1.0, 0.0, 0.0, 0.1, 0.0]], np.float32)
+    places = np.stack([v, u, certainty] if upright else [u, v, certainty])[:, None]
+    inputs = inputs_of(places, np.array([[0.0, 1.0, 0.0, 0.0, 0.1, 0.0]]))
     solver = SolvePose(loss="tukey", scale=None, tuning_constant=tuning, max_iterations=30)
-    weights = FitBoardLines(solver=solver)(places, lines, device=device).edge_weights[0]
+    weights = FitBoardLines(solver=solver)(*inputs, device=device).edge_weights[0]
     points = np.column_stack([u, v])
     *_, expected = fitted(points, certainty, lambda z: np.maximum(1.0 - (z / scale / tuning) ** 2, 0.0) ** 2)
     assert expected[6] < 0.9

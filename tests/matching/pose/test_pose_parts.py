@@ -68,7 +68,9 @@ kernel void parts(global const real *given, global const real *poses, constant i
 """
 FRAMES = """
 #include "pose/pose_input.h"
-#ifndef IN_GROUP
+#ifdef IN_GROUP
+#include "pose/pose_group_rows.h"
+#else
 #include "pose/pose_rows.h"
 #endif
 #define PUT(value) out[to++] = (value)

@@ -51,10 +51,11 @@ def curves(
 ) -> None:
     """Measure speed against accuracy: time and error of the settings that a user chooses.
 
-    The truth of the data is known. Data of triangulation, undistort_points and occluded_irradiance have no noise; the
-    others have. Errors of points are Euclidean distances. The table shows for each setting the median time, the root
-    mean square error, the 95th percentile, and the fraction of samples without a value. A star marks the best settings:
-    no other one on the same data is better in time, error or lost samples and as good in the others.
+    The truth of the data is known. Data of triangulation, undistort_points, range_image and the simulation of light
+    have no noise; the others have. Errors of points are Euclidean distances. The table shows for each setting the
+    median time, the root mean square error, the 95th percentile, and the fraction of samples without a value. A star
+    marks the best settings: no other one on the same data is better in time, error or lost samples and as good in the
+    others.
 
     With --maps nothing is timed. The table shows for each operation two axes of its inputs (light level, distance,
     distortion, size, condition), and the fraction of the places in their plane where the relative error against float64

@@ -25,6 +25,16 @@ OPERATIONS = (
     "line_fit",
     "pose",
     "occluded_irradiance",
+    "line_irradiance",
+    "reflectance",
+    "rays",
+    "range_image",
+    "merge_heights",
+    "deposits",
+    "board_image",
+    "board_pose",
+    "feature_pose",
+    "field_pose",
 )
 """Operations with curves: names of the modules of this package."""
 

@@ -20,7 +20,17 @@ from gpuvision.cli import curves as command
 from gpuvision.cli.main import application
 from gpuvision.host.errors import GpuVisionError
 from gpuvision.profiling import curves, harness
-from gpuvision.profiling.curves import curve, line_fit, plot, undistort_points
+from gpuvision.profiling.curves import (
+    board_image,
+    curve,
+    deposits,
+    field_pose,
+    line_fit,
+    line_irradiance,
+    plot,
+    rays,
+    undistort_points,
+)
 
 NUMBERS = st.lists(st.tuples(*[st.integers(0, 4).map(float)] * 3), min_size=1, max_size=8)
 
@@ -76,7 +86,7 @@ def errors_of(operation, device):
 
 
 # Their settings compile many kernels.
-NIGHTLY = {"blob", "line", "ruler", "undistort_image", "undistort_points"}
+NIGHTLY = {"blob", "board_pose", "line", "line_irradiance", "rays", "ruler", "undistort_image", "undistort_points"}
 
 
 @pytest.mark.slow
@@ -123,6 +133,47 @@ def test_the_robust_loss_pays_with_outliers_only(device, monkeypatch):
     # centred, which adds a little.
     assert rms("0% outliers", "least_squares") == pytest.approx(0.05 / math.sqrt(20.0), rel=0.1)
     assert rms("30% outliers", "least_squares") > 1.0 > 20.0 * rms("30% outliers", "tukey")
+
+
+def rms_of(settings, **chosen):
+    """Return the root mean squares of the settings with chosen parameters."""
+    return [each.errors.rms for each in settings if chosen.items() <= dict(each.parameters).items()]
+
+
+def test_more_sub_poses_are_closer_to_the_exposure(device, monkeypatch):
+    monkeypatch.setattr(board_image, "_MOTIONS", {"motion of 8 px": 8e-5})
+    found = rms_of(board_image.settings(device), dtype="float32")
+    assert np.all(np.diff(found) < 0.0)
+    assert found[-1] < 1e-2 * found[0]
+
+
+def test_twice_the_segments_of_an_arc_have_a_quarter_of_the_error(device, monkeypatch):
+    monkeypatch.setattr(line_irradiance, "_DISTANCES", {"near": (1.0, 3.0)})
+    monkeypatch.setattr(line_irradiance, "_RECEIVERS", 10)
+    monkeypatch.setattr(line_irradiance, "_COUNTS", (4, 8, 16))  # each count is a build of the kernel
+    found = np.array(rms_of(line_irradiance.settings(device), precision="single"))
+    assert np.all((found[:-1] > 3.0 * found[1:]) & (found[:-1] < 5.0 * found[1:]))
+
+
+def test_the_threshold_at_half_of_the_height_measures_the_area(device):
+    found = rms_of(deposits.settings(device), precision="single")
+    assert np.argmin(found) == 2
+    assert found[2] < 0.1 * min(found[0], found[-1])
+
+
+def test_shadow_rays_need_a_clearance_that_is_below_the_gaps(device, monkeypatch):
+    monkeypatch.setattr(rays, "_RAYS", 60)
+    errors = [each.errors.rms for each in rays.settings(device) if "clearance" in each.parameters]
+    assert errors[0] > 0.1
+    assert max(errors[1:3]) == 0.0
+
+
+def test_a_finer_map_finds_a_robot_better(device):
+    found = list(field_pose.settings(device))
+    search = [each.errors.rms for each in found if "cell" in each.parameters]
+    assert search == sorted(search)
+    steps = rms_of(found, max_iterations=1) + rms_of(found, max_iterations=40)
+    assert steps[1] < 0.5 * steps[0]
 
 
 def test_a_picture_for_each_operation(tmp_path):

@@ -1,8 +1,8 @@
 // Sampling of 16 rulers at once, one in each lane (ruler.h, vector variant).
 //
 // Positions are fixed-point numbers with RULER_BITS fractional bits, relative to the ruler's pixel. Shifted into the
-// mantissa of a float in [1, 2), the fraction needs no conversion. Pixels are inserted into vectors one by one: measured
-// faster than the processor's gather instructions.
+// mantissa of a float in [1, 2), the fraction needs no conversion. Pixels are loaded one by one: measured faster than the
+// processor's gather instructions.
 #ifndef RULER_LANES_H
 #define RULER_LANES_H
 
@@ -129,40 +129,86 @@ static inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int p
     return flags;
 }
 
+// Positions are computed RULER_AHEAD samples before their pixels are blended, so that no store is forwarded to a load of
+// another size: a load of elements of a vector, or of a vector of elements.
+#if defined(CODE_uchar) && defined(POCL_DEVICE_ADDRESS_BITS)
+// 8-bit pixels on PoCL: scalar code packs the 2 x 2 pixels of a sample in a word and stores it, one sample before words
+// are blended as a vector. The vector units have no part in it, so that both work side by side: a third less time than
+// with vectors into which loads insert pixels. (On Intel's runtime the insertions take less time.)
+#define RULER_PACKED
+#define RULER_AHEAD 2
+typedef volatile ushort ruler_two __attribute__((aligned(1)));
+static inline uint ruler_two_pixels(global const uchar *at) { return *(global const ruler_two *)at; }
+
+// Not inlined, all vector registers would be saved around the call.
+static inline __attribute__((always_inline)) void ruler_pack(global const uchar *above, global const uchar *below,
+                                                             private const uint16 *pixels, private masks *words) {
+    private const ulong *at = (private const ulong *)pixels;
+    private uint *to = (private uint *)words;
+    _Pragma("unroll") for (int k = 0; k < LANES; k += 2) {
+        const uint one = RULER_FIRST(k), two = RULER_SECOND(k);
+        to[k] = ruler_two_pixels(above + one) | ruler_two_pixels(below + one) << 16;
+        to[k + 1] = ruler_two_pixels(above + two) | ruler_two_pixels(below + two) << 16;
+    }
+}
+static inline void ruler_unpack(masks words, ruler_levels *a, ruler_levels *b, ruler_levels *c, ruler_levels *d) {
+    *a = words & 0xff;
+    *b = words >> 8 & 0xff;
+    *c = words >> 16 & 0xff;
+    *d = words >> 24 & 0xff;
+}
+#else
+#define RULER_AHEAD 1
+#endif
+#define RULER_SLOTS (2 * RULER_AHEAD) // samples whose fractions are kept, a power of two
+
 // Sum the samples over the lines; return flags.
-//
-// Software pipelining: the positions of the next sample are computed while the pixels of this one are loaded. The loads
-// read single elements of vectors that were stored one sample before, so that no store is forwarded to a smaller load.
 static inline __attribute__((always_inline)) masks ruler_sums(global const CODE *image, const ruler_place *place, int pitch,
                                                        constant real *table, constant real *model,
                                                        private reals *profile) {
     uint16 pixels[2 * WIDTH];
-    reals x[2 * WIDTH], y[2 * WIDTH];
+    reals x[RULER_SLOTS * WIDTH], y[RULER_SLOTS * WIDTH];
     masks flags = 0;
     ruler_walk walk;
-    ruler_start(&walk, place, 0);
-    for (int j = 0; j < WIDTH; j++) flags |= ruler_next(&walk, place, pitch, 0, j, model, x + j, y + j, pixels + j);
+    for (int i = 0; i < RULER_AHEAD; i++) {
+        ruler_start(&walk, place, i);
+        for (int k = i * WIDTH; k < (i + 1) * WIDTH; k++)
+            flags |= ruler_next(&walk, place, pitch, i, k - i * WIDTH, model, x + k, y + k, pixels + k);
+    }
     global const CODE *below = image + pitch;
+#ifdef RULER_PACKED
+    masks words[2 * WIDTH];
+    for (int j = 0; j < WIDTH; j++) ruler_pack(image, below, pixels + j, words + j);
+#endif
     const int length = (int)table[RULER_LENGTH];
     for (int i = 0; i < length; i++) {
-        const int now = i % 2 * WIDTH, then = WIDTH - now, next = min(i + 1, length - 1);
+        const int now = i % 2 * WIDTH, after = WIDTH - now, ahead = (i + RULER_AHEAD) % 2 * WIDTH;
+        const int slot = i % RULER_SLOTS * WIDTH, next_slot = (i + RULER_AHEAD) % RULER_SLOTS * WIDTH;
+        const int next = min(i + RULER_AHEAD, length - 1);
         ruler_start(&walk, place, next);
         ruler_levels whole = 0;
         reals rest = 0;
         for (int j = 0; j < WIDTH; j++) {
             ruler_levels a, b, c, d;
+#ifdef RULER_PACKED
+            ruler_pack(image, below, pixels + after + j, words + after + j);
+            ruler_unpack(words[now + j], &a, &b, &c, &d);
+#else
             ruler_fetch(image, below, (private const ulong *)(pixels + now + j), &a, &b, &c, &d);
-            flags |= ruler_next(&walk, place, pitch, next, j, model, x + then + j, y + then + j, pixels + then + j);
+#endif
+            flags |= ruler_next(&walk, place, pitch, next, j, model, x + next_slot + j, y + next_slot + j,
+                                pixels + ahead + j);
             b -= a;
             d -= c + b;
             c -= a;
-            const reals step_x = RULER_REAL(b), step_y = RULER_REAL(c) + x[now + j] * RULER_REAL(d);
+            const reals part_x = x[slot + j], part_y = y[slot + j];
+            const reals step_x = RULER_REAL(b), step_y = RULER_REAL(c) + part_x * RULER_REAL(d);
 #ifdef SATURATION
-            flags |= ruler_sample_flags(RULER_REAL(a) + (x[now + j] * step_x + y[now + j] * step_y), table);
+            flags |= ruler_sample_flags(RULER_REAL(a) + (part_x * step_x + part_y * step_y), table);
 #endif
             whole += a;
-            rest += x[now + j] * step_x;
-            rest += y[now + j] * step_y;
+            rest += part_x * step_x;
+            rest += part_y * step_y;
         }
         profile[i] = RULER_REAL(whole) + rest;
         flags |= ruler_sum_flags(profile[i]);

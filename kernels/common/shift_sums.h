@@ -8,8 +8,9 @@
 // Outputs: scores (headings, rows, columns) float32, 0 to 1, with WITH_SCORES; least (headings, rows, blocks) float32,
 //          the least score of each block of BLOCK adjacent positions; column (headings, rows, blocks) int32, its
 //          column, the first of equal scores. NaN scores where no point is used.
-// Options: COST_LEVELS: the cost 1 in the map; WITH_SCORES.
-// Variants: vector (sum_rows): 64 positions at once in four vectors of 16, for some rows; work-item (sum_block): a
+// Options: COST_LEVELS: the cost 1 in the map; WITH_SCORES; STRIP (vector variant): vectors of POSITIONS that are summed
+//          together.
+// Variants: vector (sum_rows): STRIP * POSITIONS positions at once in registers, for some rows; work-item (sum_block): a
 //          group of BLOCK items per block, an item per position.
 #ifndef SHIFT_SUMS_H
 #define SHIFT_SUMS_H
@@ -18,7 +19,6 @@
 // Number of levels that are summed in 16 bits without overflow: 64 * 1023 = 65472 < 65536.
 #define CHUNK 64
 #define NO_KEY 0xffffffffu
-#define NO_BLOCK (-2) // neither a block nor the one before block 0
 
 // Return the first column of a block. The last block moves back to end with the row, and repeats some positions.
 static inline int block_from(int block, int columns) { return min(block * BLOCK, max(columns - BLOCK, 0)); }
@@ -36,10 +36,18 @@ static inline void store_least(uint key, float scale, global float *least, globa
 }
 
 #ifdef VECTOR_VARIANT
-typedef ushort16 ushorts_at __attribute__((aligned(2)));
+#define POSITIONS 32 // positions in a vector: 64 bytes
+#define TILE 8192    // sums that a work-item keeps, at least the positions of the longest row
+typedef ushort levels __attribute__((ext_vector_type(POSITIONS)));
+typedef levels levels_at __attribute__((aligned(2)));
 typedef float16 floats_at __attribute__((aligned(4)));
+typedef uint16 uints_at __attribute__((aligned(4)));
 
+#define UNROLLED _Pragma("unroll")
 #define LOWER(a, b) ((a) < (b) ? (a) : (b))
+#define LANES_OF_LEVELS                                                                                                \
+    ((levels)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27,   \
+              28, 29, 30, 31))
 
 // Return the minimum over the lanes.
 static inline uint min_of_lanes(uint16 of) {
@@ -49,76 +57,87 @@ static inline uint min_of_lanes(uint16 of) {
     return LOWER(two.x, two.y);
 }
 
-// Sums of the levels of all points at the BLOCK positions of a block, 16 positions in a vector.
-typedef struct {
-    uint16 a, b, c, d;
-} block_sums;
-
-// Sum the BLOCK positions from `here` on.
+// Add the levels of STRIP * POSITIONS positions to sums; `left`: positions of the row from `at` on.
 //
-// Chunks of CHUNK points are summed in 16 bits, then added to sums of 32 bits: this doubles the lanes per instruction,
-// compared with 32 bits throughout.
-static inline block_sums sum_positions(global const ushort *here, private const int *shifts, int used) {
-    block_sums sums = {0, 0, 0, 0};
-    for (int chunk = 0; chunk < used; chunk += CHUNK) {
-        ushort16 p = 0, q = 0, r = 0, s = 0;
-        const int last = min(chunk + CHUNK, used);
-        for (int i = chunk; i < last; i++) {
-            global const ushort *at = here + shifts[i];
-            p += *(global const ushorts_at *)at;
-            q += *(global const ushorts_at *)(at + 16);
-            r += *(global const ushorts_at *)(at + 32);
-            s += *(global const ushorts_at *)(at + 48);
-        }
-        sums.a += convert_uint16(p);
-        sums.b += convert_uint16(q);
-        sums.c += convert_uint16(r);
-        sums.d += convert_uint16(s);
+// The vectors follow each other, but for the last one, which begins at position last_start().
+#if defined(__AVX512BW__) && __has_builtin(__builtin_ia32_vpermi2varhi512)
+// A load that crosses a cache line takes two accesses. Here whole lines are loaded, one more than vectors, and a
+// permutation of two neighbours gives a vector: a quarter less time. Every line holds a level that the other form reads,
+// too, so that no load leaves the pages of the map.
+typedef short permuted __attribute__((vector_size(sizeof(levels))));
+static inline levels permute(levels low, levels order, levels high) {
+    const permuted result = __builtin_ia32_vpermi2varhi512(
+        __builtin_astype(low, permuted), __builtin_astype(order, permuted), __builtin_astype(high, permuted));
+    return __builtin_astype(result, levels);
+}
+static inline int last_start(int left) { return (STRIP - 1) * POSITIONS; }
+static inline void add_levels(global const ushort *at, int left, private levels *sums) {
+    const size_t line_bytes = sizeof(levels), first = (size_t)at;
+    const size_t last = (size_t)(at + min(left, STRIP * POSITIONS) - 1);
+    const levels order = LANES_OF_LEVELS + (levels)(ushort)(first % line_bytes / sizeof(ushort));
+    global const levels *lines = (global const levels *)(first & ~(line_bytes - 1));
+    levels line = lines[0];
+    UNROLLED
+    for (int k = 0; k < STRIP - 1; k++) {
+        const levels next = lines[k + 1];
+        sums[k] += permute(line, order, next);
+        line = next;
     }
-    return sums;
+    sums[STRIP - 1] += permute(line, order, *(global const levels *)(last & ~(line_bytes - 1)));
+}
+#else
+static inline int last_start(int left) { return max(min(left, STRIP * POSITIONS), BLOCK) - POSITIONS; }
+static inline void add_levels(global const ushort *at, int left, private levels *sums) {
+    UNROLLED
+    for (int k = 0; k < STRIP - 1; k++) sums[k] += *(global const levels_at *)(at + k * POSITIONS);
+    sums[STRIP - 1] += *(global const levels_at *)(at + last_start(left));
+}
+#endif
+
+// Add sums of 16 bits to sums of 32 bits.
+static inline void keep_sums(levels sums, private uint *to) {
+    private uints_at *low = (private uints_at *)to, *high = (private uints_at *)(to + 16);
+    *low += convert_uint16(sums.lo);
+    *high += convert_uint16(sums.hi);
 }
 
-// Sum the BLOCK positions from `here` on, of which the first half is known: the sums of 32 positions at `known`.
-static inline block_sums sum_last_half(global const ushort *here, private const int *shifts, int used, private const uint *known) {
-    block_sums sums = {vload16(0, known), vload16(1, known), 0, 0};
-    for (int chunk = 0; chunk < used; chunk += CHUNK) {
-        ushort16 r = 0, s = 0;
-        const int last = min(chunk + CHUNK, used);
-        for (int i = chunk; i < last; i++) {
-            global const ushort *at = here + shifts[i];
-            r += *(global const ushorts_at *)(at + 32);
-            s += *(global const ushorts_at *)(at + 48);
-        }
-        sums.c += convert_uint16(r);
-        sums.d += convert_uint16(s);
-    }
-    return sums;
+// Sum STRIP * POSITIONS positions from `here` on, for up to CHUNK shifts: 16 bits suffice. The sums of all but the first
+// `known` vectors are added to those at `to`.
+static inline void sum_strip(global const ushort *here, private const int *shifts, int count, int left, int known,
+                             private uint *to) {
+    levels sums[STRIP];
+    UNROLLED
+    for (int k = 0; k < STRIP; k++) sums[k] = 0;
+    for (int i = 0; i < count; i++) add_levels(here + shifts[i], left, sums);
+    UNROLLED
+    for (int k = 0; k < STRIP - 1; k++)
+        if (k >= known) keep_sums(sums[k], to + k * POSITIONS);
+    // The last vector may repeat positions of the one before it.
+    const int start = last_start(left);
+    const levels at = LANES_OF_LEVELS + (levels)(ushort)start;
+    keep_sums(at >= (levels)(ushort)((STRIP - 1) * POSITIONS) ? sums[STRIP - 1] : (levels)0, to + start);
 }
 
 // Store the scores of a block of min(columns, BLOCK) positions at `to`; return its least key.
-static inline uint store_scores(block_sums sums, int columns, float scale, global float *to) {
+static inline uint store_scores(private const uint *sums, int columns, float scale, global float *to) {
     const uint16 lane = (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-    const uint16 ka = sums.a * BLOCK + lane, kb = sums.b * BLOCK + lane + 16, kc = sums.c * BLOCK + lane + 32,
-                 kd = sums.d * BLOCK + lane + 48;
+    uint16 least = NO_KEY;
     if (columns >= BLOCK) {
+        UNROLLED
+        for (int k = 0; k < BLOCK; k += 16) {
+            const uint16 part = *(private const uints_at *)(sums + k), key = part * BLOCK + (lane + (uint)k);
+            least = LOWER(least, key);
 #ifdef WITH_SCORES
-        *(global floats_at *)to = convert_float16(sums.a) * scale;
-        *(global floats_at *)(to + 16) = convert_float16(sums.b) * scale;
-        *(global floats_at *)(to + 32) = convert_float16(sums.c) * scale;
-        *(global floats_at *)(to + 48) = convert_float16(sums.d) * scale;
+            *(global floats_at *)(to + k) = convert_float16(part) * scale;
 #endif
-        const uint16 ab = LOWER(ka, kb), cd = LOWER(kc, kd);
-        return min_of_lanes(LOWER(ab, cd));
+        }
+        return min_of_lanes(least);
     }
-    uint keys[BLOCK], key = NO_KEY;
-    vstore16(ka, 0, keys);
-    vstore16(kb, 1, keys);
-    vstore16(kc, 2, keys);
-    vstore16(kd, 3, keys);
+    uint key = NO_KEY;
     for (int k = 0; k < columns; k++) {
-        key = min(key, keys[k]);
+        key = min(key, sums[k] * BLOCK + (uint)k);
 #ifdef WITH_SCORES
-        to[k] = (float)(keys[k] / BLOCK) * scale;
+        to[k] = (float)sums[k] * scale;
 #endif
     }
     return key;
@@ -126,32 +145,39 @@ static inline uint store_scores(block_sums sums, int columns, float scale, globa
 
 // Sum all positions of the rows `first` to `end` - 1, for the shifts of one heading (index `turn`).
 //
-// A map narrower than a block is read beyond its columns (the host provides the cells), but only `columns` positions
-// count. Where the last block overlaps the block before it by half a block or more, its first half is copied from the
-// sums of that block, and only the second half is summed: 81 columns cost 96 sums, not 128.
+// All rows of a tile are summed for a chunk of shifts before the next chunk: the chunk reads parts of the map that stay in
+// the caches. The scores are computed after the tile, when the sums have left the store buffers. A map narrower than a
+// block is read beyond its columns (the host provides the cells), but only `columns` positions count.
 static inline void sum_rows(global const ushort *restrict level, private const int *shifts, int used, int turn,
                             int first, int end, int rows, int columns, int stride, global float *restrict scores,
                             global float *restrict least, global int *restrict column) {
-    const int blocks = (columns + BLOCK - 1) / BLOCK, remainder = columns - (blocks - 1) * BLOCK;
-    const int half_known = blocks > 1 && remainder <= BLOCK / 2 ? blocks - 1 : NO_BLOCK;
+    const int blocks = (columns + BLOCK - 1) / BLOCK;
+    const int vectors = (max(columns, BLOCK) + POSITIONS - 1) / POSITIONS, length = vectors * POSITIONS;
+    const int tile = TILE / length;
     const float scale = score_scale(used);
-    for (int row = first; row < end; row++) {
-        const size_t place = (size_t)turn * rows + row;
-        uint previous[BLOCK];
-        for (int block = 0; block < blocks; block++) {
-            const int from = block_from(block, columns);
-            global const ushort *here = level + (size_t)row * stride + from;
-            block_sums sums;
-            if (block == half_known) sums = sum_last_half(here, shifts, used, previous + remainder);
-            else sums = sum_positions(here, shifts, used);
-            if (block + 1 == half_known) {
-                vstore16(sums.a, 0, previous);
-                vstore16(sums.b, 1, previous);
-                vstore16(sums.c, 2, previous);
-                vstore16(sums.d, 3, previous);
+    uint sums[TILE] __attribute__((aligned(64)));
+    for (int top = first; top < end; top += tile) {
+        const int bottom = min(top + tile, end);
+        for (int k = 0; k < (bottom - top) * length; k += 16) *(private uint16 *)(sums + k) = 0;
+        for (int chunk = 0; chunk < used; chunk += CHUNK) {
+            const int count = min(used - chunk, CHUNK);
+            for (int row = top; row < bottom; row++) {
+                global const ushort *here = level + (size_t)row * stride;
+                private uint *to = sums + (row - top) * length;
+                for (int vector = 0; vector < vectors; vector += STRIP) {
+                    const int from = min(vector, vectors - STRIP), at = from * POSITIONS;
+                    sum_strip(here + at, shifts + chunk, count, columns - at, vector - from, to + at);
+                }
             }
-            const uint key = store_scores(sums, columns, scale, scores + place * columns + from);
-            store_least(key, scale, least, column, place * blocks + block, from);
+        }
+        for (int row = top; row < bottom; row++) {
+            const size_t place = (size_t)turn * rows + row;
+            for (int block = 0; block < blocks; block++) {
+                const int from = block_from(block, columns);
+                const uint key = store_scores(sums + (row - top) * length + from, columns, scale,
+                                              scores + place * columns + from);
+                store_least(key, scale, least, column, place * blocks + block, from);
+            }
         }
     }
 }

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import (
+    Define,
     Device,
     FloatArray,
     IntArray,
@@ -45,8 +46,8 @@ from gpuvision.validation import finite
 _BLOCK, _MOST_POINTS = 64, 4096
 # The kernel reads cosine and sine of the headings from constant memory, of which OpenCL guarantees 64 KiB.
 _MOST_HEADINGS = (64 << 10) // (2 * 4)
-MIN_SHIFTS = 1024
-"""Least size of the kernels' array of shifts, so that searches with fewer points share programs."""
+# Least size of the kernels' array of shifts, so that searches with fewer points share programs.
+_MIN_SHIFTS = 1024
 # Shares of the rows per core, so that the cores finish together, and number of rows above which shifting a point takes
 # less time.
 _SHARES_PER_CORE, _FEWEST_ROWS = 4, 4
@@ -89,6 +90,17 @@ def pose_grid_work(build: LaunchBuilder, headings: int, rows: int, columns: int)
     if build.uses_vectors:
         return WorkSize((ceil_div(rows, each), headings), (1, 1), each, vectors=True)
     return WorkSize((round_up(columns, _BLOCK), rows, headings), (_BLOCK, 1, 1), each)
+
+
+def pose_grid_defines(work: WorkSize, columns: int, points: int, *, with_scores: bool) -> dict[str, Define]:
+    """Return the build options of a search over a grid of poses (``shift_sums.h``).
+
+    A row is summed in equal strips of vectors of 32 positions, 8 at most: the sums of a strip stay in registers.
+    """
+    vectors = max(ceil_div(columns, 32), 2)
+    strip = {"STRIP": ceil_div(vectors, ceil_div(vectors, 8))} if work.vectors else {}
+    size = capacity(points, least=_MIN_SHIFTS)
+    return {"CAPACITY": size, "COST_LEVELS": COST_LEVELS, **strip, **flags(WITH_SCORES=with_scores)}
 
 
 def is_short_search(work: WorkSize, positions: int, points: int) -> bool:
@@ -176,11 +188,7 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
             "field_pose_search",
             work=work,
             outputs=pose_cost_outputs(build, len(angles), rows, columns, with_scores=self.with_scores),
-            defines={
-                "CAPACITY": capacity(count, least=MIN_SHIFTS),
-                "COST_LEVELS": COST_LEVELS,
-                **flags(WITH_SCORES=self.with_scores),
-            },
+            defines=pose_grid_defines(work, columns, count, with_scores=self.with_scores),
             arguments=[
                 self.map.cells.level,
                 np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32),

@@ -28,17 +28,16 @@ from gpuvision.host import (
     Launch,
     LaunchBuilder,
     Variant,
-    capacity,
     flags,
     padded_rows,
     to_numpy,
     type_defines,
 )
 from gpuvision.matching.field.field_pose import (
-    MIN_SHIFTS,
     PoseCosts,
     is_short_search,
     pose_cost_outputs,
+    pose_grid_defines,
     pose_grid_work,
 )
 from gpuvision.operation import VisionOperation
@@ -226,11 +225,7 @@ class EdgeSearch(VisionOperation[PoseCosts]):
             work=work,
             more_inputs=[((self.headings, self.points), np.dtype(np.int32))],
             outputs=pose_cost_outputs(build, *grid, with_scores=self.with_scores),
-            defines={
-                "CAPACITY": capacity(self.points, least=MIN_SHIFTS),
-                "COST_LEVELS": COST_LEVELS,
-                **flags(WITH_SCORES=self.with_scores),
-            },
+            defines=pose_grid_defines(work, self.columns, self.points, with_scores=self.with_scores),
             arguments=[*map(np.int32, (self.points, self.rows, self.columns, shape[2], limit, work.each))],
             passes_once=is_short_search(work, math.prod(grid), self.points),
         )

@@ -53,11 +53,11 @@ def test_cells_and_levels_are_those_of_their_definition(device: Device, dtype: A
 
 
 @VARIANTS
-@pytest.mark.parametrize(("rows", "columns"), [(9, 7), (5, 64), (1, 1), (3, 131), (2, 96), (2, 97)])
+@pytest.mark.parametrize(("rows", "columns"), [(9, 7), (5, 64), (1, 1), (3, 131), (2, 96), (2, 97), (2, 270)])
 def test_scores_are_sums_of_levels(
     device: Device, variant: Any, rows: int, columns: int, rng: np.random.Generator
 ) -> None:
-    height, stride, points, headings = 21, 160, 77, 3
+    height, stride, points, headings = 21, 300, 77, 3
     level = rng.integers(0, COST_LEVELS + 1, (8, height, stride)).astype(np.uint16)
     limit = 8 * height * stride - (rows - 1) * stride - max(columns, 64) + 1
     shifts = rng.integers(0, limit, (headings, points)).astype(np.int32)

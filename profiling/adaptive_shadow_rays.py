@@ -65,9 +65,30 @@ class Setting(NamedTuple):
     bisections: int
 
 
-# In the order of their cost. More bisections do not change the 95th percentile: parts that no ray hits set it.
-_RAYS = (2, 4, 6, 8, 10, 12, 16, 24, 32, 48, 64, 96, 128, 192)
-SETTINGS = tuple(Setting(rays, bisections) for rays in _RAYS for bisections in (2, 4))
+# Numbers of rays and bisections that are tried for an error, ascending. Parts that no ray hits set the 95th percentile:
+# it falls with the rays, and a few bisections are enough.
+_RAYS = (2, 4, 6, 8, 9, 10, 11, 12, 16, 24, 32, 40, 48, 56, 64, 96, 128, 192)
+_BISECTIONS = (3, 4, 5, 6)
+
+
+def cheapest_setting(error: Callable[[Setting], float], cost: Callable[[Setting], float], limit: float) -> Setting:
+    """Return the setting of least cost whose error is `limit` or less.
+
+    Raises
+    ------
+    ValueError
+        The error of all settings is larger.
+    """
+    fewest = [_fewest_rays(error, bisections, limit) for bisections in _BISECTIONS]
+    settings = [each for each in fewest if each is not None]
+    if not settings:
+        raise ValueError(f"no setting of the adaptive peer has an error of {limit:.0e} or less")
+    return min(settings, key=cost)
+
+
+def _fewest_rays(error: Callable[[Setting], float], bisections: int, limit: float) -> Setting | None:
+    settings = (Setting(rays, bisections) for rays in _RAYS)
+    return next((each for each in settings if error(each) <= limit), None)
 
 
 def segment_table(segments: LitSegments) -> NDArray[np.float32]:

@@ -68,6 +68,20 @@ def _before_the_screen(start: NDArray[np.float32], step: NDArray[np.float32]) ->
     return seen
 
 
+def test_the_cheapest_setting_below_the_limit() -> None:
+    """With 3 bisections no number of rays is enough; 4, 5 and 6 bisections need 32, 16 and 12 rays."""
+
+    def error(setting: adaptive.Setting) -> float:
+        return 0.5**setting.bisections + 1.0 / setting.rays
+
+    def cost(setting: adaptive.Setting) -> float:
+        return setting.rays + 10.0 * setting.bisections
+
+    assert adaptive.cheapest_setting(error, cost, 0.1) == (16, 5)
+    with pytest.raises(ValueError, match="no setting of the adaptive peer has an error of 1e-03 or less"):
+        adaptive.cheapest_setting(error, cost, 1e-3)
+
+
 @FORMS
 def test_more_rays_come_nearer_to_the_truth_on_the_board(form: adaptive.Form) -> None:
     """Against 16 times as many rays; the parts that no ray hits are the error."""

@@ -111,8 +111,8 @@ typedef struct {
     place wide[6][LANES];
     real at[6][LANES];
     place sums[LANES];
-    uchar flags[LANES], is_none[LANES];
-    uint count;
+    uchar flags[LANES];
+    uint count, none, bad; // sets of lanes: entries without receiver; receivers with a component that is not finite
 } block;
 
 // Load a block; repeat the last receiver to fill the lanes.
@@ -120,19 +120,22 @@ static inline void load_block(global const INPUT *receivers, constant place *mid
     here->count = count;
     for (int lane = 0; lane < LANES; lane++) {
         global const INPUT *row = receivers + 6 * min((uint)lane, count - 1);
-        for (int k = 0; k < 3; k++) here->wide[k][lane] = (place)row[k] - middle[k];
-        for (int k = 3; k < 6; k++) here->wide[k][lane] = (place)row[k];
-        here->is_none[lane] = row[3] == 0 && row[4] == 0 && row[5] == 0;
+        for (int k = 0; k < 6; k++) here->wide[k][lane] = (place)row[k];
         here->sums[lane] = 0, here->flags[lane] = STATUS_OK;
     }
+    for (int k = 0; k < 3; k++) store_places(load_places(here->wide[k]) - middle[k], here->wide[k]);
     places nx = load_places(here->wide[3]), ny = load_places(here->wide[4]), nz = load_places(here->wide[5]);
-    const places longest = fmax(fmax(fabs(nx), fabs(ny)), fabs(nz));
+    const places zero = (places)0, longest = fmax(fmax(fabs(nx), fabs(ny)), fabs(nz));
+    here->none = lane_bits(mask_of_places(nx == zero) & mask_of_places(ny == zero) & mask_of_places(nz == zero));
     nx /= longest, ny /= longest, nz /= longest;
     const places per = (place)1 / sqrt(nx * nx + ny * ny + nz * nz);
     for (int k = 0; k < 3; k++) store_private(convert_to_reals(load_places(here->wide[k])), here->at[k]);
     store_private(convert_to_reals(nx * per), here->at[3]);
     store_private(convert_to_reals(ny * per), here->at[4]);
     store_private(convert_to_reals(nz * per), here->at[5]);
+    masks bad[2] = {0, 0};
+    for (int k = 0; k < 6; k++) bad[k / 3] |= LANED(not_finite)(load_private(here->at[k]));
+    here->bad = lane_bits(bad[0]) | (lane_bits(bad[1]) & ~here->none);
 }
 
 // Lanes whose receiver and a segment face each other; if any, the receivers' coordinates in the segment's frame.
@@ -231,10 +234,8 @@ static inline int has_no_number(place value) { return not_finite((real)value); }
 
 // Store the result of a receiver; return its contribution to the currents per unit of weight.
 static inline place result_of(const block *here, int lane, uchar flag, global real *irradiance, global uchar *status) {
-    int is_bad = 0;
-    for (int k = 0; k < 6; k++) is_bad |= not_finite(here->at[k][lane]) && !(k >= 3 && here->is_none[lane]);
+    const int is_none = here->none >> lane & 1, is_bad = here->bad >> lane & 1;
     const uchar wrong = flag | (is_bad || has_no_number(here->sums[lane]) ? STATUS_NOT_FINITE : 0);
-    const int is_none = here->is_none[lane];
     const place light = wrong ? (place)REAL_NAN : here->sums[lane];
     *irradiance = is_none ? REAL_NAN : (real)light;
     *status = is_none ? STATUS_NO_DATA : wrong | here->flags[lane];
@@ -246,7 +247,7 @@ static inline void store_block(const block *here, uchar flag, global real *irrad
                  global const INPUT *weights, place *to_left, place *to_right) {
     for (uint lane = 0; lane < here->count; lane++) {
         const place light = result_of(here, lane, flag, irradiance + lane, status + lane);
-        if (here->is_none[lane]) continue;
+        if (here->none >> lane & 1) continue;
         *to_left += light * (place)weights[2 * lane], *to_right += light * (place)weights[2 * lane + 1];
     }
 }

@@ -40,6 +40,9 @@ _MAX_SQUARE = 1e12
 # Largest error, relative to a rounding of the corrected coordinate, at which the kernel omits its convergence test.
 # Chosen.
 _SHARE_OF_ROUNDING = 0.25
+# Smallest focal length and largest number of camera matrices with which no result of the kernel can overflow where the
+# start polynomials hold [px]. Chosen: far from all cameras, and from the largest float.
+_SMALLEST_FOCAL, _LARGEST_ENTRY = 1e-9, 1e9
 # Fitted starting polynomials that are kept, each some kilobytes.
 _KEPT_STARTS = 64
 
@@ -195,7 +198,7 @@ class Camera:
         parts: list[Any] = [
             *(centre, 1.0 / focal, target_focal, shift, relative_focal_change),
             *((tilt - np.eye(3))[:2, :2].ravel(), tilt[2, :2]),
-            *(self.terms.radial, (p1, p2, p2 + s1, s2, p1 + s3, s4)),
+            *(self.terms.radial, (2.0 * p1, 2.0 * p2, p2 + s1, s2, p1 + s3, s4)),
             (self.terms.invertible_region.safe, self.terms.invertible_region.limit),
         ]
         if inverse:
@@ -205,15 +208,16 @@ class Camera:
         with np.errstate(over="ignore"):
             return np.concatenate(parts).astype(real)
 
-    def undistort_defines(self, real: npt.DTypeLike) -> dict[str, Define]:
+    def undistort_defines(self, real: npt.DTypeLike, matrix: npt.ArrayLike | None = None) -> dict[str, Define]:
         """Return the defines of ``kernels/common/camera.h`` for ``camera_undistort``, in addition to `defines`.
 
         If the number of Newton steps after which most points have converged is enough for every point in the image,
-        the kernel takes these steps without a test.
+        and no result can overflow there, the kernel takes these steps without a test. ``matrix`` is the camera matrix
+        of the ideal pixels.
         """
         start = _inverse_start(self, self._principal_region)
         steps, settled = start.newton_steps(real), start.settled_steps(real)
-        if settled is None or settled > steps:
+        if settled is None or settled > steps or not self._is_moderate(matrix):
             return {"CAMERA_STEPS": steps}
         return {"CAMERA_STEPS": settled, **flags(CAMERA_SURE=True)}
 
@@ -351,6 +355,12 @@ class Camera:
             radial.invertible_region.limit,
             farthest,
         )
+
+    def _is_moderate(self, matrix: npt.ArrayLike | None) -> bool:
+        """Return whether the numbers of both camera matrices are far from the limits of floats."""
+        matrices = np.abs([self.matrix, self._ideal_matrix(matrix)])
+        smallest = float(np.min(np.diagonal(matrices, axis1=1, axis2=2)[:, :2]))
+        return smallest > _SMALLEST_FOCAL and float(np.max(matrices)) < _LARGEST_ENTRY
 
     def _ideal_matrix(self, matrix: npt.ArrayLike | None) -> Matrix:
         return self.matrix if matrix is None else _checked_matrix(matrix, "matrix")

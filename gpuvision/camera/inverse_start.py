@@ -16,6 +16,9 @@ Float64 = npt.NDArray[np.float64]
 
 # CAMERA_GUESS_TERMS of camera.h, and the terms of each vector polynomial.
 _TERMS, _VECTOR_TERMS = 8, 3
+# Terms of the derivatives of z g and z w: CAMERA_SLOPE_TERMS, and one less than w has. Measured: the steps converge as
+# fast as with all terms.
+_SLOPE_TERMS, _ACROSS_TERMS = 6, 2
 # Polar grid of the points of the fit.
 _RADII, _DIRECTIONS = 32, 16
 # Polar grid of the points on which the error of the steps is tested: between the directions of the fit, up to its edge.
@@ -66,10 +69,10 @@ class InverseStart:
     def packed(self, real: npt.DTypeLike) -> Float64:
         """Return the entries of camera.h's table from CAMERA_PER_REACH on, for float32 or float64."""
         left, _ = _LEFT[np.dtype(real)]
-        by_v, by_w = self._slopes
-        return np.concatenate(
-            [[1.0 / self._reach, left / self._shrinkage**4], self._coefficients, by_v.ravel(), by_w.ravel()]
-        )
+        slope, by_v, by_w = self._slopes
+        head = np.array([1.0 / self._reach, left / self._shrinkage**4])
+        parts = [head, self._coefficients[:_TERMS], slope, self._vectors, by_v, by_w]
+        return np.concatenate([part.ravel() for part in parts])
 
     def newton_steps(self, real: npt.DTypeLike) -> int:
         """Return CAMERA_STEPS: the number of Newton steps after which most of the converging points have converged."""
@@ -101,11 +104,13 @@ class InverseStart:
         return self._coefficients[_TERMS:].reshape(2, _VECTOR_TERMS, 2)
 
     @property
-    def _slopes(self) -> tuple[Float64, Float64]:
-        """Coefficients of v' and of 2 (z w)'."""
+    def _slopes(self) -> tuple[Float64, Float64, Float64]:
+        """Coefficients of 2 (z g)' / reach, of 2 v' / reach and of 2 (z w)'."""
         v, w = self._vectors
-        order = np.arange(1.0, _VECTOR_TERMS + 1)[:, None]
-        return v[1:] * order[:-1], 2.0 * w * order
+        order = 2.0 * np.arange(1.0, _TERMS + 1)[:, None]
+        slope = _shortened(self._coefficients[:_TERMS, None] * order / self._reach, _SLOPE_TERMS)[:, 0]
+        by_v = v[1:] * order[: len(v) - 1] / self._reach
+        return slope, by_v, _shortened(w * order[: len(w)], _ACROSS_TERMS)
 
     @cached_property
     def _steps(self) -> tuple[Float64, Float64]:
@@ -121,19 +126,17 @@ class InverseStart:
         """Return the displacements of points (n, 2) before the kernel's steps and after each, (1 + steps, n, 2)."""
         square = np.sum(m**2, axis=-1, keepdims=True)
         z = square / self._reach
-        terms, by_v, by_w = self._coefficients[:_TERMS], *self._slopes
+        slopes, by_v, by_w = self._slopes
         at_v, at_w = (_values(z, each) for each in self._vectors)
-        g = z * polynomial.polyval(z, terms) + _dot(m, at_v)
-        slope = polynomial.polyval(z, terms * np.arange(1, _TERMS + 1)) + _dot(m, _values(z, by_v))
-        cross_terms = _values(z, by_w)
+        g = z * polynomial.polyval(z, self._coefficients[:_TERMS]) + _dot(m, at_v)
+        slope = polynomial.polyval(z, slopes) + _dot(m, _values(z, by_v))
+        across = _values(z, by_w)
         iterates = [m * g + square * at_w]
         with np.errstate(all="ignore"):
             for _ in range(_MAX_STEPS):
                 left = self._lens(m + iterates[-1])[0] + iterates[-1]
                 along = _dot(m, left)
-                step = (
-                    left + g * left + m * (2.0 / self._reach * slope * along + _dot(at_v, left)) + cross_terms * along
-                )
+                step = left + g * left + m * (slope * along + _dot(at_v, left)) + across * along
                 iterates.append(iterates[-1] - step)
         return np.array(iterates)
 
@@ -193,6 +196,14 @@ class InverseStart:
 def _first(enough: npt.NDArray[np.bool_]) -> int | None:
     """Return the index of the first true element, or None if all elements are false."""
     return int(np.argmax(enough)) if np.any(enough) else None
+
+
+def _shortened(terms: Float64, count: int) -> Float64:
+    """Return coefficients (count, n) of the polynomials that are closest to polynomials (terms, n) between 0 and 1."""
+    z = 0.5 - 0.5 * np.cos((np.arange(_RADII) + 0.5) * (math.pi / _RADII))
+    # Weighted by z: the derivatives are multiplied by a squared radius.
+    weights = z[:, None] ** np.arange(1, max(count, len(terms)) + 1)
+    return np.asarray(np.linalg.lstsq(weights[:, :count], weights[:, : len(terms)] @ terms, rcond=None)[0])
 
 
 def _values(z: Float64, terms: Any) -> Float64:

@@ -125,7 +125,7 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
 
     def _model_defines(self, real: np.dtype[Any]) -> dict[str, Define]:
         if isinstance(self.model, Camera):
-            steps = {} if self.inverse else self.model.undistort_defines(real)
+            steps = {} if self.inverse else self.model.undistort_defines(real, self.matrix)
             return {**self.model.defines(self.matrix), **steps}
         return dict(self.model.defines)
 

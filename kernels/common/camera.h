@@ -36,8 +36,8 @@
 #define CAMERA_GROWTH_Y 9
 #define CAMERA_TILT 10     // H less the identity: xx, xy, yx, yy, then wx, wy; undistortion: the inverse of H
 #define CAMERA_K 16        // k1 .. k6
-#define CAMERA_P1 22
-#define CAMERA_P2 23
+#define CAMERA_TWICE_P1 22
+#define CAMERA_TWICE_P2 23
 #define CAMERA_A0 24
 #define CAMERA_A1 25
 #define CAMERA_B0 26
@@ -47,8 +47,9 @@
 #define CAMERA_BENT 30       // q of bent points from which no inverse is searched: beyond the fold's image, or 1e6 f
 #define CAMERA_PER_REACH 31  // 1 / (q of bent points up to which the start polynomials hold)
 #define CAMERA_FIRST 32      // squared length of a virtual step before the first one, relative to q
-#define CAMERA_GUESS 33      // start polynomials of camera_approach, 30 entries
+#define CAMERA_GUESS 33      // start polynomials of camera_approach, 34 entries
 #define CAMERA_GUESS_TERMS 8
+#define CAMERA_SLOPE_TERMS 6
 #define CAMERA_PROFILE_MIDDLE 31  // under CAMERA_PROFILES (sheet.h): position of t = 0, and t of one position; there are no
 #define CAMERA_PROFILE_SCALE 32   // start polynomials then
 #if CAMERA_RADIAL || CAMERA_RATIONAL || defined(CAMERA_DECENTRED)
@@ -113,10 +114,11 @@ static inline reals LANED(camera_stretch)(reals q, constant real *k, reals *slop
 }
 #endif
 
+// a0 + a1 q for two neighbouring entries of the table.
 #ifdef CAMERA_PRISM
-#define CAMERA_PRISM_TERM(a, q) ((a) * (q))
+static inline reals LANED(camera_prism)(reals q, constant real *a) { return a[0] + a[1] * q; }
 #else
-#define CAMERA_PRISM_TERM(a, q) 0
+static inline reals LANED(camera_prism)(reals q, constant real *a) { return a[0]; }
 #endif
 
 // Compute the displacement of the ideal point (x, y) by the lens (normalised coordinates); return q.
@@ -125,9 +127,9 @@ static inline reals LANED(camera_bend)(reals x, reals y, constant real *camera, 
     reals slope;
     reals e = LANED(camera_stretch)(q, camera + CAMERA_K, &slope);
 #ifdef CAMERA_DECENTRED
-    e += 2 * (camera[CAMERA_P1] * y + camera[CAMERA_P2] * x);
-    *move_x = x * e + q * (camera[CAMERA_A0] + CAMERA_PRISM_TERM(camera[CAMERA_A1], q));
-    *move_y = y * e + q * (camera[CAMERA_B0] + CAMERA_PRISM_TERM(camera[CAMERA_B1], q));
+    e += camera[CAMERA_TWICE_P1] * y + camera[CAMERA_TWICE_P2] * x;
+    *move_x = x * e + q * LANED(camera_prism)(q, camera + CAMERA_A0);
+    *move_y = y * e + q * LANED(camera_prism)(q, camera + CAMERA_B0);
 #else
     *move_x = x * e;
     *move_y = y * e;
@@ -143,9 +145,9 @@ static inline reals LANED(camera_slopes)(reals x, reals y, constant real *camera
     reals growth = 1 + LANED(camera_stretch)(q, camera + CAMERA_K, &slope);
     reals e_x = 2 * slope * x, e_y = 2 * slope * y;
 #ifdef CAMERA_DECENTRED
-    const real p1 = 2 * camera[CAMERA_P1], p2 = 2 * camera[CAMERA_P2];
-    const reals a = 2 * camera[CAMERA_A0] + CAMERA_PRISM_TERM(4 * camera[CAMERA_A1], q);
-    const reals b = 2 * camera[CAMERA_B0] + CAMERA_PRISM_TERM(4 * camera[CAMERA_B1], q);
+    const real p1 = camera[CAMERA_TWICE_P1], p2 = camera[CAMERA_TWICE_P2];
+    const reals a = 2 * LANED(camera_prism)(2 * q, camera + CAMERA_A0);
+    const reals b = 2 * LANED(camera_prism)(2 * q, camera + CAMERA_B0);
     growth += p1 * y + p2 * x;
     e_x += p2;
     e_y += p1;
@@ -233,64 +235,70 @@ static inline masks LANED(camera_newton)(reals x, reals y, reals back_x, reals b
 #include "common/newton.h"
 
 #ifdef CAMERA_STEPS
+// Evaluate a polynomial with an even number of terms: its even and its odd terms apart, so that a CPU need not wait for
+// the product of one term before it begins with the next.
+static inline reals LANED(camera_series)(reals z, constant real *c, const int terms) {
+    const reals square = z * z;
+    reals even = c[terms - 2], odd = c[terms - 1];
+    _Pragma("unroll") for (int k = terms - 4; k >= 0; k -= 2) {
+        even = c[k] + square * even;
+        odd = c[k + 1] + square * odd;
+    }
+    return even + z * odd;
+}
+
 // Compute the inverse displacement `back` of measured points m = (x, y); return the mask of points without convergence.
 //
 // Start: polynomials in z = q / reach, which the host fits to the inverse (inverse_start.py):
 //
-//     back = m (z g(z) + v(z) . m) + q w(z)                  vectors v and w only for a decentred lens
+//     back = m G + q w(z),  G = z g(z) + v(z) . m            vectors v and w only for a decentred lens
 //
 // Iteration: the residual is r = bend(m + back) + back. A Newton step needs the inverse Jacobian of the lens, times r.
 // The Jacobian of the inverse mapping m -> m + back is this inverse up to the error of the fit, so that the step is r +
-// (d back / dm) r: no division, and the derivatives are computed once. With G = z g + v . m:
+// T r with the matrix T = d back / dm: no division, and T is computed once:
 //
-//     (d back / dm) r = G r + m (slope (m . r) + v . r) + 2 (z w)' (m . r),   slope = 2 ((z g)' + v' . m) / reach
+//     T = G I + m (slope m + v)^T + across m^T,   slope = 2 ((z g)' + v' . m) / reach,   across = 2 (z w)'
+//
+// The host shortens `slope` and `across`: T need not be as exact as `back`. The next `back` is back - (r + T r) =
+// -(bend(m + back) + T r).
 //
 // PoCL does not inline a function of this length, or unroll the loop, without the attribute and the pragma: it would be
 // half as fast.
 static inline __attribute__((always_inline)) masks LANED(camera_approach)(reals x, reals y, constant real *camera,
                                                                           reals *back_x, reals *back_y) {
-    constant real *c = camera + CAMERA_GUESS;
-    const real per = camera[CAMERA_PER_REACH];
-    const reals q = x * x + y * y, z = q * per;
-    reals g = c[CAMERA_GUESS_TERMS - 1], slope = 0;
-    _Pragma("unroll") for (int k = CAMERA_GUESS_TERMS - 2; k >= 0; k--) {
-        slope = g + z * slope;
-        g = c[k] + z * g;
-    }
-    slope = g + z * slope;
-    g *= z;
+    constant real *c = camera + CAMERA_GUESS;  // coefficients of g, and of slope without v
+    const reals q = x * x + y * y, z = q * camera[CAMERA_PER_REACH];
+    reals g = z * LANED(camera_series)(z, c, CAMERA_GUESS_TERMS);
+    reals slope = LANED(camera_series)(z, c + CAMERA_GUESS_TERMS, CAMERA_SLOPE_TERMS);
 #ifdef CAMERA_DECENTRED
-    c += CAMERA_GUESS_TERMS;  // coefficients v0x, v0y, v1x, ... of v, then the coefficients of w, v' and 2 (z w)'
+    c += CAMERA_GUESS_TERMS + CAMERA_SLOPE_TERMS;  // v0x, v0y, v1x, ... of v, then those of w, 2 v' / reach and `across`
     const reals v_x = c[0] + z * (c[2] + z * c[4]), v_y = c[1] + z * (c[3] + z * c[5]);
     const reals w_x = c[6] + z * (c[8] + z * c[10]), w_y = c[7] + z * (c[9] + z * c[11]);
-    const reals turn_x = c[16] + z * (c[18] + z * c[20]), turn_y = c[17] + z * (c[19] + z * c[21]);
-    slope += x * (c[12] + z * c[14]) + y * (c[13] + z * c[15]);
     g += x * v_x + y * v_y;
     *back_x = x * g + q * w_x;
     *back_y = y * g + q * w_y;
+    slope += x * (c[12] + z * c[14]) + y * (c[13] + z * c[15]);
+    const reals along_x = slope * x + v_x, along_y = slope * y + v_y;
+    const reals across_x = c[16] + z * c[18], across_y = c[17] + z * c[19];
+    const reals xx = g + x * along_x + across_x * x, xy = x * along_y + across_x * y;
+    const reals yx = y * along_x + across_y * x, yy = g + y * along_y + across_y * y;
 #else
     *back_x = x * g;
     *back_y = y * g;
+    const reals along_x = slope * x, along_y = slope * y;
+    const reals xx = g + x * along_x, xy = x * along_y, yx = xy, yy = g + y * along_y;
 #endif
-    slope *= 2 * per;
     const masks within = mask_of(z <= 1);
     masks settled = -1;
     reals before = camera[CAMERA_FIRST] * q;
     for (int k = 0; k < CAMERA_STEPS || (CAMERA_TESTED && k < CAMERA_MOST_STEPS && any_lane(within & ~settled)); k++) {
         reals move_x, move_y;
         const reals at = LANED(camera_bend)(x + *back_x, y + *back_y, camera, &move_x, &move_y);
-        const reals left_x = move_x + *back_x, left_y = move_y + *back_y, along = x * left_x + y * left_y;
-#ifdef CAMERA_DECENTRED
-        const reals turn = slope * along + (v_x * left_x + v_y * left_y);
-        const reals step_x = left_x + (g * left_x + x * turn + turn_x * along);
-        const reals step_y = left_y + (g * left_y + y * turn + turn_y * along);
-#else
-        const reals turn = slope * along;
-        const reals step_x = left_x + (g * left_x + x * turn), step_y = left_y + (g * left_y + y * turn);
-#endif
-        *back_x -= step_x;
-        *back_y -= step_y;
+        const reals left_x = move_x + *back_x, left_y = move_y + *back_y;
+        *back_x = -xx * left_x - (move_x + xy * left_y);
+        *back_y = -yy * left_y - (move_y + yx * left_x);
 #if CAMERA_TESTED
+        const reals step_x = left_x + (xx * left_x + xy * left_y), step_y = left_y + (yx * left_x + yy * left_y);
         const reals step = step_x * step_x + step_y * step_y;
         settled = mask_of(at < camera[CAMERA_SAFE]) &
                   mask_of(step * step <= (real)CAMERA_LEFT * q * (before + (real)CAMERA_NOISE * q));
@@ -302,10 +310,10 @@ static inline __attribute__((always_inline)) masks LANED(camera_approach)(reals 
 
 // Compute the normalised displacement that moves measured pixels to their ideal positions; return the mask of pixels
 // without one: beyond the image of the fold, a million focal lengths away, or not finite. Points that camera_approach
-// does not solve take Newton's method (newton.h).
-static inline __attribute__((always_inline)) masks LANED(camera_correction)(reals column, reals row,
-                                                                            constant real *camera, reals *back_x,
-                                                                            reals *back_y) {
+// does not solve take Newton's method (newton.h). *certain: under CAMERA_SURE the start polynomials hold for all lanes,
+// so that no lane is masked and all results are finite.
+static inline __attribute__((always_inline)) masks LANED(camera_solve)(reals column, reals row, constant real *camera,
+                                                                       reals *back_x, reals *back_y, int *certain) {
     reals x = (column - camera[CAMERA_CENTRE_X]) * camera[CAMERA_PER_X];
     reals y = (row - camera[CAMERA_CENTRE_Y]) * camera[CAMERA_PER_Y];
     masks folded = 0;
@@ -321,7 +329,9 @@ static inline __attribute__((always_inline)) masks LANED(camera_correction)(real
     *back_x = *back_y = 0;
     const masks open = ~folded;
 #endif
-    if (any_lane(open)) {
+    *certain = !CAMERA_TESTED;
+    if (any_compared(CAMERA_TESTED ? open : open | folded)) {
+        *certain = 0;
         // One comparison finds points that are too far or not finite: it is false for NaN of either sign.
         const masks far = ~mask_of(x * x + y * y < camera[CAMERA_BENT]);
 #ifdef CAMERA_BENDS
@@ -337,11 +347,19 @@ static inline __attribute__((always_inline)) masks LANED(camera_correction)(real
     return folded;
 }
 
-// Move measured pixels to their ideal positions; return the mask of pixels without one, as camera_correction.
+// The same for callers that test each result themselves.
+static inline __attribute__((always_inline)) masks LANED(camera_correction)(reals column, reals row,
+                                                                            constant real *camera, reals *back_x,
+                                                                            reals *back_y) {
+    int certain;
+    return LANED(camera_solve)(column, row, camera, back_x, back_y, &certain);
+}
+
+// Move measured pixels to their ideal positions; return the mask of pixels without one, and *certain, as camera_solve.
 static inline __attribute__((always_inline)) masks LANED(camera_undistort)(reals *column, reals *row,
-                                                                           constant real *camera) {
+                                                                           constant real *camera, int *certain) {
     reals back_x, back_y;
-    const masks folded = LANED(camera_correction)(*column, *row, camera, &back_x, &back_y);
+    const masks folded = LANED(camera_solve)(*column, *row, camera, &back_x, &back_y, certain);
     LANED(camera_move)(column, row, back_x, back_y, camera);
     return folded;
 }

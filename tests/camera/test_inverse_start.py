@@ -42,7 +42,7 @@ def _camera(coefficients: tuple[float, ...], matrix: object = MATRIX) -> Camera:
 
 def _points(rng: np.random.Generator, camera: Camera, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Return distorted points within a radius, and their displacement back to the ideal points, both normalised."""
-    ideal = rng.uniform(-1.0, 1.0, (6000, 2)) * math.sqrt(2.0 * reach)
+    ideal = rng.uniform(-1.0, 1.0, (40_000, 2)) * math.sqrt(2.0 * reach)
     distorted = np.asarray(reference.distort_pixels(ideal, IDEAL, camera.distortion), np.float64)
     within = np.sum(distorted**2, axis=-1) < reach
     return distorted[within], (ideal - distorted)[within]

@@ -332,6 +332,16 @@ def test_far_points_are_flagged_or_finite(device: Device, model: Any, variant: A
     np.testing.assert_array_equal(np.isnan(result.points).all(axis=1), result.status != 0)
 
 
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_results_that_overflow_are_flagged(device: Device, variant: Any) -> None:
+    """With a principal point near the largest float, 3.4e38, columns to the right of it overflow."""
+    huge = ((1e38, 0.0, 3.3e38), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    points = np.tile(np.array([[100.0, 500.0], [1200.0, 500.0]], np.float32), (10, 1))
+    result = UndistortPoints(model=CAMERAS["k1"], matrix=huge, variant=variant)(points, device=device)
+    np.testing.assert_array_equal(result.status, 10 * [0, Status.NOT_FINITE])
+    np.testing.assert_array_equal(np.isnan(result.points).all(axis=1), result.status != 0)
+
+
 @pytest.mark.double
 def test_behind_a_tilted_sensor(device: Device) -> None:
     given_ = camera(tilt=(45.0, 0.0))

@@ -1,7 +1,9 @@
 """Undistortion of points, compared with OpenCV's undistortPoints and with Numba.
 
 The peer ``numba`` reads a point as one complex number, starts at a series of the radius, and takes two quasi-Newton
-steps, five in double precision; ``numba-plain`` takes four Newton steps from the measured point.
+steps, five in double precision; ``numba-plain`` takes four Newton steps from the measured point. Both write the status
+and NaN as gpuvision does, with one test of the radius: the fold of the camera lies far outside of the points of the
+case.
 
 OpenCV's default of five fixed-point steps does not converge for every camera; the column ``peer_error`` has its error
 on the points of the case. Case names contain the camera; in ``converged`` cases OpenCV runs up to 200 steps.
@@ -45,6 +47,7 @@ FULL = Camera(
     distortion=(-0.12, 0.08, 1e-3, -2e-3, 0.01, 0.02, 0.03, 1e-3, 1e-3, 2e-3, -1e-3, 3e-3, TWENTY_DEGREES, -0.2),
 )
 _FAST = {"contract", "arcp", "reassoc", "nsz"}  # fused multiply-add, sums in any order
+_OK, _NOT_FINITE, _NOT_INVERTIBLE = np.uint8(0), np.uint8(8), np.uint8(128)  # flags of gpuvision
 _CHUNK = 8192  # points of a chunk of the peer
 _TERMS = 7  # of the series of the peer
 _STEPS = {"float32": 2, "float64": 5}  # of the peer
@@ -70,8 +73,15 @@ def _newton_step(x, y, at_x, at_y, one, k1, k2, p1, p2, k3):
     return at_x - (yy * left_x - xy * left_y) * per, at_y - (xx * left_y - yx * left_x) * per
 
 
+@numba.njit(error_model="numpy")
+def _flags(column, row, inside):
+    """Return the status of a point; without a branch, so that LLVM vectorises the loops below."""
+    finite = (np.abs(column) < np.inf) & (np.abs(row) < np.inf)
+    return _OK if inside else (_NOT_INVERTIBLE if finite else _NOT_FINITE)
+
+
 @numba.njit(parallel=True, error_model="numpy")
-def _plain(columns, rows, table, ideal_columns, ideal_rows):
+def _plain(columns, rows, table, far, ideal_columns, ideal_rows, status):
     """Take four Newton steps from the measured point, on all cores.
 
     The loop is unrolled, with separate arrays of columns and rows (ours takes pairs), so that LLVM vectorises it.
@@ -85,18 +95,22 @@ def _plain(columns, rows, table, ideal_columns, ideal_rows):
         a, b = _newton_step(x, y, a, b, one, k1, k2, p1, p2, k3)
         a, b = _newton_step(x, y, a, b, one, k1, k2, p1, p2, k3)
         a, b = _newton_step(x, y, a, b, one, k1, k2, p1, p2, k3)
-        ideal_columns[i] = cx + f * a
-        ideal_rows[i] = cy + f * b
+        inside = x * x + y * y < far
+        ideal_columns[i] = cx + f * a if inside else np.nan
+        ideal_rows[i] = cy + f * b if inside else np.nan
+        status[i] = _flags(columns[i], rows[i], inside)
 
 
 @numba.njit(error_model="numpy", fastmath=_FAST)
-def _one_thread(points, table, series, steps, ideal):
+def _one_thread(points, table, far, series, steps, ideal, status):
     """Undistort points (complex numbers) on one core by quasi-Newton steps from a series of the radius.
 
     The inverse displacement of the radial terms is nearly m q s(q) at the measured point m, with q = |m|^2. The
     Jacobian of this series replaces the inverse Jacobian of the lens, so that a step has no division. `steps` is a
-    tuple: its length is known when the loop is compiled, so that the steps are unrolled and the points vectorised.
+    tuple: its length is known when the loop is compiled, so that the steps are unrolled and the points vectorised. The
+    series holds for squared radii below `far`, in normalised coordinates.
     """
+    lost = points.dtype.type(complex(np.nan, np.nan))
     cx, cy, f, k1, k2, p1, p2, k3 = table[0], table[1], table[2], table[3], table[4], table[5], table[6], table[7]
     per = table[8]
     s0, s1, s2, s3, s4, s5, s6 = series[0], series[1], series[2], series[3], series[4], series[5], series[6]
@@ -117,15 +131,17 @@ def _one_thread(points, table, series, steps, ideal):
             turn = slope * (x * left + y * below)
             a -= left + (g * left + x * turn)
             b -= below + (g * below + y * turn)
-        ideal[i] = complex(column + f * a, row + f * b)
+        inside = q < far
+        ideal[i] = complex(column + f * a, row + f * b) if inside else lost
+        status[i] = _flags(column, row, inside)
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _chunks(points, table, series, steps, ideal):
+def _chunks(points, table, far, series, steps, ideal, status):
     """Undistort chunks of points on all cores."""
     for chunk in numba.prange((points.shape[0] + _CHUNK - 1) // _CHUNK):
         first, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, points.shape[0])
-        _one_thread(points[first:end], table, series, steps, ideal[first:end])
+        _one_thread(points[first:end], table, far, series, steps, ideal[first:end], status[first:end])
 
 
 # Operations of a point in kernels/common/camera.h: normalised place 4, moved pixel 4, tilt 17 and its sums 4.
@@ -229,35 +245,42 @@ def _numba_peers(points: NDArray[Any], camera: Camera, exact: NDArray[np.float64
     (f, _, cx), (_, _, cy), _ = camera.matrix
     table = np.array([cx, cy, f, *camera.distortion[:5], 1.0 / f], points.dtype)
     columns, rows = (np.ascontiguousarray(each) for each in points.T)
-    ideal = np.empty_like(points)
+    ideal, status = np.empty_like(points), np.empty(len(points), np.uint8)
     pairs, targets = (each.reshape(-1).view(np.result_type(points, np.complex64)) for each in (points, ideal))
-    series, steps = _inverse_series(camera, points).astype(points.dtype), (0,) * _STEPS[points.dtype.name]
-    given = pairs, table, series, steps, targets
+    far = _farthest(camera, points)
+    series, steps = _inverse_series(camera, far).astype(points.dtype), (0,) * _STEPS[points.dtype.name]
+    square = points.dtype.type(far**2)
+    given = pairs, table, square, series, steps, targets, status
     forms: dict[str, Callable[[], object]] = {
         "one-thread": functools.partial(_one_thread, *given),
         "chunks": functools.partial(_chunks, *given),
     }
     for form in forms.values():
-        ideal[:] = np.nan
+        ideal[:], status[:] = np.nan, 255
         form()
-        if not _worst(ideal, exact) < _AGREEMENT[points.dtype.name]:
+        if not _worst(ideal, exact) < _AGREEMENT[points.dtype.name] or np.any(status):
             raise AssertionError("the Numba loop and float64 differ")
     moved = np.full_like(columns, np.nan), np.full_like(rows, np.nan)
-    plain = functools.partial(_plain, columns, rows, table, *moved)
+    plain = functools.partial(_plain, columns, rows, table, square, *moved, status)
+    status[:] = 255
     plain()
-    if not _worst(np.stack(moved, axis=-1), exact) < _PLAIN_AGREEMENT[points.dtype.name]:
+    if not _worst(np.stack(moved, axis=-1), exact) < _PLAIN_AGREEMENT[points.dtype.name] or np.any(status):
         raise AssertionError("the plain Numba loop and float64 differ")
     return {"numba": forms, "numba-plain": plain}
 
 
-def _inverse_series(camera: Camera, points: NDArray[Any]) -> NDArray[np.float64]:
+def _farthest(camera: Camera, points: NDArray[Any]) -> float:
+    """Return the radius of the farthest of the points from the principal point, and 1 % more, over the focal length."""
+    (f, _, cx), (_, _, cy), _ = camera.matrix
+    return 1.01 * float(np.max(np.hypot(*(points.astype(np.float64) - (cx, cy)).T))) / f
+
+
+def _inverse_series(camera: Camera, far: float) -> NDArray[np.float64]:
     """Return the coefficients of the series of `_one_thread`, and of twice its derivative by q.
 
-    The series is fitted to the radial terms of the lens, up to the farthest of the points.
+    The series is fitted to the radial terms of the lens, up to the radius `far`.
     """
     k1, k2, _, _, k3 = camera.distortion[:5]
-    (f, _, cx), (_, _, cy), _ = camera.matrix
-    far = 1.01 * float(np.max(np.hypot(*(points.astype(np.float64) - (cx, cy)).T))) / f
     ideal = np.linspace(1e-3, 2.0 * far, 8000)
     measured = ideal * (1.0 + ideal**2 * (k1 + ideal**2 * (k2 + ideal**2 * k3)))
     used = (measured <= far) & (ideal < camera.invertible_radius)

@@ -41,7 +41,7 @@ ELECTRON = 1.602176634e-19  # elementary charge [C]
 # Gaussian spot 3 standard deviations from its centre moves the reading by 0.0044 of them.
 _MARGIN_SPOTS = 3.0
 # Samples of a work-item of the vector variant, multiples of 16: long, unless there are too few to keep every core busy.
-_SHORT_STRIP, _LONG_STRIP, _STRIPS_PER_CORE = 4096, 65536, 4
+_SHORT_STRIP, _LONG_STRIP, _STRIPS_PER_CORE = 4096, 32768, 8
 _LANES = 16  # of a vector of the vector variant: its kernel's vectors have 16 elements
 _GROUP = 64  # work-items of a group of the other variant
 
@@ -220,7 +220,7 @@ class PsdReadout(VisionOperation[PsdReading]):
     Result: ClassVar[type[Any]] = PsdReading
     # Not the variant: with a triangulation the variants round differently.
     tunable: ClassVar[Tunable | None] = Tunable(
-        strips=(1024, 2048, 4096, 8192, 16384, 65536), groups=(32, 64, 128, 256)
+        strips=(1024, 2048, 4096, 8192, 16384, 32768), groups=(32, 64, 128, 256)
     )
 
     strip_length: float

@@ -64,6 +64,8 @@ static inline void load_pair(const Readout *io, int sample, reals *left, reals *
 #ifdef WORD_PAIRS
     // The left code is the lower half of a word on the little-endian CPUs of this variant. A mask and a shift cost less
     // than the shuffles that separate even and odd codes.
+    prefetch_inputs(pairs);
+    prefetch_inputs(pairs + LANES);
     const uint16 words = *(global const words_at *)pairs;
     *left = LANED(convert_real)(as_int16(words & 0xffff));
     *right = LANED(convert_real)(as_int16(words >> 16));

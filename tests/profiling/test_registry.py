@@ -26,12 +26,12 @@ BOUND_BY = {"EstimateFeaturePose": "FeatureSet"}
 LACKS: dict[str, set[str]] = {
     "curve": set(),
     "map": {
-        *("BoardPoseEstimator", "EstimateFeaturePose", "FieldPoseRefinement", "FieldPoseSearch", "OccludedIrradiance"),
+        *("BoardPoseEstimator", "EstimateFeaturePose", "FieldPoseRefinement", "FieldPoseSearch"),
     },
     "roofline": set(),
     "contract": set(),
 }
-NUMBER = 5  # of the entries of the list
+NUMBER = 4  # of the entries of the list
 
 
 def constructed(path: Path) -> set[str]:

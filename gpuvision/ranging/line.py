@@ -40,9 +40,14 @@ METHODS = ("centroid", "windowed", "gauss3", "fir", "ml")
 PEAK_SELECTIONS = ("strongest", "first", "last", "nearest")
 LONGEST_PROFILE = 32767  # samples: the vector variant keeps sample indices in 16 bits
 WIDEST_WINDOW = 180  # samples on either side: sums of 16-bit samples times their index fit 32 bits
+_SMALL_WINDOW = 15  # samples on either side: sums of bytes times their index fit 16 bits
 _LANES = 16  # of a vector of the vector variant: its kernel's vectors have 16 elements
 _GROUP = 64  # work-items of a work-group that selects among candidates
 _STRIP = 1024  # largest number of columns of a strip: MAX_STRIP in line_strip.h
+_PROFILE_BYTES = 96  # largest sum of the sizes of a profile's outputs
+# Bytes of a launch that one work-item moves. Intel's runtime runs a launch of one work-group in the calling thread, as
+# PoCL does with all short launches (host/bound.py). Measured on two cores: 10 us, not 16 us, for a frame of 512 KiB.
+_ONE_ITEM_BYTES = 640 << 10
 _FIELDS = ("position", "peak", "width", "total", "status")  # default outputs without a triangulation
 _WIDE_BYTES = 64  # bytes of a wide vector (one cache line): WIDE in line_wide.h
 
@@ -199,8 +204,8 @@ class LineReadout(VisionOperation[LineReading]):
     background image was subtracted from the frames, ``read_noise`` must contain the noise of both.
 
     Cost of ``sigma`` over the readout of 16 frames (512, 1024) uint8 without it, two-core machine, PoCL and Intel:
-    ``"windowed"`` 12 and 15 %, ``"gauss3"`` 3 and 3 %, ``"fir"`` 13 and 10 %, ``"ml"`` 60 and 50 %, ``"centroid"``
-    14 and 19 % (medians of interleaved runs on a machine with other load; ``gpuvision profile line`` repeats them in
+    ``"windowed"`` 6 and 13 %, ``"gauss3"`` 3 and 5 %, ``"fir"`` 13 and 12 %, ``"ml"`` 65 and 60 %, ``"centroid"``
+    15 and 25 % (medians of interleaved runs on a machine with other load; ``gpuvision profile line`` repeats them in
     the rows ``-sigma/16``). The sums of ``"centroid"`` for integer frames round ``sigma`` to 1e-4 of its value where
     the line is steep and thin.
 
@@ -311,6 +316,10 @@ class LineReadout(VisionOperation[LineReading]):
         return self.minimum_width > 1 or self.maximum_width is not None
 
     @property
+    def _passes_once(self) -> bool:
+        return self.method in ("centroid", "windowed")
+
+    @property
     def _has_candidates(self) -> bool:
         return self.method != "centroid" and (self.peak_selection != "strongest" or self._limits_width)
 
@@ -329,7 +338,8 @@ class LineReadout(VisionOperation[LineReading]):
         frames = math.prod(batch)
         is_narrow = build.uses_vectors and not self._fits_strip(rows, columns, dtype)
         if build.uses_vectors and not is_narrow:
-            work = WorkSize((self._items(device, frames, samples), frames), (1, 1), vectors=True)
+            moved = frames * (rows * columns * dtype.itemsize + _PROFILE_BYTES * samples)
+            work = WorkSize((self._items(device, frames, samples, moved), frames), (1, 1), vectors=True)
         else:
             work = self._groups(frames, samples, dtype, build.real, item_per_profile=is_narrow)
         chosen, of_samples = self.outputs or (), (*batch, samples)
@@ -343,16 +353,21 @@ class LineReadout(VisionOperation[LineReading]):
             more_inputs=[(of_samples, build.real)] if self.peak_selection == "nearest" else [],
             outputs=build.outputs({name: of_samples if name in chosen else None for name in LineReading._fields}),
             defines=self._defines(dtype, length, build.real, profiles)
-            | flags(PREFETCH=device.prefers_vectors, ITEM_PER_PROFILE=is_narrow and not self._has_candidates),
+            | self._window_defines(vectors=work.vectors)
+            | flags(
+                PREFETCH=work.vectors and (dtype.itemsize == 1 or self.along == "rows"),
+                ITEM_PER_PROFILE=is_narrow and not self._has_candidates,
+            ),
             arguments=[
                 np.int32(rows),
                 np.int32(columns),
                 *self._levels(dtype),
+                np.int32(self.window),
                 self._packed(build.real, dtype, length, device),
                 None if self.triangulation is None else self.triangulation.packed(build.real, self.axes, profiles),
                 None if profiles is None else profiles.blocks(build.real),
             ],
-            passes_once=work.vectors and self.method in ("centroid", "windowed"),
+            passes_once=work.vectors and self._passes_once,
         )
 
     def _fits_strip(self, rows: int, columns: int, dtype: np.dtype[Any]) -> bool:
@@ -377,10 +392,15 @@ class LineReadout(VisionOperation[LineReading]):
             group, profiles = 256, 16 if sums_in_double else 32
         return WorkSize((ceil_div(samples, profiles) * group, frames), (group, 1))
 
-    def _items(self, device: Device, frames: int, samples: int) -> int:
-        """Return the work-items per frame of the vector variant: few, but two per core at least over all frames."""
+    def _items(self, device: Device, frames: int, samples: int, moved: int) -> int:
+        """Return the work-items per frame of the vector variant: few, but two per core at least over all frames.
+
+        The launch moves about `moved` bytes. One work-item reads a small frame.
+        """
         if self.along == "rows" or self._has_candidates:
             return ceil_div(samples, _LANES)
+        if frames == 1 and self._passes_once and moved <= _ONE_ITEM_BYTES:
+            return 1
         units = device.compute_units
         busy = ceil_div(2 * units, max(frames, 1)) if frames < 2 * units else 1
         return min(max(ceil_div(samples, _STRIP), busy), max(samples // 128, 1))
@@ -409,10 +429,6 @@ class LineReadout(VisionOperation[LineReading]):
         bits = 8 * dtype.itemsize
         defines = type_defines("CODE", dtype, 4, 8, 16) | {"CODE_BITS": bits}
         defines |= flags(**{f"METHOD_{self.method.upper()}": True, f"SELECT_{self.peak_selection.upper()}": True})
-        # The centroid method has no window, and only the FIR method has a filter: fewer builds for other values.
-        window = 1 if self.method == "centroid" else self.window
-        half = self.fir_length // 2 if self.method == "fir" else 0
-        defines |= {"RADIUS": window, "REACH": window + half, "FIR_HALF": half}
         chosen = self.outputs or ()
         defines |= flags(**{f"WITH_{name.upper()}": True for name in chosen})
         if self.triangulation is not None:
@@ -428,6 +444,21 @@ class LineReadout(VisionOperation[LineReading]):
             COUNT_WIDTH="width" in chosen or (self.method == "centroid" and self._limits_width),
             LONG_MOMENT=bits < 32 and length**2 // 2 * np.iinfo(f"uint{bits}").max >= 2**32,
         )
+
+    def _window_defines(self, *, vectors: bool) -> dict[str, Define]:
+        """Return the macros of the window.
+
+        The window is an argument of the kernel where that costs nothing: in the vector variant of ``"windowed"`` down
+        the columns. Elsewhere it is a constant of the build. Measured with an argument: 3 to 4 % more time for the
+        fits, 9 % along rows; on GPUs the samples of the window lie in memory and not in registers.
+        """
+        # The centroid method has no window, and only the FIR method has a filter: fewer builds for other values.
+        half = self.fir_length // 2 if self.method == "fir" else 0
+        if vectors and self.method == "windowed" and self.along == "columns":
+            largest = _SMALL_WINDOW if self.window <= _SMALL_WINDOW else WIDEST_WINDOW
+            return {"MAX_RADIUS": largest, "WINDOW_ARGUMENT": None, "FIR_HALF": half}
+        window = 1 if self.method == "centroid" else self.window
+        return {"RADIUS": window, "MAX_RADIUS": window, "FIR_HALF": half}
 
     def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any], length: int, device: Device) -> Any:
         """Return the parameter table of the kernel."""

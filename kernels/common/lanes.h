@@ -114,7 +114,11 @@ static inline int any_lane(masks mask) { return mask != 0; }
 
 // The same for a 32-bit mask.
 #ifdef VECTOR_VARIANT
-static inline int any_int_lane(ints mask) { return any(mask); }
+static inline int any_int_lane(ints mask) {
+    const int8 half_of_it = mask.lo | mask.hi;
+    const long2 quarter = as_long2(half_of_it.lo | half_of_it.hi);
+    return (quarter.x | quarter.y) != 0;
+}
 #else
 static inline int any_int_lane(ints mask) { return mask != 0; }
 #endif

@@ -4,13 +4,14 @@
 // A profile is a column of the frame, or a row under ALONG_ROWS. `length` is the number of its samples, `samples` the
 // number of profiles of a frame. METHOD_... selects the peak estimator:
 //     CENTROID  sum v k / sum v over the whole profile, v the light (line_centroid.h)
-//     WINDOWED  the same in a window of RADIUS samples on either side of the peak (line_window.h)
+//     WINDOWED  the same in a window of `radius` samples on either side of the peak (line_window.h)
 //     GAUSS3    parabola through three logarithms, FIR zero crossing of a derivative filter (line_points.h)
 //     ML        maximum-likelihood fit of a Gaussian (line_ml.h, line_point_fit.h)
 //
 // Inputs:  frames     (frames, rows, columns) CODE [grey levels]
 //          previous   (frames, samples) real [px], under SELECT_NEAREST: earlier positions, NaN: unknown
 //          threshold, saturation, minimum  CODE [grey levels]: level of no light, of saturation, smallest peak
+//          radius     int [px]: samples on either side of the peak in its window
 //          table      LineTable;  sheet  SheetTable (common/sheet.h), under WITH_SHEET
 //          correction (blocks, CAMERA_PROFILES, 2, 16) real, under CAMERA_PROFILES (sheet_place_in_profile)
 // Outputs: (frames, samples), each one compiled only under its WITH_... option:
@@ -18,10 +19,11 @@
 //          g, h real [m] (under WITH_SHEET), sigma real [px] (standard deviation of the position by the noise of the
 //          samples), and under WITH_SHEET sigma_g, sigma_h real [m] (the same of g and h) and systematic_g,
 //          systematic_h real [m] (standard deviation by the covariance of the triangulation)
-// Build options: CODE, CODE4, CODE8, CODE16, CODE_BITS (type of the samples), REAL_IS_DOUBLE, ALONG_ROWS, RADIUS and
-//          REACH (window that counts, and window that is read), FIR_HALF, CANDIDATES with SELECT_... (line_peak.h), AMBIGUITY,
-//          WIDTH_LIMITS, COUNT_WIDTH, LONG_MOMENT, PREFETCH, NOISE (compute variances: any of the sigmas is an output),
-//          ITEM_PER_PROFILE (line_group.h),
+// Build options: CODE, CODE4, CODE8, CODE16, CODE_BITS (type of the samples), REAL_IS_DOUBLE, ALONG_ROWS, MAX_RADIUS
+//          (largest radius that the build takes), WINDOW_ARGUMENT (the radius is the argument) or RADIUS (it is this
+//          constant), FIR_HALF (samples read beyond the window on either side), CANDIDATES with SELECT_...
+//          (line_peak.h), AMBIGUITY, WIDTH_LIMITS, COUNT_WIDTH, LONG_MOMENT, PREFETCH, NOISE (compute variances: any of
+//          the sigmas is an output), ITEM_PER_PROFILE (line_group.h),
 //          WITH_POSITION/PEAK/WIDTH/TOTAL/STATUS/SHEET/G/H/SIGMA/SIGMA_G/SIGMA_H/SYSTEMATIC_G/SYSTEMATIC_H, LENS,
 //          LENS_K2, LENS_K3, LENS_K4, CAMERA, CAMERA_PROFILES (terms of the table of corrections), PAST_CACHES,
 //          VECTOR_VARIANT.
@@ -177,7 +179,7 @@ static inline void finish_centroid(const Profiles *profiles, const Centroid *cen
 // `second`: under AMBIGUITY the highest sample outside the window.
 static inline void finish_peak(const Profiles *profiles, const Peak *peak, const Place *found, codes second,
                                constant LineTable *table, const Outputs *to, ulong first, int sample) {
-    const Place place = middle_of_wide_top(peak, *found);
+    const Place place = middle_of_wide_top(profiles, peak, *found);
     const ints cut = cut_lanes(profiles, peak) & peak->found;
     ints flags = place.flags | common_flags(profiles, peak->level, peak->not_finite);
     flags |= flag_where(~peak->found, STATUS_LOW_SIGNAL) | flag_where(cut, STATUS_OUT_OF_RANGE);
@@ -200,10 +202,11 @@ static inline void finish_peak(const Profiles *profiles, const Peak *peak, const
 
 // Copy the window of every lane and estimate the position in it, by any of the methods.
 static inline Place place_in_window(const Profiles *profiles, Peak *peak, constant LineTable *table) {
-    CODE window[(2 * REACH + 1) * LANES];
-    gather_centred(profiles, peak, REACH, window);
+    const int reach = radius_of(profiles) + FIR_HALF;
+    CODE window[(2 * MAX_REACH + 1) * LANES];
+    gather_centred(profiles, peak, reach, window);
 #if defined(METHOD_WINDOWED)
-    return window_centroid(window, REACH, profiles, peak, table);
+    return window_centroid(window, reach, profiles, peak, table);
 #elif defined(METHOD_ML)
     return fit_gaussian(window, profiles, peak, table);
 #else
@@ -284,7 +287,7 @@ kernel void line_readout(global const CODE *restrict frames,
                          global real *restrict h, global real *restrict sigma, global real *restrict sigma_g,
                          global real *restrict sigma_h, global real *restrict systematic_g,
                          global real *restrict systematic_h, const int rows, const int columns, const CODE threshold,
-                         const CODE saturation, const CODE minimum, constant LineTable *table,
+                         const CODE saturation, const CODE minimum, const int radius, constant LineTable *table,
                          constant SheetTable *sheet, global const real *restrict correction) {
 #ifndef SELECT_NEAREST
     global const real *previous = 0;
@@ -295,8 +298,8 @@ kernel void line_readout(global const CODE *restrict frames,
     const int samples = columns, length = rows, stride = columns, lane_stride = 1;
 #endif
     const ulong number = get_global_id(1);
-    const Profiles frame = {frames + number * rows * columns, stride, lane_stride, length,
-                            threshold,                        saturation, minimum};
+    const Profiles frame = {frames + number * rows * columns, stride,  lane_stride, length, threshold,
+                            saturation,                       minimum, radius};
     const Outputs to = {position, peak,    width,   total,        status,       g,     h,
                         sigma,    sigma_g, sigma_h, systematic_g, systematic_h, sheet, table,
                         correction, samples};

@@ -175,8 +175,8 @@ static inline ints fit_integrals(const CODE *window, Gaussian *at, ints wanted, 
 // Where no fit converges inside the window, the position is the centroid of the window, with AMBIGUOUS.
 static inline Place fit_gaussian(const CODE *window, const Profiles *profiles, const Peak *peak,
                                  constant LineTable *table) {
-    reals samples[WINDOW];
-    for (int k = 0; k < WINDOW; k++) samples[k] = to_reals(window_level(window, k));
+    reals samples[2 * RADIUS + 1];
+    for (int k = 0; k <= 2 * RADIUS; k++) samples[k] = to_reals(window_level(window, k));
     const SampleNoise noise = {table->read_variance, table->gain, (real)profiles->saturation};
     Gaussian at = first_guess(samples, peak->level, 1);
     ints settled = fit_points(samples, &at, peak->found, noise);

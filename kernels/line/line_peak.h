@@ -121,15 +121,15 @@ static inline codes highest_outside(const Profiles *profiles, ints peak) {
     *(ints_at *)at = peak;
     for (int lane = 0; lane < LANES; lane++) {
         global const CODE *row = profiles->first + (long)lane * profiles->lane_stride;
-        const CODE before = highest_in(row, 0, min(at[lane] - RADIUS, profiles->length));
-        level[lane] = higher_of(before, highest_in(row, max(at[lane] + RADIUS + 1, 0), profiles->length));
+        const CODE before = highest_in(row, 0, min(at[lane] - radius_of(profiles), profiles->length));
+        level[lane] = higher_of(before, highest_in(row, max(at[lane] + radius_of(profiles) + 1, 0), profiles->length));
     }
     return *(const codes_at *)level;
 #else
     codes highest = (codes)DARKEST;
     for (int k = 0; k < profiles->length; k++) {
         const codes x = sample_of(profiles, k);
-        const ints outside = int_mask(abs(k - peak) > RADIUS);
+        const ints outside = int_mask(abs(k - peak) > (uint)radius_of(profiles));
         highest = choose_codes(outside & int_mask(x > highest), x, highest);
     }
     return highest;

@@ -5,6 +5,8 @@
 
 #include "line/line_window.h"
 
+#define REACH (RADIUS + FIR_HALF)
+
 // Light of the sample at distance k from the peak.
 static inline reals over_at(const CODE *window, int k, CODE threshold) {
     return over_threshold(window_level(window, k + REACH), threshold);

@@ -31,7 +31,17 @@ typedef struct {
     int lane_stride;           // elements from one profile to the next
     int length;                // samples of a profile
     CODE threshold, saturation, minimum;
+    int radius;                // see radius_of()
 } Profiles;
+
+// Number of samples on either side of the peak in its window.
+static inline int radius_of(const Profiles *profiles) {
+#ifdef WINDOW_ARGUMENT
+    return profiles->radius;
+#else
+    return RADIUS;
+#endif
+}
 
 // Select by a 32-bit mask.
 #if defined(VECTOR_VARIANT) && CODE_BITS == 8

@@ -10,11 +10,39 @@
 // columns are read twice.
 static inline int group_start(int begin, int group, int columns) { return min(begin + group * WIDE, columns - WIDE); }
 
-// Prefetch the rows from `at` on, `width` columns of each.
-static inline Ahead prefetch_from(global const CODE *at, int width, int columns) {
-    const Ahead ahead = {at, at + width, columns - width, width};
-    return ahead;
+#ifndef ALONG_ROWS
+// Intel's compiler takes minutes for a fit with this walk.
+#if CODE_BITS == 8 && (defined(METHOD_CENTROID) || defined(METHOD_WINDOWED))
+#define STRIP_BY_ROWS
+// Largest of `steps` samples of each column of a whole strip, row by row: memory is read in sequence, and MAX_GROUPS
+// vectors fit the registers. Where a frame lies in the second-level cache it takes half the time of group after group.
+static inline void highest_of_strip(Highest *highest, global const CODE *at, int stride, int steps) {
+    Highest kept[MAX_GROUPS];
+    _Pragma("unroll") for (int i = 0; i < MAX_GROUPS; i++) kept[i] = darkest();
+    for (int k = 0; k < steps; k++, at += stride) {
+        _Pragma("unroll") for (int i = 0; i < MAX_GROUPS; i++) {
+            prefetch_line(at + i * WIDE + (long)STEPS * stride);
+            raise_highest(&kept[i], wide_load(at + i * WIDE));
+        }
+    }
+    _Pragma("unroll") for (int i = 0; i < MAX_GROUPS; i++) highest[i] = kept[i];
 }
+#endif
+
+// Largest of `steps` samples, at most STEPS, of each column of a strip; `at` is the first row.
+static inline void highest_of_block(Highest *highest, global const CODE *at, int begin, int groups, int columns,
+                                    int steps) {
+#ifdef STRIP_BY_ROWS
+    if (begin + MAX_STRIP <= columns && groups == MAX_GROUPS) {
+        highest_of_strip(highest, at + begin, columns, steps);
+        return;
+    }
+#endif
+    for (int i = 0; i < groups; i++) {
+        highest[i] = highest_of_steps(at + group_start(begin, i, columns), columns, steps);
+    }
+}
+#endif
 
 // The 16 profiles of quarter i % QUARTERS of group i / QUARTERS in a strip; `sample` is the first one's column.
 static inline Profiles profiles_of_quarter(const Profiles *frame, int begin, int i, int *sample) {
@@ -25,19 +53,29 @@ static inline Profiles profiles_of_quarter(const Profiles *frame, int begin, int
 }
 
 #if defined(METHOD_CENTROID) && !defined(ALONG_ROWS)
+// Add a block of at most STEPS rows to the sums of a group of columns, see add_steps(). `highest`: its largest samples.
+// Most blocks of a frame have no light: their sums are zero, and cost one instruction for each vector, not seven.
+static inline void add_block_of_rows(WideSums *sums, const Highest *highest, global const CODE *at, int stride,
+                                     int steps, int first, CODE threshold) {
+    if (any_greater(highest->level, threshold)) add_steps(sums, at, stride, steps, first, threshold);
+    else raise_peak(sums, highest);
+}
+
 // Read the columns begin <= column < end, at most MAX_STRIP: blocks of STEPS rows outside, groups of WIDE columns
 // inside.
 static inline void read_strip(const Profiles *frame, int begin, int end, constant LineTable *table, const Outputs *to,
                               ulong first) {
     WideSums sums[MAX_GROUPS];
+    Highest highest[MAX_GROUPS];
     const int columns = frame->stride, groups = (end - begin + WIDE - 1) / WIDE;
     for (int i = 0; i < groups; i++) clear_sums(&sums[i]);
     for (int row = 0; row < frame->length; row += STEPS) {
         global const CODE *at = frame->first + (long)row * columns;
         const int steps = min(STEPS, frame->length - row);
-        Ahead ahead = prefetch_from(at + (long)BLOCKS_AHEAD * STEPS * columns + begin, groups * WIDE, columns);
+        highest_of_block(highest, at, begin, groups, columns, steps);
         for (int i = 0; i < groups; i++) {
-            add_steps(&sums[i], at + group_start(begin, i, columns), columns, steps, row, frame->threshold, &ahead);
+            add_block_of_rows(&sums[i], &highest[i], at + group_start(begin, i, columns), columns, steps, row,
+                              frame->threshold);
         }
     }
     for (int i = 0; i < groups; i++) {
@@ -58,12 +96,14 @@ static inline void read_strip(const Profiles *frame, int begin, int end, constan
 
 #elif defined(METHOD_CENTROID)
 // Sum a row lane by lane in steps of WIDE samples, then combine the lanes and add the remainder of the row.
-static inline void read_row(global const CODE *row, int length, CODE threshold, RowSums *sums, Ahead *ahead) {
+static inline void read_row(global const CODE *row, int length, CODE threshold, RowSums *sums) {
     WideSums wide;
     clear_sums(&wide);
     const int blocks = length / WIDE;
     for (int block = 0; block < blocks; block += STEPS) {
-        add_steps(&wide, row + block * WIDE, WIDE, min(STEPS, blocks - block), block, threshold, ahead);
+        const int steps = min(STEPS, blocks - block);
+        for (int k = block; k < block + steps; k++) prefetch_line(row + k * WIDE + LANES * length);
+        add_steps(&wide, row + block * WIDE, WIDE, steps, block, threshold);
     }
     sum_lanes(&wide, sums);
     for (int k = blocks * WIDE; k < length; k++) add_sample(sums, row[k], k, threshold);
@@ -75,9 +115,7 @@ static inline void read_rows(const Profiles *profiles, constant LineTable *table
     RowSums rows[LANES];
     for (int i = 0; i < LANES; i++) {
         global const CODE *row = profiles->first + (long)i * profiles->lane_stride;
-        global const CODE *later = row + (long)BLOCKS_AHEAD * LANES * profiles->lane_stride;
-        Ahead ahead = prefetch_from(later, profiles->length, profiles->length);
-        read_row(row, profiles->length, profiles->threshold, &rows[i], &ahead);
+        read_row(row, profiles->length, profiles->threshold, &rows[i]);
     }
     Centroid centroid = row_centroid(rows);
 #ifdef NOISE
@@ -87,19 +125,20 @@ static inline void read_rows(const Profiles *profiles, constant LineTable *table
 }
 
 #elif !defined(ALONG_ROWS)
-// Finish the 16 columns of quarter i, given the level and the block of their peaks.
+// Finish the 16 columns of quarter i, given their peaks.
 static inline void finish_quarter(const Profiles *profiles, const WidePeak *wide, int i, int tall,
                                   constant LineTable *table, const Outputs *to, ulong first, int sample) {
     Peak peak;
-    peak.level = ((const codes *)&wide->level)[i];
+    peak.level = ((const codes *)&wide->highest.level)[i];
     peak.found = ~dark_lanes(profiles, peak.level);
     peak.not_finite = 0;
 #if CODE_BITS == 32
-    peak.not_finite = not_finite_lanes(to_reals(wide->poison));
+    peak.not_finite = not_finite_lanes(to_reals(wide->highest.poison));
 #endif
     const ints block = convert_int16(((const step_lanes16 *)&wide->block)[i]);
-    Span span = span_of(block * tall, peak.found, 0, tall - 1, profiles->length);
-    const int together = span.end - span.begin <= SPAN_LIMIT + tall;
+    peak.at = block * tall + convert_int16(((const step_lanes16 *)&wide->row)[i]);
+    const Span span = span_of(peak.at, peak.found, 0, 0, profiles->length);
+    const int together = span.end - span.begin <= span_limit(profiles);
     Place place;
     if (!any_int_lane(peak.found)) {
         peak.at = 0;
@@ -110,7 +149,6 @@ static inline void finish_quarter(const Profiles *profiles, const WidePeak *wide
         place.variance = 0;
 #endif
     } else {
-        peak.at = together ? first_row(profiles, peak.level, span) : first_row_apart(profiles, peak.level, block, tall);
 #ifdef METHOD_WINDOWED
         place = together ? centroid_together(profiles, &peak, table) : place_in_window(profiles, &peak, table);
 #else
@@ -124,16 +162,18 @@ static inline void finish_quarter(const Profiles *profiles, const WidePeak *wide
 static inline void read_strip(const Profiles *frame, int begin, int end, constant LineTable *table, const Outputs *to,
                               ulong first) {
     WidePeak peaks[MAX_GROUPS];
+    Highest highest[MAX_GROUPS];
     const int columns = frame->stride, groups = (end - begin + WIDE - 1) / WIDE;
-    // The number of a block fits a byte: blocks of taller frames have more rows.
+    // The number of a block fits a byte, and so does a row of it: blocks of taller frames have more rows, 140 at most.
     const int tall = STEPS * (frame->length / (255 * STEPS) + 1);
     for (int i = 0; i < groups; i++) clear_peak(&peaks[i]);
-    for (int row = 0; row < frame->length; row += tall) {
+    for (int row = 0; row < frame->length; row += STEPS) {
         global const CODE *at = frame->first + (long)row * columns;
-        const int steps = min(tall, frame->length - row);
-        Ahead ahead = prefetch_from(at + (long)BLOCKS_AHEAD * tall * columns + begin, groups * WIDE, columns);
+        const int steps = min(STEPS, frame->length - row), number = row / tall;
+        highest_of_block(highest, at, begin, groups, columns, steps);
         for (int i = 0; i < groups; i++) {
-            find_steps(&peaks[i], at + group_start(begin, i, columns), columns, steps, row / tall, &ahead);
+            find_steps(&peaks[i], &highest[i], at + group_start(begin, i, columns), columns, steps, number,
+                       row - number * tall, frame->threshold);
         }
     }
     for (int i = 0; i < groups * QUARTERS; i++) {
@@ -151,9 +191,7 @@ static inline void read_rows(const Profiles *profiles, constant LineTable *table
     CODE level[LANES];
     for (int i = 0; i < LANES; i++) {
         global const CODE *row = profiles->first + (long)i * profiles->lane_stride;
-        global const CODE *later = row + (long)BLOCKS_AHEAD * LANES * profiles->lane_stride;
-        Ahead ahead = prefetch_from(later, profiles->length, profiles->length);
-        find_in_row(row, profiles->length, &at[i], &level[i], &not_finite_mask[i], &ahead);
+        find_in_row(row, profiles->length, &at[i], &level[i], &not_finite_mask[i]);
     }
     Peak peak;
     peak.at = *(const ints_at *)at;

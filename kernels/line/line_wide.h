@@ -3,7 +3,7 @@
 //
 // Vectors of 32 and 64 elements are an extension of clang, which all CPU runtimes use; OpenCL C ends at 16. Only builds
 // under VECTOR_VARIANT include this file. A wide vector consists of QUARTERS groups of 16 lanes.
-// Build options: PREFETCH fetches memory ahead of its use.
+// Build options: PREFETCH fetches memory ahead of its use, see highest_of_steps().
 #ifndef LINE_WIDE_H
 #define LINE_WIDE_H
 
@@ -33,31 +33,61 @@ typedef wides wides_at __attribute__((aligned(sizeof(CODE))));
 
 static inline wides wide_load(global const CODE *at) { return *(global const wides_at *)at; }
 
-// Memory is prefetched into the second-level cache a few blocks ahead: the hardware does not predict a walk in blocks.
-#define BLOCKS_AHEAD 4
-static inline void prefetch_line(global const CODE *at) {
-#ifdef PREFETCH
-    __builtin_prefetch((const void *)(ulong)at, 0, 2);
+// Whether a lane of a is greater than the same lane of b.
+static inline int any_greater(wides a, wides b) {
+    const long8 whole = __builtin_astype(a > b, long8);
+    const long4 half_of_it = whole.lo | whole.hi;
+    const long2 quarter = half_of_it.lo | half_of_it.hi;
+    return (quarter.x | quarter.y) != 0;
+}
+
+// Largest sample so far of every lane.
+typedef struct {
+    wides level;
+#if CODE_BITS == 32
+    wides poison;  // 0, or NaN after a sample that is not finite: x * 0 is NaN for infinity and NaN
+#endif
+} Highest;
+
+static inline Highest darkest(void) {
+    Highest highest;
+    highest.level = DARKEST;
+#if CODE_BITS == 32
+    highest.poison = 0;
+#endif
+    return highest;
+}
+
+static inline void raise_highest(Highest *highest, wides x) {
+    highest->level = x > highest->level ? x : highest->level;
+#if CODE_BITS == 32
+    highest->poison += x * 0;
 #endif
 }
 
-// The next addresses of a block to prefetch, row by row in the order of memory, independent of the order of the
-// computation.
-typedef struct {
-    global const CODE *at, *end;  // next address, and end of the current row of the block
-    int gap, extent;              // elements from the end of a row to the next row, and elements of a row
-} Ahead;
+static inline void prefetch_line(global const CODE *at) {
+#ifdef PREFETCH
+    __builtin_prefetch((const void *)(ulong)at, 0, 3);
+#endif
+}
 
-static inline void prefetch_lines(Ahead *ahead) {
-    prefetch_line(ahead->at);
-    prefetch_line(ahead->at + WIDE);
-    prefetch_line(ahead->at + 2 * WIDE);
-    prefetch_line(ahead->at + 3 * WIDE);
-    ahead->at += 4 * WIDE;
-    if (ahead->at >= ahead->end) {
-        ahead->at = ahead->end + ahead->gap;
-        ahead->end = ahead->at + ahead->extent;
+// Largest of `steps` samples of every lane, at most STEPS: the first at `at`, the next ones `stride` elements further.
+//
+// A full block is unrolled, and each step prefetches the sample STEPS further on. The processor predicts the addresses
+// of each load instruction separately: here an instruction reads neighbouring memory from call to call, in a loop it
+// would jump from row to row. The prefetch gains 10 to 20 % where bytes come from memory and not from a cache; wider
+// samples lose by it.
+static inline Highest highest_of_steps(global const CODE *at, int stride, int steps) {
+    Highest highest = darkest();
+    if (steps == STEPS) {
+        _Pragma("unroll") for (int k = 0; k < STEPS; k++) {
+            prefetch_line(at + (long)(k + STEPS) * stride);
+            raise_highest(&highest, wide_load(at + (long)k * stride));
+        }
+    } else {
+        for (int k = 0; k < steps; k++) raise_highest(&highest, wide_load(at + (long)k * stride));
     }
+    return highest;
 }
 
 static inline int highest(int16 v) { return -lowest_lane(-v); }

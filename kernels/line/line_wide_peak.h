@@ -1,8 +1,8 @@
 // Strongest samples of WIDE profiles at once (every method but the centroid), and the windowed centroid of 16 of them.
 //
-// Down the columns the walk keeps two numbers per profile: the largest sample, and the number of the block of rows
-// where it first occurred. Then groups of 16 profiles are read again in the few rows around their peaks; together,
-// unless the peaks lie far apart.
+// Down the columns the walk keeps for each profile the largest sample, the block of rows where it first occurred, and
+// its row in the block: the row in a frame exceeds a byte. Then groups of 16 profiles are read again in the few rows
+// around their peaks; together, unless the peaks lie far apart.
 #ifndef LINE_WIDE_PEAK_H
 #define LINE_WIDE_PEAK_H
 
@@ -10,59 +10,44 @@
 #include "line/line_window.h"
 
 typedef struct {
-    wides level;
+    Highest highest;
     wide_steps block;  // number of the block in which the level first occurred
-#if CODE_BITS == 32
-    wides poison;  // 0, or NaN after a sample that is not finite: x * 0 is NaN for infinity and NaN
+#ifndef ALONG_ROWS
+    wide_steps row;  // its row in the block
 #endif
 } WidePeak;
 
 static inline void clear_peak(WidePeak *peak) {
-    peak->level = (wides)DARKEST;
+    peak->highest = darkest();
     peak->block = 0;
-#if CODE_BITS == 32
-    peak->poison = 0;
+#ifndef ALONG_ROWS
+    peak->row = 0;
 #endif
 }
 
-// Largest sample of one block, and a test for samples that are not finite.
-typedef struct {
-    wides level;
+#ifndef ALONG_ROWS
+// Add `steps` samples of every lane, of which `highest` are the largest: the first at `at`, the next ones `stride`
+// elements further. They are the samples `first`, first + 1, ... of block `number`. They are read again, now for the
+// row, where a lane has its largest sample so far, above the threshold: in few blocks of a frame.
+static inline void find_steps(WidePeak *peak, const Highest *highest, global const CODE *at, int stride, int steps,
+                              int number, int first, CODE threshold) {
+    const wides limit = threshold, before = peak->highest.level;
+    raise_highest(&peak->highest, highest->level);
 #if CODE_BITS == 32
-    wides poison;
+    peak->highest.poison += highest->poison;
 #endif
-} BlockPeak;
-
-static inline void find_step(BlockPeak *block, wides x) {
-    block->level = x > block->level ? x : block->level;
-#if CODE_BITS == 32
-    block->poison += x * 0;
-#endif
-}
-
-// Search a block of `steps` samples in every lane: the first at `at`, the next ones `stride` elements further.
-static inline void find_steps(WidePeak *peak, global const CODE *at, int stride, int steps, int number, Ahead *ahead) {
-    BlockPeak block;
-    block.level = (wides)DARKEST;
-#if CODE_BITS == 32
-    block.poison = peak->poison;
-#endif
-    int k = 0;
-    for (; k + 4 <= steps; k += 4) {
-        find_step(&block, wide_load(at));
-        find_step(&block, wide_load(at + stride));
-        find_step(&block, wide_load(at + 2 * (long)stride));
-        find_step(&block, wide_load(at + 3 * (long)stride));
-        at += 4 * (long)stride;
-        prefetch_lines(ahead);
+    if (!any_greater(peak->highest.level, before > limit ? before : limit)) return;
+    wides level = before;
+    wide_steps row = peak->row, index = (wide_steps)first;
+    for (int k = 0; k < steps; k++, at += stride, index += (wide_steps)1) {
+        const wides x = wide_load(at);
+        row = x > level ? index : row;
+        level = x > level ? x : level;
     }
-    for (; k < steps; k++, at += stride) find_step(&block, wide_load(at));
-    peak->block = block.level > peak->level ? (wide_steps)number : peak->block;
-    peak->level = block.level > peak->level ? block.level : peak->level;
-#if CODE_BITS == 32
-    peak->poison = block.poison;
-#endif
+    peak->row = row;
+    peak->block = level > before ? (wide_steps)number : peak->block;
 }
+#endif
 
 #define NO_INDEX (1 << 24)  // larger than any index
 
@@ -82,11 +67,11 @@ static inline Span span_of(ints rows, ints found, int before, int after, int len
 }
 
 // Rows of the span above which the lanes are processed one by one.
-#define SPAN_LIMIT (4 * WINDOW + 64)
+static inline int span_limit(const Profiles *profiles) { return 4 * window_length(profiles) + 64; }
 
-// Integer types of a row index and of the sums over a window: 16 bits where they suffice. Bytes and RADIUS <= 15: the
+// Integer types of a row index and of the sums over a window: 16 bits where they suffice. Bytes and MAX_RADIUS <= 15: the
 // total is at most 31 * 255 = 7905, the moment at most 255 * (1 + ... + 15) = 30600 < 2^15.
-#if CODE_BITS == 8 && RADIUS <= 15
+#if CODE_BITS == 8 && MAX_RADIUS <= 15
 typedef short16 indices;
 typedef short16 sums16;
 typedef ushort16 unsigned_indices;
@@ -115,31 +100,8 @@ typedef real16 squares16;
 #endif
 #endif
 
-// First row of the span whose sample equals the level, in every lane.
-static inline ints first_row(const Profiles *profiles, codes level, Span span) {
-    indices at = (indices)span.begin;
-    for (int k = span.end - 1; k >= span.begin; k--) {
-        at = to_indices(sample_of(profiles, k) == level) ? (indices)k : at;
-    }
-    return convert_int16(at);
-}
-
-// The same for lanes whose peaks lie far apart: each lane searches a separate block of `tall` rows.
-static inline ints first_row_apart(const Profiles *profiles, codes level, ints block, int tall) {
-    int first[LANES];
-    CODE levels[LANES];
-    *(ints_at *)first = block * tall;
-    *(codes_at *)levels = level;
-    for (int lane = 0; lane < LANES; lane++) {
-        const int end = min(first[lane] + tall, profiles->length) - 1;
-        global const CODE *profile = profiles->first + lane;
-        while (first[lane] < end && profile[(long)first[lane] * profiles->stride] != levels[lane]) first[lane]++;
-    }
-    return *(const ints_at *)first;
-}
-
 // Windowed centroid of all lanes over one span of rows. A mask selects the rows of the window of each lane. A signed
-// offset o is in the window where o + RADIUS <= 2 * RADIUS as unsigned numbers. Also count the flat top: the first
+// offset o is in the window where o + radius <= 2 radius as unsigned numbers. Also count the flat top: the first
 // offset past it is the smallest unsigned offset whose sample differs from the peak (negative offsets are large
 // unsigned numbers; an equal sample has all bits set by the OR with its mask).
 //
@@ -147,7 +109,7 @@ static inline ints first_row_apart(const Profiles *profiles, codes level, ints b
 // moment of the light exceeds 16 bits.
 static inline Place span_centroid(const Profiles *profiles, const Peak *peak, Span span, ints *top,
                                   constant LineTable *table) {
-    const indices at = to_indices(peak->at);
+    const indices at = to_indices(peak->at), radius = (indices)radius_of(profiles);
     sums16 total = 0, moment = 0;
     indices offset = (indices)span.begin - at;
     unsigned_indices past = as_unsigned((indices)-1);  // first offset past the flat top; -1: none yet
@@ -157,7 +119,7 @@ static inline Place span_centroid(const Profiles *profiles, const Peak *peak, Sp
 #endif
     for (int k = span.begin; k < span.end; k++) {
         const codes x = sample_of(profiles, k);
-        const indices inside = as_unsigned(offset + (indices)RADIUS) <= (unsigned_indices)(2 * RADIUS);
+        const indices inside = as_unsigned(offset + radius) <= as_unsigned(radius + radius);
 #if CODE_BITS == 32
         const sums16 v = choose_reals(inside, over_threshold(x, profiles->threshold), 0);
 #else
@@ -192,10 +154,10 @@ static inline Place span_centroid(const Profiles *profiles, const Peak *peak, Sp
 // Windowed centroid of all lanes over their common span; twice where a flat top moves a peak to its middle.
 static inline Place centroid_together(const Profiles *profiles, Peak *peak, constant LineTable *table) {
     ints top;
-    const Span span = span_of(peak->at, peak->found, RADIUS, RADIUS, profiles->length);
+    const Span span = span_of(peak->at, peak->found, radius_of(profiles), radius_of(profiles), profiles->length);
     const Place place = span_centroid(profiles, peak, span, &peak->top, table);
     if (!centre_top(profiles, peak)) return place;
-    const Span settled = span_of(peak->at, peak->found, RADIUS, RADIUS, profiles->length);
+    const Span settled = span_of(peak->at, peak->found, radius_of(profiles), radius_of(profiles), profiles->length);
     return span_centroid(profiles, peak, settled, &top, table);
 }
 
@@ -206,7 +168,7 @@ static inline Place centroid_together(const Profiles *profiles, Peak *peak, cons
 static inline int locate_in_row(global const CODE *row, CODE level, const WidePeak *peak) {
     int16 block = NO_INDEX, lane = NO_INDEX;
     for (int i = 0; i < QUARTERS; i++) {
-        const ints here = int_mask(((const codes *)&peak->level)[i] == (codes)level);
+        const ints here = int_mask(((const codes *)&peak->highest.level)[i] == (codes)level);
         block = min(block, choose_ints(here, convert_int16(((const step_lanes16 *)&peak->block)[i]), NO_INDEX));
     }
     const int first = lowest_lane(block) * WIDE;
@@ -219,28 +181,24 @@ static inline int locate_in_row(global const CODE *row, CODE level, const WidePe
 }
 
 // Find the largest sample of a row, its index, and whether a sample is not finite.
-static inline void find_in_row(global const CODE *row, int length, int *at, CODE *level, int *not_finite_mask,
-                               Ahead *ahead) {
+static inline void find_in_row(global const CODE *row, int length, int *at, CODE *level, int *not_finite_mask) {
     WidePeak peak;
     clear_peak(&peak);
     const int blocks = length / WIDE;
     for (int block = 0; block < blocks; block++) {
         const wides x = wide_load(row + block * WIDE);
-        if ((block & 3) == 0) prefetch_lines(ahead);
-        peak.block = x > peak.level ? (wide_steps)block : peak.block;
-        peak.level = x > peak.level ? x : peak.level;
-#if CODE_BITS == 32
-        peak.poison += x * 0;
-#endif
+        prefetch_line(row + block * WIDE + LANES * length);
+        peak.block = x > peak.highest.level ? (wide_steps)block : peak.block;
+        raise_highest(&peak.highest, x);
     }
-    codes levels = ((const codes *)&peak.level)[0];
-    for (int i = 1; i < QUARTERS; i++) levels = higher_of(((const codes *)&peak.level)[i], levels);
+    codes levels = ((const codes *)&peak.highest.level)[0];
+    for (int i = 1; i < QUARTERS; i++) levels = higher_of(((const codes *)&peak.highest.level)[i], levels);
     const CODE highest = highest_level(levels);
     *at = locate_in_row(row, highest, &peak);
     *level = highest;
     *not_finite_mask = 0;
 #if CODE_BITS == 32
-    *not_finite_mask = any(not_finite_lanes(to_reals(peak.poison))) ? -1 : 0;
+    *not_finite_mask = any(not_finite_lanes(to_reals(peak.highest.poison))) ? -1 : 0;
 #endif
     for (int k = blocks * WIDE; k < length; k++) {
         const CODE x = row[k];

@@ -50,12 +50,11 @@ static inline void add_step(BlockSums *block, wides x, wides threshold) {
 #endif
 }
 
-static inline void add_four_steps(BlockSums *block, global const CODE *at, int stride, wides threshold, Ahead *ahead) {
+static inline void add_four_steps(BlockSums *block, global const CODE *at, int stride, wides threshold) {
     add_step(block, wide_load(at), threshold);
     add_step(block, wide_load(at + stride), threshold);
     add_step(block, wide_load(at + 2 * stride), threshold);
     add_step(block, wide_load(at + 3 * stride), threshold);
-    prefetch_lines(ahead);
 }
 
 // Add the sums of 16 lanes of a block to element i: see line_centroid.h for the moment.
@@ -92,8 +91,7 @@ static inline void add_block(WideSums *sums, const BlockSums *block, int first, 
 
 // Add `steps` samples of every lane, at most STEPS: the first at `at`, the next ones `stride` elements further; `first`
 // is the index of the first sample. Full blocks are unrolled by hand, so that the sums stay in registers.
-static inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold,
-                             Ahead *ahead) {
+static inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold) {
     BlockSums block;
     block.s = block.s_odd = block.m = block.m_odd = 0;
 #ifdef COUNT_WIDTH
@@ -102,16 +100,21 @@ static inline void add_steps(WideSums *sums, global const CODE *at, int stride, 
     block.peak = sums->peak;
     const wides limit = threshold;
     if (steps == STEPS) {
-        add_four_steps(&block, at, stride, limit, ahead);
-        add_four_steps(&block, at + 4 * (long)stride, stride, limit, ahead);
-        add_four_steps(&block, at + 8 * (long)stride, stride, limit, ahead);
-        add_four_steps(&block, at + 12 * (long)stride, stride, limit, ahead);
-        add_four_steps(&block, at + 16 * (long)stride, stride, limit, ahead);
+        add_four_steps(&block, at, stride, limit);
+        add_four_steps(&block, at + 4 * (long)stride, stride, limit);
+        add_four_steps(&block, at + 8 * (long)stride, stride, limit);
+        add_four_steps(&block, at + 12 * (long)stride, stride, limit);
+        add_four_steps(&block, at + 16 * (long)stride, stride, limit);
     } else {
         for (int k = 0; k < steps; k++, at += stride) add_step(&block, wide_load(at), limit);
     }
     sums->peak = block.peak;
     add_block(sums, &block, first, steps);
+}
+
+// Raise the largest samples of the lanes.
+static inline void raise_peak(WideSums *sums, const Highest *highest) {
+    sums->peak = highest->level > sums->peak ? highest->level : sums->peak;
 }
 
 // Interleave even and odd lanes.

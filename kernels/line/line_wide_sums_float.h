@@ -9,13 +9,11 @@ static inline void clear_sums(WideSums *sums) { *sums = zero_sums(); }
 
 // Add `steps` samples of every lane: the first at `at`, the next ones `stride` elements further; `first` is the index
 // of the first sample.
-static inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold,
-                             Ahead *ahead) {
+static inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold) {
     reals s = 0, m = 0, width = 0, poison = sums->poison;
     codes peak = sums->peak;
     for (int k = 0; k < steps; k++, at += stride) {
         const float16 x = wide_load(at);
-        if ((k & 3) == 0) prefetch_lines(ahead);
         const reals v = over_threshold(x, threshold);
         peak = x > peak ? x : peak;
         poison += to_reals(x) * 0;
@@ -29,6 +27,12 @@ static inline void add_steps(WideSums *sums, global const CODE *at, int stride, 
     sums->peak = peak;
     sums->poison = poison;
     sums->width += width;
+}
+
+// Raise the largest samples of the lanes, and keep whether a sample is not finite.
+static inline void raise_peak(WideSums *sums, const Highest *highest) {
+    sums->peak = highest->level > sums->peak ? highest->level : sums->peak;
+    sums->poison += to_reals(highest->poison);
 }
 
 // Centroids of the 16 lanes of a quarter (a wide vector of floats has one).

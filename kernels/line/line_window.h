@@ -1,13 +1,16 @@
 // Window of samples around a peak, flat tops, and the centroid of the light in the window.
 //
 // A window holds the samples [peak - reach, peak + reach] of every lane: sample k of the lanes lies at window[k *
-// LANES]. Build options: RADIUS (samples on either side that count), COUNT_WIDTH (lengths of runs).
+// LANES]. Build options: RADIUS, MAX_RADIUS and WINDOW_ARGUMENT (line.cl), FIR_HALF (samples beyond the window that are
+// read), COUNT_WIDTH (lengths of runs).
 #ifndef LINE_WINDOW_H
 #define LINE_WINDOW_H
 
 #include "line/line_peak.h"
 
-#define WINDOW (2 * RADIUS + 1)
+#define MAX_REACH (MAX_RADIUS + FIR_HALF)
+
+static inline int window_length(const Profiles *profiles) { return 2 * radius_of(profiles) + 1; }
 
 typedef struct {
     reals at;     // position relative to the index of the peak
@@ -50,7 +53,7 @@ static inline void gather(const Profiles *profiles, ints peak, int reach, CODE *
         gather_lanes(profiles, peak, reach, window);
         return;
     }
-    CODE rows[(2 * REACH + SHIFTS) * LANES];
+    CODE rows[(2 * MAX_REACH + SHIFTS) * LANES];
     const ints shift = peak - first;
     const int copied = height + last - first;
     for (int k = 0; k < copied; k++) {
@@ -82,7 +85,7 @@ static inline void follow_tops(const Profiles *profiles, Peak *peak) {
     *(ints_at *)top = peak->top & peak->found;
     *(codes_at *)level = peak->level;
     for (int lane = 0; lane < LANES; lane++) {
-        if (top[lane] <= RADIUS) continue;
+        if (top[lane] <= radius_of(profiles)) continue;
         global const CODE *profile = profiles->first + (long)lane * profiles->lane_stride;
         int end = at[lane] + top[lane];
         while (end < profiles->length && profile[(long)end * profiles->stride] == level[lane]) end++;
@@ -93,7 +96,7 @@ static inline void follow_tops(const Profiles *profiles, Peak *peak) {
 
 // Move peaks from the first sample of their flat top to its middle; return whether a peak moved.
 static inline int centre_top(const Profiles *profiles, Peak *peak) {
-    if (any_int_lane(int_mask(peak->top > RADIUS) & peak->found)) follow_tops(profiles, peak);
+    if (any_int_lane(int_mask(peak->top > radius_of(profiles)) & peak->found)) follow_tops(profiles, peak);
     const ints shift = ((peak->top - 1) >> 1) & peak->found;
     peak->at += shift;
     return any_int_lane(int_mask(shift > 0));
@@ -104,7 +107,7 @@ static inline void gather_centred(const Profiles *profiles, Peak *peak, int reac
     gather(profiles, peak->at, reach, window);
     ints equal = -1;
     peak->top = 0;
-    for (int k = 0; k <= RADIUS; k++) {
+    for (int k = 0; k <= radius_of(profiles); k++) {
         equal &= int_mask(window_level(window, k + reach) == peak->level) & int_mask(peak->at + k < profiles->length);
         peak->top -= equal;  // a mask is -1
     }
@@ -114,14 +117,14 @@ static inline void gather_centred(const Profiles *profiles, Peak *peak, int reac
 // Lanes where the border cuts the window, or cuts a flat top wider than the window.
 static inline ints cut_lanes(const Profiles *profiles, const Peak *peak) {
     const ints begin = peak->at - ((peak->top + 1) >> 1), end = peak->at + (peak->top >> 1) + 1;
-    return int_mask(peak->at < RADIUS) | int_mask(peak->at + RADIUS >= profiles->length) |
-           (int_mask(peak->top > WINDOW) & (int_mask(begin < 0) | int_mask(end >= profiles->length)));
+    return int_mask(peak->at < radius_of(profiles)) | int_mask(peak->at + radius_of(profiles) >= profiles->length) |
+           (int_mask(peak->top > window_length(profiles)) & (int_mask(begin < 0) | int_mask(end >= profiles->length)));
 }
 
 // Replace the position by the middle of the flat top, with AMBIGUOUS, where the top is wider than the window: the
 // window then holds no slope to measure.
-static inline Place middle_of_wide_top(const Peak *peak, Place place) {
-    const ints wide = int_mask(peak->top > WINDOW) & peak->found;
+static inline Place middle_of_wide_top(const Profiles *profiles, const Peak *peak, Place place) {
+    const ints wide = int_mask(peak->top > window_length(profiles)) & peak->found;
     place.at = choose_reals(wide, to_reals((peak->top - 1) & 1) / 2, place.at);
     place.flags = choose_ints(wide, STATUS_AMBIGUOUS, place.flags);
 #ifdef NOISE
@@ -151,7 +154,7 @@ static inline Place window_centroid(const CODE *window, int reach, const Profile
 #ifdef NOISE
     reals square = 0, lit_count = 0, lit_moment = 0, lit_square = 0;
 #endif
-    for (int k = -RADIUS; k <= RADIUS; k++) {
+    for (int k = -radius_of(profiles); k <= radius_of(profiles); k++) {
         const ints inside = int_mask(as_uints(peak->at + k) < (uints)profiles->length);
         const reals v = choose_reals(inside, over_threshold(window_level(window, k + reach), profiles->threshold), 0);
         total += v;

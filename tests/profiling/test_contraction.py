@@ -56,7 +56,7 @@ def test_zero_of_the_cut_is_no_constant(tmp_path: Path) -> None:
 def test_sums_of_float_profiles_contract_only_where_it_is_harmless(tmp_path: Path) -> None:
     """``steps * s - m`` may be one rounding less; the product in the two-sum stays rounded."""
     defines = type_defines("CODE", "float32", 4, 8, 16)
-    defines |= {"CODE_BITS": 32, "METHOD_CENTROID": None, "RADIUS": 1, "REACH": 1, "FIR_HALF": 0}
+    defines |= {"CODE_BITS": 32, "METHOD_CENTROID": None, "RADIUS": 1, "MAX_RADIUS": 1, "FIR_HALF": 0}
     kernel = """
         kernel void one(global Sums *x, int first, int steps) {
             Sums sums = x[0];

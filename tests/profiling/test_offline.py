@@ -32,6 +32,7 @@ _OF_CPUS = {
     "PREFETCH",
     "POCL_DEVICE_ADDRESS_BITS",
     "WORD_PAIRS",
+    "WINDOW_ARGUMENT",
 }
 PTXAS_LOG = """\
 ptxas info    : 0 bytes gmem

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from canary import Guarded
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
-from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.line import LineReadout, Method
 from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.reference.line import (
@@ -35,7 +35,7 @@ from tiers import variants_of
 TOP = {"uint8": 180.0, "uint16": 40_000.0, "float32": 100.0}
 LEVEL = {"uint8": 20, "uint16": 4000, "float32": 8.5}
 VARIANTS = ("vector", "work_item")
-# The compiler knows the window: each value is a kernel more to compile. Tests take this one unless they are about it.
+# Most builds know the window: each value is a kernel more to compile. Tests take this one unless they are about it.
 WINDOW = 6
 EVERY = list(itertools.product(TOP, ("columns", "rows"), VARIANTS))
 
@@ -561,6 +561,54 @@ def test_tall_frames(device, rng, variant):
     frame[rng.integers(20, 8980, 70), np.arange(70)] = 200
     parameters = {"threshold": 5, "window": 4}
     assert_same(LineReadout(variant=variant, **parameters)(frame, device=device), read_lines(frame, **parameters))
+
+
+@pytest.mark.parametrize("dtype", TOP)
+@pytest.mark.parametrize("method", ["centroid", "windowed"])
+def test_light_of_a_single_sample_counts(device: Device, method: Method, dtype: str) -> None:
+    """Blocks of rows without light are skipped: a sample just above the threshold, in each row of several blocks.
+
+    The frame has a whole strip of columns and a part of one.
+    """
+    columns, level = np.arange(1090), LEVEL[dtype]
+    rows = 1 + columns % 65
+    frame = np.full((67, len(columns)), level, dtype)
+    frame[rows, columns] += 1
+    frame[40] = np.where(rows == 40, level + 1, 0)  # the block also has dark samples
+    outputs = ("position", "peak", "width", "total", "status")
+    readout = LineReadout(method=method, threshold=level, window=1, outputs=outputs)
+    reading = readout(frame, device=device)
+    np.testing.assert_array_equal(reading.position, rows)
+    np.testing.assert_array_equal(reading.status, 0)
+    for name in ("total", "width"):
+        np.testing.assert_array_equal(getattr(reading, name), 1.0, err_msg=name)
+    np.testing.assert_array_equal(reading.peak, np.dtype(dtype).type(level + 1))
+
+
+@pytest.mark.vectors
+def test_another_window_is_no_other_build(device: Device, rng: np.random.Generator) -> None:
+    """In the vector variant down the columns the window is an argument; up to 15 samples the sums have 16 bits."""
+    frame = line_frames(rng, "uint8", (90, 64), sigma=4.0)
+    builds = {}
+    for window in (3, 15, 16, 40):
+        readout = LineReadout(threshold=20, window=window, variant="vector")
+        builds[window] = readout.launch(device, frame.shape, frame.dtype).defines
+        assert_same(readout(frame, device=device), read_lines(frame, threshold=20, window=window))
+    assert builds[3] == builds[15] != builds[16] == builds[40]
+
+
+@pytest.mark.vectors
+def test_a_small_frame_has_one_work_item(device: Device) -> None:
+    """So Intel's runtime runs the launch in the calling thread."""
+    launches = {
+        shape: LineReadout(variant="vector").launch(device, shape, np.dtype(np.uint8))
+        for shape in ((512, 1024), (1024, 1024), (2, 64, 64))
+    }
+    assert launches[512, 1024].global_size == (1, 1)
+    assert launches[1024, 1024].global_size[0] > 1
+    assert launches[2, 64, 64].global_size[1] == 2
+    fit = LineReadout(method="ml", variant="vector").launch(device, (512, 1024), np.dtype(np.uint8))
+    assert fit.global_size[0] > 1
 
 
 @pytest.mark.parametrize(

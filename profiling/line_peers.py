@@ -11,6 +11,7 @@ import numpy as np
 
 _STRIP = 512  # columns that a task reads
 _BLOCK = 22  # rows whose sums of bytes, and sums of their running sums, fit 16 bits
+_CHUNK = 128  # columns of a block that are summed if one of them has light
 _LANES = 16  # columns that a task fits together
 _F = np.float32
 _FAST = {"contract", "reassoc", "nsz", "arcp"}
@@ -84,6 +85,57 @@ def _blocks_of_strip(frame, first, n, threshold, sums, part, tops):
     for r in range(whole, rows):
         _add_row(frame[r, first : first + n], part, tops, threshold)
     _flush(sums, part, n, rows - whole)
+
+
+@numba.njit(error_model="numpy")
+def _highest_of_block(flat, at, pitch, n, highest, tops):
+    for c in range(np.uint32(n)):
+        top = flat[at + np.uint64(c)]
+        for k in range(1, _BLOCK):
+            top = max(top, flat[at + np.uint64(k) * pitch + np.uint64(c)])
+        highest[c] = top
+    for c in range(np.uint32(n)):
+        tops[c] = max(tops[c], highest[c])
+
+
+@numba.njit(error_model="numpy")
+def _largest(line):
+    top = np.uint8(0)
+    for c in range(np.uint32(line.size)):
+        top = max(top, line[c])
+    return top
+
+
+@numba.njit(error_model="numpy")
+def _add_lit_block(flat, at, pitch, n, threshold, later, sums):
+    """Add a block after which `later` rows follow: running totals of each of them contain its sum."""
+    for c in range(np.uint32(n)):
+        s, m = np.uint16(0), np.uint16(0)
+        for k in range(_BLOCK):
+            x = flat[at + np.uint64(k) * pitch + np.uint64(c)]
+            s = np.uint16(s + np.uint16(max(x, threshold) - threshold))
+            m = np.uint16(m + s)
+        sums[np.uint32(_STRIP) + c] += np.uint32(later) * np.uint32(s) + np.uint32(m)
+        sums[c] += np.uint32(s)
+
+
+@numba.njit(error_model="numpy")
+def _lit_blocks_of_strip(frame, first, n, threshold, sums, part, tops):
+    """Find the largest samples of blocks of rows, and sum only the parts of them that have light."""
+    rows, pitch = frame.shape
+    flat, whole = frame.reshape(-1), rows // _BLOCK * _BLOCK
+    highest = np.zeros(_STRIP, np.uint8)
+    for r in range(0, whole, _BLOCK):
+        at = np.uint64(r * pitch + first)
+        _highest_of_block(flat, at, np.uint64(pitch), n, highest, tops)
+        for c in range(0, n, _CHUNK):
+            width = min(_CHUNK, n - c)
+            if _largest(highest[c : c + width]) > threshold:
+                later = rows - r - _BLOCK
+                _add_lit_block(flat, at + np.uint64(c), np.uint64(pitch), width, threshold, later, sums[c:])
+    for r in range(whole, rows):
+        _add_row(frame[r, first : first + n], part, tops, threshold)
+    _flush(sums, part, n, 0)
 
 
 @numba.njit(error_model="numpy")
@@ -568,6 +620,7 @@ def expert_forms(method: str, along: str, count: int) -> dict[str, Any]:
         if method == "centroid":
             forms["rows" + name] = _centroid_form(_rows_of_strip, threads)
             forms["blocks" + name] = _centroid_form(_blocks_of_strip, threads)
+            forms["lit-blocks" + name] = _centroid_form(_lit_blocks_of_strip, threads)
         else:
             forms["rows" + name] = _peak_form(_peaks_by_rows, _COLUMNS[method], threads)
             forms["blocks" + name] = _peak_form(_peaks_by_blocks, _COLUMNS[method], threads)

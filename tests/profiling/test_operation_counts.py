@@ -191,7 +191,8 @@ def test_undistorted_points():
     (f, _, cx), (_, _, cy), _ = camera.matrix
     table, series = np.array([cx, cy, f, *camera.distortion[:5], 1.0 / f], F), np.ones(14, F)
     pairs = points.reshape(-1).view(np.complex64)
-    found = operations_of(undistort_points._one_thread, pairs, table, series, (0, 0), np.empty_like(pairs))
+    out = np.empty_like(pairs), np.empty(len(pairs), np.uint8)
+    found = operations_of(undistort_points._one_thread, pairs, table, F(1.0), series, (0, 0), *out)
     agree(10 * undistort_points.undistort_flops(camera, F), found)
 
 

@@ -11,8 +11,12 @@
 //          size, angle. EITHER_POLARITY: fiducials may be brighter or darker than the background. MATCH_IMAGE: refine by
 //          grey levels. SPOKES: number of rulers, even; opposite rulers are SPOKES / 2 apart. PADDED_SPOKES: SPOKES
 //          rounded up to whole vectors.
-// Variants: vector: a work-item processes `each` fiducials, 16 rulers in a vector; work-item: a work-group of
-//          RULER_GROUP items per fiducial, one ruler after the other.
+// Variants: vector: a work-item processes `each` fiducials, 16 rulers or pixels in a vector; work-item: a work-group of
+//          RULER_GROUP items per fiducial. The items share the samples of RULERS_PER_GROUP rulers at a time
+//          (ruler_group.h), the start shapes, the edges and the pixels, and add up their sums in local memory (group.h).
+#ifndef VECTOR_VARIANT
+#define GROUP_PER_PROBLEM
+#endif
 #include "blob/blob_fit.h"
 #include "blob/blob_grey.h"
 #include "blob/blob_start.h"
@@ -30,6 +34,11 @@
 #define PLACE 4
 #endif
 
+// Whether a shape is further than `search` from the nominal position.
+static inline int is_beyond(blob_shape shape, real search) {
+    return shape.x * shape.x + shape.y * shape.y > search * search;
+}
+
 kernel void find_blobs(global const CODE *restrict image, global const real *restrict places, global real *restrict x,
                        global real *restrict y, global real *restrict shift, global real *restrict size,
                        global real *restrict angle, global real *restrict covariance, global real *restrict residual,
@@ -45,19 +54,22 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
                                 ruler_table + 3 * PADDED_SPOKES,
                                 ruler_table + 4 * PADDED_SPOKES,
                                 ruler_table + 5 * PADDED_SPOKES};
+    GROUP_SPACE blob_edges edges;
+    GROUP_SPACE blob_fit fit;
+    GROUP_SPACE blob_quality quality;
+    GROUP_SPACE real distances[PADDED_SPOKES]; // of the edges from the shape
+    GROUP_SPACE blob_room room;
+#ifdef MATCH_IMAGE
+    GROUP_SPACE blob_hidden hidden;
+    GROUP_SPACE blob_match match;
+#endif
 #ifdef VECTOR_VARIANT
     const uint first = get_global_id(0) * each, end = min(first + each, count);
-    const int mine = 1;
 #else
-    local ruler_memory rulers;
-    local blob_shape shared_shape;
-    local int shared_done;
-    local blob_edges shared;
     const uint first = get_group_id(0), end = first + 1;
-    const int mine = get_local_id(0) == 0;
 #endif
-    blob_edges edges;
-    for (uint n = first; n < end; n++) {
+    uint n = first;
+    do {
         global const real *place = places + (ulong)n * PLACE;
 #ifdef ROUND
         const blob_shape nominal = {0, 0, place[2], 0};
@@ -66,102 +78,95 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
 #endif
         const int bad = not_finite(place[0]) | not_finite(place[1]) | not_finite(nominal.size) |
                         not_finite(nominal.angle) | !(nominal.size > 0);
-        blob_shape shape = nominal;
-        real variance = 0, noise = 0, scale = 0;
-        int found = 0, agreed = 0;
-        for (int pass = 0; pass < passes && !bad; pass++) {
-            const blob_shape from = shape;
-            int done = 1;
-#ifdef VECTOR_VARIANT
-            measure(image, rows, columns, place[0], place[1], from, from.angle, table, layout, &edges);
-#else
-            measure(image, rows, columns, place[0], place[1], from, from.angle, table, layout, &shared, &rulers);
-#endif
-            if (mine) {
-#ifndef VECTOR_VARIANT
-                edges = shared;
-#endif
-                const real cosine = cos(nominal.angle), sine = sin(nominal.angle);
-                found = keep_edges(&edges, layout, nominal, cosine, sine, search, &noise, &variance);
-                if (pass == 0 && found >= least) shape = start_of(&edges, layout, nominal, START_REACH);
-                agreed = found >= least && fit_shape(&edges, layout, 2 * START_REACH, noise, across, &shape, &variance,
-                                                     &scale);
-                const real dx = shape.x - from.x, dy = shape.y - from.y, ds = shape.size - from.size;
-                const real da = (shape.angle - from.angle) * from.size;
-#ifndef VECTOR_VARIANT
-                shared = edges;
-#endif
-                done = !agreed || dx * dx + dy * dy + ds * ds + da * da < STILL * STILL;
+        if (GROUP_ITEM == 0) fit.shape = nominal, fit.is_done = 0;
+        group_barrier();
+        blob_count counted = {0, 0, 0, 0, 0};
+        real scale = 0;
+        int pass = 0;
+        do {
+            const blob_shape from = fit.shape;
+            measure(image, rows, columns, place[0], place[1], from, table, layout, &edges, &room);
+            counted = keep_edges(&edges, layout, nominal, search, &room);
+            const int is_enough = !bad && counted.found >= least;
+            if (GROUP_ITEM == 0) {
+                fit.blur = counted.blur;
+                fit.is_regular = is_enough;
             }
-#ifndef VECTOR_VARIANT
-            barrier(CLK_LOCAL_MEM_FENCE);
-            if (mine) shared_shape = shape, shared_done = done;
-            barrier(CLK_LOCAL_MEM_FENCE);
-            shape = shared_shape, done = shared_done;
-#endif
-            if (done) break;
+            group_barrier();
+            start_of(&fit.shape, &edges, layout, is_enough && pass == 0, START_REACH, &room);
+            scale = fit_shape(&fit, &edges, layout, 2 * START_REACH, counted.noise, across, distances, &room);
+            if (GROUP_ITEM == 0) {
+                const real dx = fit.shape.x - from.x, dy = fit.shape.y - from.y, ds = fit.shape.size - from.size;
+                const real da = (fit.shape.angle - from.angle) * from.size;
+                fit.is_done = !fit.is_regular || dx * dx + dy * dy + ds * ds + da * da < STILL * STILL;
+            }
+            group_barrier();
+        } while (++pass < passes && !fit.is_done);
+        quality_of(&quality, &edges, layout, fit.shape, scale, bent_by(fit.blur, across), overlap, &room);
+        if (GROUP_ITEM == 0) {
+            int what = bad ? STATUS_NOT_FINITE : 0;
+            if (!bad) {
+                what |= SPOKES - counted.outside < least ? STATUS_OUT_OF_RANGE : 0;
+                what |= SPOKES - counted.broken < least ? STATUS_NOT_FINITE : 0;
+                if (!what && counted.found < least) what = STATUS_LOW_SIGNAL;
+                if (!what && (!fit.is_regular || quality.inliers < least || !quality.regular))
+                    what = STATUS_AMBIGUOUS;
+                if (!what && is_beyond(fit.shape, search)) what = STATUS_OUT_OF_RANGE;
+            }
+            fit.status = what;
         }
-        if (!mine) continue;
-#ifndef VECTOR_VARIANT
-        edges = shared;
-#endif
-#ifdef ROUND
-        const real bent = variance + across;
-#else
-        const real bent = 0;
-#endif
-        blob_quality quality;
-        int what = bad ? STATUS_NOT_FINITE : 0;
-        if (!bad) {
-            what |= SPOKES - edges.outside < least ? STATUS_OUT_OF_RANGE : 0;
-            what |= SPOKES - edges.broken < least ? STATUS_NOT_FINITE : 0;
-            if (!what && found < least) what = STATUS_LOW_SIGNAL;
-            if (!what && !agreed) what = STATUS_AMBIGUOUS;
-        }
-        if (!what) {
-            quality = quality_of(&edges, layout, shape, scale, bent, overlap);
-            if (quality.inliers < least || !quality.regular) what = STATUS_AMBIGUOUS;
-            else if (shape.x * shape.x + shape.y * shape.y > search * search) what = STATUS_OUT_OF_RANGE;
-        }
+        group_barrier();
 #ifdef MATCH_IMAGE
-        if (!what) {
-            blob_grey grey = {0, quality.contrast, sqrt(fmax(variance - BILINEAR, SHARPEST * SHARPEST))};
-            grey.background = background_of(image, rows, columns, place[0], place[1], shape, &edges, quality.weights,
-                                            layout, grey.blur);
-            blob_hidden hidden;
-            hide(shape, quality.weights, layout, spacing, grey.blur, &hidden);
-            if (!match(image, rows, columns, place[0], place[1], pixel_noise, extent, &hidden, &shape, &grey,
-                       quality.covariance))
-                what = STATUS_AMBIGUOUS;
-            else if (shape.x * shape.x + shape.y * shape.y > search * search) what = STATUS_OUT_OF_RANGE;
-            quality.contrast = grey.contrast;
-            variance = grey.blur * grey.blur;
+        const real blur_of_edges = sqrt(fmax(fit.blur - BILINEAR, SHARPEST * SHARPEST));
+        const real background = background_of(image, rows, columns, place[0], place[1], fit.shape, &edges,
+                                              quality.weights, layout, blur_of_edges, &room);
+        if (GROUP_ITEM == 0) {
+            match.first = match.shape = fit.shape;
+            match.grey = (blob_grey){background, quality.contrast, blur_of_edges};
+            match.slope_x = match.slope_y = 0;
+            match.state = fit.status ? MATCH_FAILS : MATCH_RUNS;
+            hide(fit.shape, quality.weights, layout, spacing, blur_of_edges, &hidden);
         }
+        group_barrier();
+        match_image(&match, image, rows, columns, place[0], place[1], pixel_noise, extent, &hidden, &room);
+        if (GROUP_ITEM == 0 && !fit.status) {
+            fit.shape = match.shape;
+            fit.blur = match.grey.blur * match.grey.blur;
+            quality.contrast = match.grey.contrast;
+            for (int j = 0; j < FREEDOMS; j++)
+                for (int k = 0; k < FREEDOMS; k++) quality.covariance[j][k] = match.covariance[j][k];
+            if (match.state == MATCH_FAILS) fit.status = STATUS_AMBIGUOUS;
+            else if (is_beyond(fit.shape, search)) fit.status = STATUS_OUT_OF_RANGE;
+        }
+        group_barrier();
 #endif
-        const int good = !what;
-        x[n] = good ? place[0] + shape.x : REAL_NAN;
-        y[n] = good ? place[1] + shape.y : REAL_NAN;
-        shift[2 * n] = good ? shape.x : REAL_NAN;
-        shift[2 * n + 1] = good ? shape.y : REAL_NAN;
-        size[n] = good ? shape.size : REAL_NAN;
+        const blob_shape shape = fit.shape;
+        const int good = !fit.status;
+        real to_x, to_y;
+        const real middle_x = place[0] + shape.x, middle_y = place[1] + shape.y, width = sqrt(fit.blur);
+        const int heavy = gravity_of(image, rows, columns, middle_x, middle_y,
+                                     shape.size * extent + (real)2.5f * width + 1, good, &room, &to_x, &to_y);
+        if (GROUP_ITEM == 0) {
+            x[n] = good ? middle_x : REAL_NAN;
+            y[n] = good ? middle_y : REAL_NAN;
+            shift[2 * n] = good ? shape.x : REAL_NAN;
+            shift[2 * n + 1] = good ? shape.y : REAL_NAN;
+            size[n] = good ? shape.size : REAL_NAN;
 #ifndef ROUND
-        angle[n] = good ? shape.angle : REAL_NAN;
+            angle[n] = good ? shape.angle : REAL_NAN;
 #endif
-        for (int j = 0; j < FREEDOMS; j++)
-            for (int k = 0; k < FREEDOMS; k++)
-                covariance[((ulong)n * FREEDOMS + j) * FREEDOMS + k] = good ? quality.covariance[j][k] : REAL_NAN;
-        residual[n] = good ? quality.residual : REAL_NAN;
-        inliers[n] = good ? quality.inliers : 0;
-        symmetry[n] = good ? quality.symmetry : REAL_NAN;
-        distance[n] = good ? sqrt(shape.x * shape.x + shape.y * shape.y) : REAL_NAN;
-        contrast[n] = good ? quality.contrast : REAL_NAN;
-        blur[n] = good ? sqrt(variance) : REAL_NAN;
-        real to_x = 0, to_y = 0;
-        const real middle_x = place[0] + shape.x, middle_y = place[1] + shape.y;
-        const int heavy = good && gravity_of(image, rows, columns, middle_x, middle_y,
-                                             shape.size * extent + (real)2.5f * sqrt(variance) + 1, &to_x, &to_y);
-        gravity_x[n] = heavy ? middle_x + to_x : REAL_NAN;
-        gravity_y[n] = heavy ? middle_y + to_y : REAL_NAN;
-        status[n] = (uchar)(what | (good && quality.saturated ? STATUS_SATURATED : 0));
-    }
+            for (int j = 0; j < FREEDOMS; j++)
+                for (int k = 0; k < FREEDOMS; k++)
+                    covariance[((ulong)n * FREEDOMS + j) * FREEDOMS + k] = good ? quality.covariance[j][k] : REAL_NAN;
+            residual[n] = good ? quality.residual : REAL_NAN;
+            inliers[n] = good ? quality.inliers : 0;
+            symmetry[n] = good ? quality.symmetry : REAL_NAN;
+            distance[n] = good ? sqrt(shape.x * shape.x + shape.y * shape.y) : REAL_NAN;
+            contrast[n] = good ? quality.contrast : REAL_NAN;
+            blur[n] = good ? width : REAL_NAN;
+            gravity_x[n] = heavy ? middle_x + to_x : REAL_NAN;
+            gravity_y[n] = heavy ? middle_y + to_y : REAL_NAN;
+            status[n] = (uchar)(fit.status | (good && quality.saturated ? STATUS_SATURATED : 0));
+        }
+    } while (++n < end);
 }

@@ -16,156 +16,217 @@
 #define START_REACH (3 * LEAST_REACH) // larger: start shapes have the nominal angle
 #endif
 
-// Robust scale of the residuals within reach: their median absolute deviation.
-static inline real scale_of(private const blob_edges *edges, blob_layout layout, blob_shape shape, real bent, real reach) {
-    const real cosine = cos(shape.angle), sine = sin(shape.angle);
-    real distances[PADDED_SPOKES];
-    masks inside = 0;
-    for (int i = 0; i < PADDED_SPOKES; i += LANES) {
-        const reals distance = FABS(equation_of(edges, i, layout, shape, cosine, sine, bent).residual);
-        const masks near = mask_of(READ(edges->there, i) > (reals)0) & mask_of(distance <= (reals)reach);
-        inside -= near;
-        *(private reals_at *)(distances + i) = near ? distance : (reals)INFINITY;
-    }
-    const int within = (int)sum_of(LANED(convert_real)(inside));
-    bits found = 0;
-    for (int bit = BITS_BELOW_SIGN - 1; bit >= BITS_TO_ONE_PERCENT; bit--) {
-        const bits next = found | ((bits)1 << bit);
-        masks below = 0;
-        for (int i = 0; i < PADDED_SPOKES; i += LANES) below -= mask_of(as_masks(READ(distances, i)) < (masks)next);
-        found = (int)sum_of(LANED(convert_real)(below)) > within / 2 ? found : next;
-    }
-    return MAD_TO_SIGMA * (1 + FEW_FITTED / fmax((real)(within - FREEDOMS), (real)1)) * as_real(found);
+// State of the fit to the edges; in a group item 0 changes it.
+typedef struct {
+    blob_shape shape;
+    real blur;      // mean variance of the blur of the edges [px^2]
+    int is_regular; // whether the last step was possible
+    int is_done;    // whether the rulers are well placed, or no fit was possible
+    int status;
+} blob_fit;
+
+// Variance that moves a round edge (equation_of).
+static inline real bent_by(real blur, real across) {
+#ifdef ROUND
+    return blur + across;
+#else
+    return 0;
+#endif
 }
 
-// One Gauss-Newton step of the reweighted fit; return 0 if it is singular.
-static inline int fit_step(private const blob_edges *edges, blob_layout layout, real scale, private blob_shape *shape,
-                    private real *blur, real across) {
-    const real cosine = cos(shape->angle), sine = sin(shape->angle), per_scale = 1 / scale;
-#ifdef ROUND
-    const real bent = *blur + across;
-#else
-    const real bent = 0;
-#endif
-    reals matrix[TRIANGLE], right[FREEDOMS], step[FREEDOMS], weights = 0, blurs = 0;
-    for (int j = 0; j < TRIANGLE; j++) matrix[j] = 0;
-    for (int j = 0; j < FREEDOMS; j++) right[j] = 0;
-    for (int i = 0; i < PADDED_SPOKES; i += LANES) {
-        const blob_equation equation = equation_of(edges, i, layout, *shape, cosine, sine, bent);
-        const reals weight = READ(edges->there, i) * loss_weight(equation.residual * (reals)per_scale);
-        for (int j = 0; j < FREEDOMS; j++) {
-            const reals weighted = weight * equation.row[j];
-            right[j] += weighted * equation.residual;
-            for (int k = 0; k <= j; k++) matrix[CELL(j, k)] += weighted * equation.row[k];
+// Return the robust scale of the residuals within reach: their median absolute deviation.
+INLINE real scale_of(GROUP_SPACE const blob_edges *edges, blob_layout layout, blob_shape shape, real bent, real reach,
+                     GROUP_SPACE real *distances, GROUP_SPACE blob_room *room) {
+    const real cosine = cos(shape.angle), sine = sin(shape.angle);
+    reals inside;
+    EACH_PART(part) {
+        masks counted = 0;
+        for (int i = part * LANES; i < PADDED_SPOKES; i += PARTS * LANES) {
+            const reals distance = FABS(equation_of(edges, i, layout, shape, cosine, sine, bent).residual);
+            const masks near = mask_of(AT(edges->there, i) > (reals)0) & mask_of(distance <= (reals)reach);
+            counted -= near;
+            AT(distances, i) = near ? distance : (reals)INFINITY;
         }
-        weights += weight;
-        blurs += weight * READ(edges->blur, i);
+        inside = LANED(convert_real)(counted);
+        group_put(&inside, 1, part, room->sums);
     }
-    for (int j = 0; j < TRIANGLE; j++) matrix[j] = (reals)sum_of(matrix[j]);
-    for (int j = 0; j < FREEDOMS; j++) right[j] = (reals)sum_of(right[j]);
-    if (any_lane(factored(matrix))) return 0;
-    solved(matrix, right, step);
-    shape->x += FIRST(step[0]);
-    shape->y += FIRST(step[1]);
-    shape->size += FIRST(step[2]);
+    const int within = (int)sum_of(*group_total(&inside, 1, room->sums));
+    const real middle = group_ranked(distances, PADDED_SPOKES, within / 2 + 1, BITS_TO_ONE_PERCENT, room->sums);
+    return MAD_TO_SIGMA * (1 + FEW_FITTED / fmax((real)(within - FREEDOMS), (real)1)) * middle;
+}
+
+// Sums over the edges: weighted normal equations (lower triangle, right side), weights, weighted variances of the blur.
+#define FIT_RIGHT TRIANGLE
+#define FIT_WEIGHT (FIT_RIGHT + FREEDOMS)
+#define FIT_BLUR (FIT_WEIGHT + 1)
+#define FIT_SUMS (FIT_BLUR + 1)
+
+// Do the Gauss-Newton step of the normal equations.
+BETWEEN_BARRIERS void fit_stepped(private blob_fit *fit, private reals *sums) {
+    reals step[FREEDOMS];
+    fit->is_regular &= !any_lane(factored(sums));
+    if (!fit->is_regular) return;
+    solved(sums, sums + FIT_RIGHT, step);
+    fit->shape.x += FIRST(step[0]);
+    fit->shape.y += FIRST(step[1]);
+    fit->shape.size += FIRST(step[2]);
 #ifndef ROUND
-    shape->angle += FIRST(step[3]);
+    fit->shape.angle += FIRST(step[3]);
 #endif
-    *blur = sum_of(blurs) / sum_of(weights);
-    return shape->size > 0 && !not_finite(shape->x + shape->y + shape->size + shape->angle);
+    fit->blur = FIRST(sums[FIT_BLUR]) / FIRST(sums[FIT_WEIGHT]);
+    fit->is_regular = fit->shape.size > 0 &&
+                      !not_finite(fit->shape.x + fit->shape.y + fit->shape.size + fit->shape.angle);
+}
+
+// One Gauss-Newton step of the reweighted fit.
+INLINE void fit_step(GROUP_SPACE blob_fit *fit, GROUP_SPACE const blob_edges *edges, blob_layout layout, real scale,
+                     real across, GROUP_SPACE blob_room *room) {
+    const blob_shape shape = fit->shape;
+    const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale;
+    const real bent = bent_by(fit->blur, across);
+    reals sums[FIT_SUMS];
+    EACH_PART(part) {
+        for (int k = 0; k < FIT_SUMS; k++) sums[k] = 0;
+        for (int i = part * LANES; i < PADDED_SPOKES; i += PARTS * LANES) {
+            const blob_equation equation = equation_of(edges, i, layout, shape, cosine, sine, bent);
+            const reals weight = AT(edges->there, i) * loss_weight(equation.residual * (reals)per_scale);
+            for (int j = 0; j < FREEDOMS; j++) {
+                const reals weighted = weight * equation.row[j];
+                sums[FIT_RIGHT + j] += weighted * equation.residual;
+                for (int k = 0; k <= j; k++) sums[CELL(j, k)] += weighted * equation.row[k];
+            }
+            sums[FIT_WEIGHT] += weight;
+            sums[FIT_BLUR] += weight * AT(edges->blur, i);
+        }
+        for (int k = 0; k < FIT_SUMS; k++) sums[k] = (reals)sum_of(sums[k]);
+        group_put(sums, FIT_SUMS, part, room->sums);
+    }
+    GROUP_SPACE const reals *totals = group_total(sums, FIT_SUMS, room->sums);
+    if (GROUP_ITEM == 0) {
+        for (int k = 0; k < FIT_SUMS; k++) sums[k] = totals[k];
+        blob_fit stepped = *fit;
+        fit_stepped(&stepped, sums);
+        *fit = stepped;
+    }
+    group_barrier();
 }
 
 // Fit the shape to the edges by reweighted least squares, with the scale halved from step to step and then estimated from
-// the residuals. Return 0 if the fit is singular.
-static inline int fit_shape(private const blob_edges *edges, blob_layout layout, real reach, real noise, real across,
-                     private blob_shape *shape, private real *blur, private real *scale) {
+// the residuals. Return the last scale. A fit that is not regular stays as it is.
+INLINE real fit_shape(GROUP_SPACE blob_fit *fit, GROUP_SPACE const blob_edges *edges, blob_layout layout, real reach,
+                      real noise, real across, GROUP_SPACE real *distances, GROUP_SPACE blob_room *room) {
     const real predicted = fmax(sqrt(noise), LEAST_SCALE), least = fmax(LEAST_REACH / TUNING, predicted);
-    *scale = fmax(reach / TUNING, least);
-    for (int step = 0; step < MOST_STEPS; step++) {
-        if (!fit_step(edges, layout, *scale, shape, blur, across)) return 0;
-        if (*scale <= least) break;
-        *scale = fmax(*scale / 2, least);
+    real scale = fmax(reach / TUNING, least);
+    int step = 0, is_last;
+    do {
+        fit_step(fit, edges, layout, scale, across, room);
+        is_last = scale <= least;
+        scale = is_last ? scale : fmax(scale / 2, least);
+    } while (++step < MOST_STEPS && !is_last && fit->is_regular);
+    for (int again = 0; again < STEPS_AT_SCALE; again++) {
+        const real bent = bent_by(fit->blur, across);
+        const real measured = scale_of(edges, layout, fit->shape, bent, TUNING * scale, distances, room);
+        scale = fmin(fmax(measured, predicted), least);
+        fit_step(fit, edges, layout, scale, across, room);
     }
-    for (int step = 0; step < STEPS_AT_SCALE; step++) {
-#ifdef ROUND
-        const real bent = *blur + across;
-#else
-        const real bent = 0;
-#endif
-        const real measured = scale_of(edges, layout, *shape, bent, TUNING * *scale);
-        *scale = fmin(fmax(measured, predicted), least);
-        if (!fit_step(edges, layout, *scale, shape, blur, across)) return 0;
-    }
-    return 1;
+    return scale;
 }
 
-// Quality of a fit: covariance, residual, symmetry, contrast, weights of the edges, counts.
+// Quality of a fit: covariance, residual, symmetry, contrast, counts; weights and heights of the edges, repeated after
+// the last one.
 typedef struct {
     real covariance[FREEDOMS][FREEDOMS];
     real residual, symmetry, contrast;
-    real weights[PADDED_SPOKES + SPOKES / 2 + LANES];
+    real weights[PADDED_SPOKES + SPOKES / 2 + LANES], height[PADDED_SPOKES + SPOKES / 2 + LANES];
     int inliers, saturated, regular;
 } blob_quality;
 
-static inline blob_quality quality_of(private blob_edges *edges, blob_layout layout, blob_shape shape, real scale, real bent,
-                           real overlap) {
-    const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale;
-    blob_quality quality;
-    reals matrix[TRIANGLE], weights = 0, squares = 0, noises = 0, amplitudes = 0, inliers = 0;
-    reals slopes = 0;
-    real height[PADDED_SPOKES + SPOKES / 2 + LANES];
-    private real *of = quality.weights;
-    for (int j = 0; j < TRIANGLE; j++) matrix[j] = 0;
-    quality.saturated = 0;
-    for (int i = 0; i < PADDED_SPOKES; i += LANES) {
-        const blob_equation equation = equation_of(edges, i, layout, shape, cosine, sine, bent);
-        const reals z = equation.residual * (reals)per_scale, weight = READ(edges->there, i) * loss_weight(z);
-        const masks is_in = mask_of(weight > (reals)0);
-        for (int j = 0; j < FREEDOMS; j++)
-            for (int k = 0; k <= j; k++)
-                matrix[CELL(j, k)] += kept_where(is_in, equation.row[j] * equation.row[k]);
-        weights += weight;
-        squares += weight * weight * z * z;
-        slopes += kept_where(is_in, loss_slope(z));
-        noises += kept_where(is_in, READ(edges->noise, i));
-        amplitudes += weight * READ(edges->amplitude, i);
-        inliers += kept_where(is_in, (reals)1);
-        *(private reals_at *)(of + i) = weight;
-        *(private reals_at *)(height + i) = FABS(READ(edges->amplitude, i));
-        for (int lane = 0; lane < LANES; lane++)
-            quality.saturated |= edges->saturated[i + lane] & (LANE_BITS(is_in, lane) != 0);
-    }
-    const real count = sum_of(inliers), free = fmax(count - FREEDOMS, (real)1), mean = sum_of(slopes) / count;
-    quality.inliers = (int)count;
-    quality.residual = scale * sqrt(sum_of(squares) / sum_of(weights));
-    quality.contrast = -sum_of(amplitudes) / sum_of(weights);
+// Sums over the edges of a fit: normal equations of the inliers without weights; weights, squares of the weighted
+// residuals, slopes of the loss, variances, weighted amplitudes, number of inliers and of saturated inliers.
+#define QUALITY_WEIGHT TRIANGLE
+#define QUALITY_SQUARE (TRIANGLE + 1)
+#define QUALITY_SLOPE (TRIANGLE + 2)
+#define QUALITY_NOISE (TRIANGLE + 3)
+#define QUALITY_AMPLITUDE (TRIANGLE + 4)
+#define QUALITY_INLIERS (TRIANGLE + 5)
+#define QUALITY_SATURATED (TRIANGLE + 6)
+#define QUALITY_SUMS (TRIANGLE + 7)
+
+// Compute everything but the symmetry from the sums.
+INLINE void quality_from(GROUP_SPACE blob_quality *quality, private reals *sums, real scale, real overlap,
+                         real size) {
+    const real count = FIRST(sums[QUALITY_INLIERS]), free = fmax(count - FREEDOMS, (real)1), mean = FIRST(sums[QUALITY_SLOPE]) / count;
+    const real squares = FIRST(sums[QUALITY_SQUARE]), weights = FIRST(sums[QUALITY_WEIGHT]);
+    quality->inliers = (int)count;
+    quality->saturated = FIRST(sums[QUALITY_SATURATED]) > 0;
+    quality->residual = scale * sqrt(squares / weights);
+    quality->contrast = -FIRST(sums[QUALITY_AMPLITUDE]) / weights;
     // Variance of an edge: the larger one of the variance predicted from the noise and the variance of the residuals.
-    const real measured = scale * scale * sum_of(squares) / (free * mean * mean);
-    const real predicted = sum_of(noises) / (count * (real)EFFICIENCY);
-    const real variance = fmax(measured, predicted) * fmax(overlap / shape.size, (real)1);
-    for (int j = 0; j < TRIANGLE; j++) matrix[j] = (reals)sum_of(matrix[j]);
-    quality.regular = !any_lane(factored(matrix)) && mean > 0;
+    const real measured = scale * scale * squares / (free * mean * mean);
+    const real predicted = FIRST(sums[QUALITY_NOISE]) / (count * (real)EFFICIENCY);
+    const real variance = fmax(measured, predicted) * fmax(overlap / size, (real)1);
+    quality->regular = !any_lane(factored(sums)) && mean > 0;
     for (int j = 0; j < FREEDOMS; j++) {
         reals unit[FREEDOMS], column[FREEDOMS];
         for (int k = 0; k < FREEDOMS; k++) unit[k] = (reals)(real)(j == k);
-        solved(matrix, unit, column);
-        for (int k = 0; k < FREEDOMS; k++) quality.covariance[j][k] = variance * FIRST(column[k]);
+        solved(sums, unit, column);
+        for (int k = 0; k < FREEDOMS; k++) quality->covariance[j][k] = variance * FIRST(column[k]);
     }
-    for (int i = 0; i < SPOKES / 2 + LANES; i++) {
-        of[SPOKES + i] = of[i];
-        height[SPOKES + i] = height[i];
+}
+
+INLINE void quality_of(GROUP_SPACE blob_quality *quality, GROUP_SPACE const blob_edges *edges, blob_layout layout,
+                       blob_shape shape, real scale, real bent, real overlap, GROUP_SPACE blob_room *room) {
+    const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale;
+    reals sums[QUALITY_SUMS];
+    EACH_PART(part) {
+        for (int k = 0; k < QUALITY_SUMS; k++) sums[k] = 0;
+        for (int i = part * LANES; i < PADDED_SPOKES; i += PARTS * LANES) {
+            const blob_equation equation = equation_of(edges, i, layout, shape, cosine, sine, bent);
+            const reals z = equation.residual * (reals)per_scale, weight = AT(edges->there, i) * loss_weight(z);
+            const masks is_in = mask_of(weight > (reals)0);
+            for (int j = 0; j < FREEDOMS; j++)
+                for (int k = 0; k <= j; k++)
+                    sums[CELL(j, k)] += kept_where(is_in, equation.row[j] * equation.row[k]);
+            sums[QUALITY_WEIGHT] += weight;
+            sums[QUALITY_SQUARE] += weight * weight * z * z;
+            sums[QUALITY_SLOPE] += kept_where(is_in, loss_slope(z));
+            sums[QUALITY_NOISE] += kept_where(is_in, AT(edges->noise, i));
+            sums[QUALITY_AMPLITUDE] += weight * AT(edges->amplitude, i);
+            sums[QUALITY_INLIERS] += kept_where(is_in, (reals)1);
+            const masks saturated = is_in & mask_of((FLAGS_AT(edges, i) & (masks)STATUS_SATURATED) != 0);
+            sums[QUALITY_SATURATED] += kept_where(saturated, (reals)1);
+            AT(quality->weights, i) = weight;
+            AT(quality->height, i) = FABS(AT(edges->amplitude, i));
+        }
+        for (int k = 0; k < QUALITY_SUMS; k++) sums[k] = (reals)sum_of(sums[k]);
+        group_put(sums, QUALITY_SUMS, part, room->sums);
     }
+    GROUP_SPACE const reals *totals = group_total(sums, QUALITY_SUMS, room->sums);
+    if (GROUP_ITEM == 0) {
+        for (int k = 0; k < QUALITY_SUMS; k++) sums[k] = totals[k];
+        quality_from(quality, sums, scale, overlap, shape.size);
+    }
+    for (int i = GROUP_ITEM; i < SPOKES / 2 + LANES; i += GROUP_ITEMS) {
+        quality->weights[SPOKES + i] = quality->weights[i];
+        quality->height[SPOKES + i] = quality->height[i];
+    }
+    group_barrier();
     // The loop ends at SPOKES, not at PADDED_SPOKES: without lanes it would read beyond the repeated numbers, which nothing
     // wrote, and a NaN there times the weight 0 of the padding is NaN. With lanes the last vector holds the padding.
-    reals agreed = 0;
-    for (int i = 0; i < SPOKES; i += LANES) {
-        const reals here = READ(height, i), there = READ(height, i + SPOKES / 2);
-        const reals low = here < there ? here : there, high = here < there ? there : here;
-        const reals product = READ(of, i) * READ(of, i + SPOKES / 2) * FROM(layout.counts, i);
-        agreed += sqrt(product) * low / (high + (reals)1e-30f);
+    reals agreed;
+    EACH_PART(part) {
+        agreed = 0;
+        for (int i = part * LANES; i < SPOKES; i += PARTS * LANES) {
+            const reals here = AT(quality->height, i), there = AT(quality->height, i + SPOKES / 2);
+            const reals low = here < there ? here : there, high = here < there ? there : here;
+            const reals product =
+                AT(quality->weights, i) * AT(quality->weights, i + SPOKES / 2) * FROM(layout.counts, i);
+            agreed += sqrt(product) * low / (high + (reals)1e-30f);
+        }
+        group_put(&agreed, 1, part, room->sums);
     }
-    quality.symmetry = sum_of(agreed) / SPOKES;
-    return quality;
+    const real symmetry = sum_of(*group_total(&agreed, 1, room->sums)) / SPOKES;
+    if (GROUP_ITEM == 0) quality->symmetry = symmetry;
 }
 
 #endif

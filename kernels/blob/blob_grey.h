@@ -10,74 +10,101 @@
 #define BEYOND (real)2.5f         // distance of background samples from an edge, in blurs
 #define OWN (real)0.5f            // smallest weight of an edge that belongs to the fiducial
 
-// Grey level of the background, sampled beyond the edges of the fit.
-static inline real background_of(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
-                          private const blob_edges *edges, private const real *weights, blob_layout layout, real blur) {
+// Return the grey level of the background, sampled beyond the edges of the fit.
+INLINE real background_of(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
+                          GROUP_SPACE const blob_edges *edges, GROUP_SPACE const real *weights, blob_layout layout,
+                          real blur, GROUP_SPACE blob_room *room) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle), out = BEYOND * blur + (real)0.5f;
-    real sum = 0, all = 0;
-    for (int i = 0; i < SPOKES; i++) {
-        const real nx = layout.nx[i], ny = layout.ny[i];
-        const int column = (int)rint(x + edges->x[i] + out * (cosine * nx - sine * ny));
-        const int row = (int)rint(y + edges->y[i] + out * (sine * nx + cosine * ny));
-        const int inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows);
-        const real level = convert_real(image[inside ? row * columns + column : 0]);
-        const real weight = (inside && !not_finite(level)) ? weights[i] : 0;
-        sum += weight > 0 ? weight * level : 0;
-        all += weight;
+    reals sums[2];
+    EACH_PART(part) {
+        real sum = 0, all = 0;
+        for (int i = part; i < SPOKES; i += PARTS) {
+            const real nx = layout.nx[i], ny = layout.ny[i];
+            const int column = (int)rint(x + edges->x[i] + out * (cosine * nx - sine * ny));
+            const int row = (int)rint(y + edges->y[i] + out * (sine * nx + cosine * ny));
+            const int inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows);
+            const real level = convert_real(image[inside ? row * columns + column : 0]);
+            const real weight = (inside && !not_finite(level)) ? weights[i] : 0;
+            sum += weight > 0 ? weight * level : 0;
+            all += weight;
+        }
+        sums[0] = (reals)sum, sums[1] = (reals)all;
+        group_put(sums, 2, part, room->sums);
     }
-    return sum / all;
+    GROUP_SPACE const reals *totals = group_total(sums, 2, room->sums);
+    return FIRST(totals[0]) / FIRST(totals[1]);
 }
 
 // Mark the parts of the contour whose edges disagree with the shape, as wide as the spacing of the rulers.
-static inline void hide(blob_shape shape, private const real *weights, blob_layout layout, real spacing, real blur,
-                 private blob_hidden *hidden) {
+static inline void hide(blob_shape shape, GROUP_SPACE const real *weights, blob_layout layout, real spacing, real blur,
+                        GROUP_SPACE blob_hidden *hidden) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle);
-    hidden->count = 0;
-    hidden->half_width = spacing * shape.size;
-    hidden->half_length = ABOUT_BLURS * blur + ABOUT + 1;
+    int count = 0;
     for (int i = 0; i < SPOKES; i++) {
         if (weights[i] >= OWN) continue;
         const real bx = layout.bx[i], by = layout.by[i], nx = layout.nx[i], ny = layout.ny[i];
-        hidden->x[hidden->count] = shape.size * (cosine * bx - sine * by);
-        hidden->y[hidden->count] = shape.size * (sine * bx + cosine * by);
-        hidden->nx[hidden->count] = cosine * nx - sine * ny;
-        hidden->ny[hidden->count++] = sine * nx + cosine * ny;
+        hidden->x[count] = shape.size * (cosine * bx - sine * by);
+        hidden->y[count] = shape.size * (sine * bx + cosine * by);
+        hidden->nx[count] = cosine * nx - sine * ny;
+        hidden->ny[count++] = sine * nx + cosine * ny;
     }
+    hidden->count = count;
+    hidden->half_width = spacing * shape.size;
+    hidden->half_length = ABOUT_BLURS * blur + ABOUT + 1;
 }
 
+// Sums over the pixels of the disc, and over the ring around it (number of pixels, grey levels).
+#define AREA 0
+#define AT_X 1
+#define AT_Y 2
+#define GREY 3
+#define GREY_X 4
+#define GREY_Y 5
+#define ABOUT_AREA 6
+#define ABOUT_GREY 7
+#define GRAVITY_SUMS 8
+
 // Centroid of the grey levels over the background of a ring around the fiducial, relative to (x, y). Return 0 if the ring
-// leaves the image.
-static inline int gravity_of(global const CODE *image, int rows, int columns, real x, real y, real reach, private real *to_x,
-                      private real *to_y) {
+// leaves the image, and unless `is_wanted`.
+INLINE int gravity_of(global const CODE *image, int rows, int columns, real x, real y, real reach, int is_wanted,
+                      GROUP_SPACE blob_room *room, private real *to_x, private real *to_y) {
     const real outer = reach + RING;
-    if (!(x - outer >= 0 && y - outer >= 0 && x + outer <= columns - 1 && y + outer <= rows - 1)) return 0;
-    const int left = (int)(x - outer), right = (int)(x + outer), top = (int)(y - outer), bottom = (int)(y + outer);
+    const int inside = is_wanted && x - outer >= 0 && y - outer >= 0 && x + outer <= columns - 1 && y + outer <= rows - 1;
+    const int left = inside ? (int)(x - outer) : 0, right = inside ? (int)(x + outer) : -1;
+    const int top = inside ? (int)(y - outer) : 0, bottom = inside ? (int)(y + outer) : -1;
     // Subtract one grey level first: sums of differences keep more digits.
-    const reals level = (reals)convert_real(image[(int)y * columns + (int)x]);
-    reals area = 0, sum = 0, sum_x = 0, sum_y = 0, at_x = 0, at_y = 0, about = 0, sum_about = 0;
-    for (int row = top; row <= bottom; row++) {
-        const reals dy = (reals)(row - y);
-        for (int column = left; column <= right; column += LANES) {
-            const int from = min(column, columns - LANES);
-            const reals place = (reals)(real)from + COUNTED, dx = place - (reals)x, square = dx * dx + dy * dy;
-            const masks fresh = mask_of(place >= (reals)(real)column);
-            const masks in = fresh & mask_of(square <= (reals)(reach * reach));
-            const masks ring = fresh & ~in & mask_of(square <= (reals)(outer * outer));
-            const reals grey = PIXELS(image + row * columns + from) - level, mine = kept_where(in, grey);
-            area += kept_where(in, (reals)1);
-            at_x += kept_where(in, dx);
-            at_y += kept_where(in, dy);
-            sum += mine;
-            sum_x += mine * dx;
-            sum_y += mine * dy;
-            about += kept_where(ring, (reals)1);
-            sum_about += kept_where(ring, grey);
+    const reals level = (reals)convert_real(image[inside ? (int)y * columns + (int)x : 0]);
+    reals sums[GRAVITY_SUMS];
+    EACH_PART(part) {
+        for (int k = 0; k < GRAVITY_SUMS; k++) sums[k] = 0;
+        for (int row = top + PART_ROW(part); row <= bottom; row += PART_ROWS) {
+            const reals dy = (reals)(row - y);
+            for (int column = left + PART_COLUMN(part); column <= right; column += LANES * PART_COLUMNS) {
+                const int from = min(column, columns - LANES);
+                const reals place = (reals)(real)from + COUNTED, dx = place - (reals)x, square = dx * dx + dy * dy;
+                const masks fresh = mask_of(place >= (reals)(real)column);
+                const masks in = fresh & mask_of(square <= (reals)(reach * reach));
+                const masks ring = fresh & ~in & mask_of(square <= (reals)(outer * outer));
+                const reals grey = PIXELS(image + row * columns + from) - level, mine = kept_where(in, grey);
+                sums[AREA] += kept_where(in, (reals)1);
+                sums[AT_X] += kept_where(in, dx);
+                sums[AT_Y] += kept_where(in, dy);
+                sums[GREY] += mine;
+                sums[GREY_X] += mine * dx;
+                sums[GREY_Y] += mine * dy;
+                sums[ABOUT_AREA] += kept_where(ring, (reals)1);
+                sums[ABOUT_GREY] += kept_where(ring, grey);
+            }
         }
+        for (int k = 0; k < GRAVITY_SUMS; k++) sums[k] = (reals)sum_of(sums[k]);
+        group_put(sums, GRAVITY_SUMS, part, room->sums);
     }
-    const real background = sum_of(sum_about) / sum_of(about), per = 1 / (sum_of(sum) - background * sum_of(area));
-    *to_x = (sum_of(sum_x) - background * sum_of(at_x)) * per;
-    *to_y = (sum_of(sum_y) - background * sum_of(at_y)) * per;
-    return !not_finite(*to_x + *to_y) && fabs(*to_x) <= reach && fabs(*to_y) <= reach;
+    GROUP_SPACE const reals *totals = group_total(sums, GRAVITY_SUMS, room->sums);
+    const real area = FIRST(totals[AREA]), grey = FIRST(totals[GREY]);
+    const real background = FIRST(totals[ABOUT_GREY]) / FIRST(totals[ABOUT_AREA]), per = 1 / (grey - background * area);
+    *to_x = (FIRST(totals[GREY_X]) - background * FIRST(totals[AT_X])) * per;
+    *to_y = (FIRST(totals[GREY_Y]) - background * FIRST(totals[AT_Y])) * per;
+    return inside && !not_finite(*to_x + *to_y) && fabs(*to_x) <= reach && fabs(*to_y) <= reach;
 }
 
 #endif

@@ -5,7 +5,7 @@
 // Options: ROUND, FREEDOMS as in blob.cl; RATIO: inner over outer size of a ring or a cross; else a disc or a square.
 #ifndef BLOB_MATCH_H
 #define BLOB_MATCH_H
-#include "blob/blob_model.h"
+#include "blob/blob_edges.h"
 
 // Grey levels of a fiducial: background at its centre, contrast over the background; blur of its edges [px].
 typedef struct {
@@ -31,7 +31,7 @@ typedef struct {
     int count;
 } blob_hidden;
 
-static inline masks hidden_at(private const blob_hidden *hidden, reals dx, reals dy) {
+static inline masks hidden_at(GROUP_SPACE const blob_hidden *hidden, reals dx, reals dy) {
     masks in = 0;
     for (int i = 0; i < hidden->count; i++) {
         const reals x = dx - (reals)hidden->x[i], y = dy - (reals)hidden->y[i];
@@ -50,24 +50,39 @@ static inline masks hidden_at(private const blob_hidden *hidden, reals dx, reals
 #define COUNTED (reals)0
 #endif
 
-typedef struct {
-    reals matrix[UNKNOWN_CELLS], right[UNKNOWNS], squares, weights, count, pixels;
-} match_sums;
+// A part of the pixels has every PART_ROWS-th row, and of it every PART_COLUMNS-th vector of LANES pixels: neighbouring
+// items of a group load neighbouring pixels.
+#ifdef IN_GROUP
+#define PART_COLUMNS 16
+#else
+#define PART_COLUMNS 1
+#endif
+#define PART_ROWS (PARTS / PART_COLUMNS)
+#define PART_ROW(part) ((part) / PART_COLUMNS)
+#define PART_COLUMN(part) ((part) % PART_COLUMNS * LANES)
 
-// Accumulate the normal equations of the pixels of the fiducial and its background around (x, y), in units of the contrast.
+// Sums over the pixels: weighted normal equations (lower triangle, right side), weighted squares of the residuals, weights,
+// number of pixels with a weight above 0, and of all pixels.
+#define MATCH_RIGHT UNKNOWN_CELLS
+#define MATCH_SQUARE (MATCH_RIGHT + UNKNOWNS)
+#define MATCH_WEIGHT (MATCH_SQUARE + 1)
+#define MATCH_COUNT (MATCH_SQUARE + 2)
+#define MATCH_PIXELS (MATCH_SQUARE + 3)
+#define MATCH_SUMS (MATCH_SQUARE + 4)
+
+// Add up the normal equations of a part of the pixels of the fiducial and its background around (x, y), in units of the
+// contrast.
 static inline void match_summed(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
                          blob_grey grey, real slope_x, real slope_y, real scale, real reach,
-                         private const blob_hidden *hidden, private match_sums *sums) {
+                         GROUP_SPACE const blob_hidden *hidden, int part, private reals *sums) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale, per_size = 1 / shape.size;
     const real per_contrast = 1 / grey.contrast;
     const int top = max((int)ceil(y - reach), 0), bottom = min((int)(y + reach), rows - 1);
-    for (int i = 0; i < UNKNOWN_CELLS; i++) sums->matrix[i] = 0;
-    for (int i = 0; i < UNKNOWNS; i++) sums->right[i] = 0;
-    sums->squares = sums->weights = sums->count = sums->pixels = 0;
-    for (int row = top; row <= bottom; row++) {
+    for (int i = 0; i < MATCH_SUMS; i++) sums[i] = 0;
+    for (int row = top + PART_ROW(part); row <= bottom; row += PART_ROWS) {
         const real dy = row - y, half_chord = sqrt(fmax(reach * reach - dy * dy, (real)0));
         const int left = max((int)ceil(x - half_chord), 0), right = min((int)(x + half_chord), columns - 1);
-        for (int column = left; column <= right; column += LANES) {
+        for (int column = left + PART_COLUMN(part); column <= right; column += LANES * PART_COLUMNS) {
             const int from = min(column, columns - LANES);
             const reals place = (reals)(real)from + COUNTED, dx = place - (reals)x;
             masks in = mask_of(place >= (reals)(real)column) & mask_of(FABS(dx) <= (reals)half_chord);
@@ -90,65 +105,94 @@ static inline void match_summed(global const CODE *image, int rows, int columns,
 #pragma unroll
             for (int i = 0; i < UNKNOWNS; i++) {
                 const reals weighted = weight * equation[i];
-                sums->right[i] += weighted * residual;
+                sums[MATCH_RIGHT + i] += weighted * residual;
 #pragma unroll
-                for (int j = 0; j <= i; j++) sums->matrix[CELL(i, j)] += weighted * equation[j];
+                for (int j = 0; j <= i; j++) sums[CELL(i, j)] += weighted * equation[j];
             }
-            sums->pixels += kept_where(in, (reals)1);
-            sums->squares += weight * residual * residual;
-            sums->weights += weight;
-            sums->count += kept_where(mask_of(weight > (reals)0), (reals)1);
+            sums[MATCH_PIXELS] += kept_where(in, (reals)1);
+            sums[MATCH_SQUARE] += weight * residual * residual;
+            sums[MATCH_WEIGHT] += weight;
+            sums[MATCH_COUNT] += kept_where(mask_of(weight > (reals)0), (reals)1);
         }
     }
 }
 
-// Fit the shape to the grey levels; return 0 if the fit fails or moves too far. `covariance`: from the residuals.
-static inline int match(global const CODE *image, int rows, int columns, real x, real y, real noise, real extent,
-                 private const blob_hidden *hidden, private blob_shape *shape, private blob_grey *grey,
-                 real covariance[FREEDOMS][FREEDOMS]) {
-    const blob_shape first = *shape;
-    const real reach = extent * first.size + ABOUT_BLURS * grey->blur + ABOUT;
-    real slope_x = 0, slope_y = 0;
-    for (int step = 0; step < MATCH_STEPS; step++) {
-        match_sums sums;
-        reals moved[UNKNOWNS];
-        const real contrast = grey->contrast, scale = (MATCH_SHARE + MATCH_NOISES * noise / fabs(contrast)) / TUNING;
-        match_summed(image, rows, columns, x + shape->x, y + shape->y, *shape, *grey, slope_x / contrast,
-                     slope_y / contrast, scale, reach, hidden, &sums);
-        for (int i = 0; i < UNKNOWN_CELLS; i++) sums.matrix[i] = (reals)sum_of(sums.matrix[i]);
-        for (int i = 0; i < UNKNOWNS; i++) sums.right[i] = (reals)sum_of(sums.right[i]);
-        if (any_lane(factored_of(UNKNOWNS, sums.matrix))) return 0;
-        solved_of(UNKNOWNS, sums.matrix, sums.right, moved);
-        const real dx = FIRST(moved[0]), dy = FIRST(moved[1]), ds = FIRST(moved[2]);
-        const real db = FIRST(moved[FREEDOMS]);
-        real less = 0, da = 0;
-        for (int i = 0; i < UNKNOWNS; i++) less += FIRST(moved[i]) * FIRST(sums.right[i]);
-        shape->x += dx;
-        shape->y += dy;
-        shape->size += ds;
+// State of the match; in a group item 0 changes it.
+typedef struct {
+    blob_shape first, shape; // fitted to the edges; fitted to the grey levels
+    blob_grey grey;
+    real slope_x, slope_y;   // of the background
+    real covariance[FREEDOMS][FREEDOMS]; // from the residuals
+    int state;
+} blob_match;
+#define MATCH_RUNS 0
+#define MATCH_ENDS 1  // with a shape
+#define MATCH_FAILS 2 // the normal equations are singular, too few pixels agree, or the fiducial moved too far
+
+// Do the Gauss-Newton step of the normal equations.
+BETWEEN_BARRIERS void match_stepped(private blob_match *match, private reals *sums, int is_last) {
+    reals moved[UNKNOWNS];
+    const real contrast = match->grey.contrast;
+    match->state = MATCH_FAILS;
+    if (any_lane(factored_of(UNKNOWNS, sums))) return;
+    solved_of(UNKNOWNS, sums, sums + MATCH_RIGHT, moved);
+    const real dx = FIRST(moved[0]), dy = FIRST(moved[1]), ds = FIRST(moved[2]);
+    const real db = FIRST(moved[FREEDOMS]);
+    real less = 0, da = 0;
+    for (int i = 0; i < UNKNOWNS; i++) less += FIRST(moved[i]) * FIRST(sums[MATCH_RIGHT + i]);
+    match->shape.x += dx;
+    match->shape.y += dy;
+    match->shape.size += ds;
 #ifndef ROUND
-        da = FIRST(moved[3]) * first.size;
-        shape->angle += FIRST(moved[3]);
+    da = FIRST(moved[3]) * match->first.size;
+    match->shape.angle += FIRST(moved[3]);
 #endif
-        grey->blur = fmax(grey->blur + db, SHARPEST);
-        grey->contrast += contrast * FIRST(moved[FREEDOMS + 1]);
-        grey->background += contrast * FIRST(moved[FREEDOMS + 2]);
-        slope_x += contrast * FIRST(moved[FREEDOMS + 3]);
-        slope_y += contrast * FIRST(moved[FREEDOMS + 4]);
-        const real off = dx * dx + dy * dy + ds * ds + da * da + db * db;
-        if (off > MATCHED * MATCHED * grey->blur * grey->blur && step < MATCH_STEPS - 1) continue;
-        const real count = sum_of(sums.count), free = count - UNKNOWNS;
-        const real variance = fmax(sum_of(sums.squares) - less, (real)0) / sum_of(sums.weights) * count / free;
-        for (int i = 0; i < FREEDOMS; i++) {
-            reals unit[UNKNOWNS], column[UNKNOWNS];
-            for (int k = 0; k < UNKNOWNS; k++) unit[k] = (reals)(real)(i == k);
-            solved_of(UNKNOWNS, sums.matrix, unit, column);
-            for (int k = 0; k < FREEDOMS; k++) covariance[i][k] = variance * FIRST(column[k]);
-        }
-        const real off_x = shape->x - first.x, off_y = shape->y - first.y, off_size = shape->size - first.size;
-        const real away = off_x * off_x + off_y * off_y + off_size * off_size;
-        return free > 0 && count >= MATCH_OWN * sum_of(sums.pixels) && away <= MATCH_FURTHEST * MATCH_FURTHEST;
+    match->grey.blur = fmax(match->grey.blur + db, SHARPEST);
+    match->grey.contrast += contrast * FIRST(moved[FREEDOMS + 1]);
+    match->grey.background += contrast * FIRST(moved[FREEDOMS + 2]);
+    match->slope_x += contrast * FIRST(moved[FREEDOMS + 3]);
+    match->slope_y += contrast * FIRST(moved[FREEDOMS + 4]);
+    const real off = dx * dx + dy * dy + ds * ds + da * da + db * db;
+    if (off > MATCHED * MATCHED * match->grey.blur * match->grey.blur && !is_last) {
+        match->state = MATCH_RUNS;
+        return;
     }
-    return 0;
+    const real count = FIRST(sums[MATCH_COUNT]), free = count - UNKNOWNS;
+    const real variance = fmax(FIRST(sums[MATCH_SQUARE]) - less, (real)0) / FIRST(sums[MATCH_WEIGHT]) * count / free;
+    for (int i = 0; i < FREEDOMS; i++) {
+        reals unit[UNKNOWNS], column[UNKNOWNS];
+        for (int k = 0; k < UNKNOWNS; k++) unit[k] = (reals)(real)(i == k);
+        solved_of(UNKNOWNS, sums, unit, column);
+        for (int k = 0; k < FREEDOMS; k++) match->covariance[i][k] = variance * FIRST(column[k]);
+    }
+    const real off_x = match->shape.x - match->first.x, off_y = match->shape.y - match->first.y;
+    const real off_size = match->shape.size - match->first.size;
+    const real away = off_x * off_x + off_y * off_y + off_size * off_size;
+    if (free > 0 && count >= MATCH_OWN * FIRST(sums[MATCH_PIXELS]) && away <= MATCH_FURTHEST * MATCH_FURTHEST)
+        match->state = MATCH_ENDS;
+}
+
+// Fit the shape to the grey levels. `match` holds the start, and gets the result.
+INLINE void match_image(GROUP_SPACE blob_match *match, global const CODE *image, int rows, int columns, real x, real y,
+                        real noise, real extent, GROUP_SPACE const blob_hidden *hidden, GROUP_SPACE blob_room *room) {
+    const int is_wanted = match->state == MATCH_RUNS;
+    const real reach = is_wanted ? extent * match->first.size + ABOUT_BLURS * match->grey.blur + ABOUT : -1;
+    int step = 0;
+    do {
+        reals sums[MATCH_SUMS];
+        const blob_shape shape = match->shape;
+        const blob_grey grey = match->grey;
+        const real contrast = grey.contrast, scale = (MATCH_SHARE + MATCH_NOISES * noise / fabs(contrast)) / TUNING;
+        match_summed(image, rows, columns, x + shape.x, y + shape.y, shape, grey, match->slope_x / contrast,
+                     match->slope_y / contrast, scale, reach, hidden, GROUP_ITEM, sums);
+        for (int k = 0; k < MATCH_SUMS; k++) sums[k] = (reals)sum_of(sums[k]);
+        group_add_up(sums, MATCH_SUMS, ROUND_SUMS, room->sums);
+        if (GROUP_ITEM == 0 && match->state == MATCH_RUNS) {
+            blob_match stepped = *match;
+            match_stepped(&stepped, sums, step == MATCH_STEPS - 1);
+            *match = stepped;
+        }
+        group_barrier();
+    } while (++step < MATCH_STEPS && match->state == MATCH_RUNS);
 }
 #endif

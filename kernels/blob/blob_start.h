@@ -9,14 +9,32 @@
 #define PATTERNS 4
 __constant int pattern[PATTERNS][2] = {{4, 8}, {5, 10}, {3, 6}, {2, 6}};
 #define START_STEPS 3
-#define WRAPPED (PADDED_SPOKES + SPOKES + LANES)
 
-// Edges in the order of the contour, repeated after the last one; straight edges with normals at the nominal angle.
+// Edges in the order of the contour; straight edges with normals at the nominal angle.
 typedef struct {
-    real x[WRAPPED], y[WRAPPED], there[WRAPPED], height[WRAPPED];
-#ifndef ROUND
-    real nx[WRAPPED], ny[WRAPPED];
-#endif
+    reals x, y, there, height, nx, ny;
+} contour_edge;
+
+#ifdef IN_GROUP
+typedef struct {
+    local const blob_edges *edges;
+    blob_layout layout;
+    real cosine, sine;
+} blob_circuit;
+
+static inline contour_edge edge_from(private const blob_circuit *circuit, int i) {
+    const int at = i % SPOKES;
+    const real nx = circuit->layout.nx[at], ny = circuit->layout.ny[at];
+    local const blob_edges *edges = circuit->edges;
+    return (contour_edge){edges->x[at], edges->y[at], edges->there[at], circuit->layout.height[at],
+                          circuit->cosine * nx - circuit->sine * ny, circuit->sine * nx + circuit->cosine * ny};
+}
+#define edge_for_all edge_from
+#else
+// The edges are repeated after the last one, so that each lane can begin with another edge.
+#define WRAPPED (PADDED_SPOKES + SPOKES + LANES)
+typedef struct {
+    real x[WRAPPED], y[WRAPPED], there[WRAPPED], height[WRAPPED], nx[WRAPPED], ny[WRAPPED];
 } blob_circuit;
 
 static inline void wrap(private const blob_edges *edges, blob_layout layout, real cosine, real sine,
@@ -35,6 +53,25 @@ static inline void wrap(private const blob_edges *edges, blob_layout layout, rea
         }
 }
 
+// Edges i, i + 1, ... of the lanes.
+static inline contour_edge edge_from(private const blob_circuit *circuit, int i) {
+    contour_edge edge = {READ(circuit->x, i), READ(circuit->y, i), READ(circuit->there, i), READ(circuit->height, i), 0, 0};
+#ifndef ROUND
+    edge.nx = READ(circuit->nx, i), edge.ny = READ(circuit->ny, i);
+#endif
+    return edge;
+}
+
+// Edge i in all lanes.
+static inline contour_edge edge_for_all(private const blob_circuit *circuit, int i) {
+    contour_edge edge = {(reals)circuit->x[i], (reals)circuit->y[i], (reals)circuit->there[i], (reals)circuit->height[i], 0, 0};
+#ifndef ROUND
+    edge.nx = (reals)circuit->nx[i], edge.ny = (reals)circuit->ny[i];
+#endif
+    return edge;
+}
+#endif
+
 // Shape in each lane: centre and size.
 typedef struct {
     reals x, y, size;
@@ -45,37 +82,27 @@ typedef struct {
     reals nx, ny, off;
 } edge_residual;
 
+// A circle: the normal points from the centre to the edge. Straight sides have the normal of the edge.
+static inline edge_residual residual_at(laned_shape of, contour_edge edge) {
+    const reals ax = edge.x - of.x, ay = edge.y - of.y;
 #ifdef ROUND
-// Edge at (x, y) of a circle: the normal points from the centre to the edge.
-static inline edge_residual residual_at(laned_shape of, reals x, reals y, reals height) {
-    const reals ax = x - of.x, ay = y - of.y;
     const reals square = ax * ax + ay * ay + (reals)1e-12f, per = rsqrt(square);
-    return (edge_residual){ax * per, ay * per, square * per - of.size * height};
-}
-#define RESIDUAL(of, circuit, take, i)                                                                                 \
-    residual_at(of, take((circuit)->x, i), take((circuit)->y, i), take((circuit)->height, i))
+    return (edge_residual){ax * per, ay * per, square * per - of.size * edge.height};
 #else
-// Edge at (x, y) of a straight side with normal (nx, ny).
-static inline edge_residual residual_at(laned_shape of, reals x, reals y, reals nx, reals ny, reals height) {
-    return (edge_residual){nx, ny, nx * (x - of.x) + ny * (y - of.y) - of.size * height};
-}
-#define RESIDUAL(of, circuit, take, i)                                                                                 \
-    residual_at(of, take((circuit)->x, i), take((circuit)->y, i), take((circuit)->nx, i), take((circuit)->ny, i),      \
-                take((circuit)->height, i))
+    return (edge_residual){edge.nx, edge.ny, edge.nx * ax + edge.ny * ay - of.size * edge.height};
 #endif
-#define FOR_ALL(from, i) ((reals)((from)[i]))
+}
 
 // Shapes through three edges each (first edges i, i + 1, ...), by Newton's method. `start` is copied: Mesa 22.3 passes
 // structs by reference, so that a change of a parameter changes the variable of the caller.
-static inline laned_shape shape_through(private const blob_circuit *circuit, int i, int j, int k,
-                                        const laned_shape start) {
+static inline laned_shape shape_through(private const contour_edge *edges, const laned_shape start) {
     laned_shape shape = start;
     for (int step = 0; step < START_STEPS; step++) {
-        const edge_residual one = RESIDUAL(shape, circuit, READ, i), two = RESIDUAL(shape, circuit, READ, j);
-        const edge_residual three = RESIDUAL(shape, circuit, READ, k);
+        const edge_residual one = residual_at(shape, edges[0]), two = residual_at(shape, edges[1]);
+        const edge_residual three = residual_at(shape, edges[2]);
         const reals ux = one.nx, uy = one.ny, u = one.off, vx = two.nx, vy = two.ny, v = two.off;
         const reals wx = three.nx, wy = three.ny, w = three.off;
-        const reals uh = READ(circuit->height, i), vh = READ(circuit->height, j), wh = READ(circuit->height, k);
+        const reals uh = edges[0].height, vh = edges[1].height, wh = edges[2].height;
         const reals a = vy * wh - vh * wy, b = vh * wx - vx * wh, c = vx * wy - vy * wx;
         const reals whole = 1 / (ux * a + uy * b + uh * c);
         shape.x += whole * (u * a + v * (wy * uh - wh * uy) + w * (uy * vh - uh * vy));
@@ -85,35 +112,63 @@ static inline laned_shape shape_through(private const blob_circuit *circuit, int
     return shape;
 }
 
-// Start shape: among the shapes through three edges, the shape with the least sum of truncated squares.
-static inline blob_shape start_of(private const blob_edges *edges, blob_layout layout, blob_shape near, real reach) {
-    blob_circuit circuit;
-    wrap(edges, layout, cos(near.angle), sin(near.angle), &circuit);
-    const laned_shape from = {(reals)near.x, (reals)near.y, (reals)near.size};
-    blob_shape best = near;
+// Compute the shape through the edges i, i + pattern[p][0] / 16 and i + pattern[p][1] / 16 of the contour in each lane,
+// and its sum of truncated squares; infinity where an edge is missing.
+static inline reals start_loss(private const blob_circuit *circuit, int p, int i, laned_shape near, real reach,
+                               private laned_shape *tried) {
+    const contour_edge edges[3] = {edge_from(circuit, i), edge_from(circuit, i + pattern[p][0] * SPOKES / 16),
+                                   edge_from(circuit, i + pattern[p][1] * SPOKES / 16)};
+    const masks all = mask_of(edges[0].there * edges[1].there * edges[2].there > (reals)0);
+    *tried = shape_through(edges, near);
+    reals loss = 0;
+    for (int m = 0; m < SPOKES; m++) {
+        const contour_edge edge = edge_for_all(circuit, m);
+        const reals off = residual_at(*tried, edge).off, squared = off * off;
+        const masks in = mask_of(edge.there > (reals)0) & mask_of(squared < (reals)(reach * reach));
+        loss += in ? squared : (reals)(reach * reach);
+    }
+    return all ? loss : (reals)INFINITY;
+}
+
+// Replace `shape` by the start shape: among the shapes through three edges, the shape with the least sum of truncated
+// squares. The items of a group try different triples. No triples are tried unless `is_wanted`.
+INLINE void start_of(GROUP_SPACE blob_shape *shape, GROUP_SPACE const blob_edges *edges, blob_layout layout,
+                     int is_wanted, real reach, GROUP_SPACE blob_room *room) {
+    const real cosine = cos(shape->angle), sine = sin(shape->angle);
+    const laned_shape near = {(reals)shape->x, (reals)shape->y, (reals)shape->size};
     real least = SPOKES * reach * reach;
+#ifdef IN_GROUP
+    const blob_circuit circuit = {edges, layout, cosine, sine};
+    const int triples = is_wanted ? PATTERNS * SPOKES : 0;
+    int chosen = INT_MAX;
+    laned_shape best = near;
+    for (int triple = GROUP_ITEM; triple < triples; triple += GROUP_ITEMS) {
+        laned_shape tried;
+        const real loss = start_loss(&circuit, triple / SPOKES, triple % SPOKES, near, reach, &tried);
+        const int better = loss < least;
+        chosen = better ? triple : chosen;
+        least = better ? loss : least;
+        best = better ? tried : best;
+    }
+    if (group_best(chosen < INT_MAX ? least : (real)INFINITY, chosen, room->sums) == GROUP_ITEM && chosen < INT_MAX)
+        shape->x = best.x, shape->y = best.y, shape->size = best.size;
+    group_barrier();
+#else
+    if (!is_wanted) return;
+    blob_circuit circuit;
+    wrap(edges, layout, cosine, sine, &circuit);
     for (int p = 0; p < PATTERNS; p++)
         for (int i = 0; i < PADDED_SPOKES; i += LANES) {
-            const int j = i + pattern[p][0] * SPOKES / 16, k = i + pattern[p][1] * SPOKES / 16;
-            const laned_shape tried = shape_through(&circuit, i, j, k, from);
-            const reals found = READ(circuit.there, i) * READ(circuit.there, j) * READ(circuit.there, k);
-            const masks all = mask_of(found > (reals)0);
-            reals loss = 0;
-            for (int m = 0; m < SPOKES; m++) {
-                const reals off = RESIDUAL(tried, &circuit, FOR_ALL, m).off, squared = off * off;
-                const masks there = mask_of((reals)circuit.there[m] > (reals)0);
-                const masks in = there & mask_of(squared < (reals)(reach * reach));
-                loss += in ? squared : (reals)(reach * reach);
-            }
-            loss = all ? loss : (reals)INFINITY;
+            laned_shape tried;
+            const reals loss = start_loss(&circuit, p, i, near, reach, &tried);
             if (!any_lane(mask_of(loss < (reals)least))) continue;
             for (int lane = 0; lane < LANES; lane++) {
                 if (!(LANE(loss, lane) < least)) continue;
                 least = LANE(loss, lane);
-                best.x = LANE(tried.x, lane), best.y = LANE(tried.y, lane), best.size = LANE(tried.size, lane);
+                shape->x = LANE(tried.x, lane), shape->y = LANE(tried.y, lane), shape->size = LANE(tried.size, lane);
             }
         }
-    return best;
+#endif
 }
 
 #endif

@@ -46,6 +46,13 @@
 // Function without barriers, on private memory, in which an item computes alone. It is not inlined on PoCL: inlined,
 // the eigenvalues of a pose came out wrong while pose.h was written. With its present state PoCL 3.1 passes the tests
 // of test_pose.py in both cases.
+// A pointer to local memory as an argument made its compiler crash (blob_fit.h, blob_match.h).
+//
+// Loops with barriers run at least once (do ... while) and have one exit. PoCL 3.1 copies what follows a branch around a
+// barrier: with five loops that may not run at all, find_blobs did not compile in five minutes, with these loops in 7 s.
+//
+// Sums are arrays, not structs that are read as arrays: with Mesa 22.3 every index of a struct of single numbers gave its
+// first member.
 #if defined(IN_GROUP) && defined(POCL_DEVICE_ADDRESS_BITS)
 #define BETWEEN_BARRIERS static __attribute__((noinline))
 #else
@@ -77,6 +84,18 @@ INLINE local const real *group_total(private const real *values, int count, loca
     }
     group_barrier();
     return sums;
+}
+
+// Add up values of all items in item 0, `most` sums at a time: `sums` has room for `most` sums. The group has PARTS items.
+INLINE void group_add_up(private real *values, int count, int most, local real *sums) {
+#pragma unroll
+    for (int from = 0; from < count; from += most) {
+        const int now = min(most, count - from);
+        group_put(values + from, now, GROUP_ITEM, sums);
+        local const real *totals = group_total(0, now, sums);
+        if (GROUP_ITEM == 0)
+            for (int k = 0; k < now; k++) values[from + k] = totals[k];
+    }
 }
 
 // Return the largest of the values that group_put stored, one for each part.
@@ -147,6 +166,7 @@ INLINE void group_put(private const reals *values, int count, int part, private 
 INLINE private const reals *group_total(private const reals *values, int count, private real *sums) {
     return values;
 }
+INLINE void group_add_up(private reals *values, int count, int most, private real *sums) {}
 
 // The same of `count` values, padded with infinity to whole vectors; bit by bit, with LANES values at once.
 INLINE real group_ranked(private const real *values, int count, int rank, int lowest, private real *sums) {

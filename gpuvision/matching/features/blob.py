@@ -276,7 +276,7 @@ class FindBlobs(VisionOperation[Blobs]):
             work=work,
             more_inputs=[((self.count, freedoms), build.real)],
             outputs=build.outputs(shapes | ({"angle": None} if self._round else {}), inliers=np.int32),
-            defines={**edges.defines, "RULERS_PER_GROUP": 1, **self._defines(freedoms)},
+            defines={**edges.defines, **self._defines(freedoms)},
             arguments=[
                 self._table(edges),
                 self._layout().astype(build.real),

@@ -169,12 +169,14 @@ def test_unwritten_memory_does_not_reach_the_symmetry(
     operation = replace(PLAIN, spokes=24, match=False, count=1, variant=variant)
     plain = operation.bind(device, image.shape, image.dtype).on_host([image, place()])
     shutil.copytree(KERNEL_FOLDER, tmp_path / "kernels")
-    header = tmp_path / "kernels" / "blob" / "blob_fit.h"
-    count = "PADDED_SPOKES + SPOKES / 2 + LANES"
-    declared = f"real height[{count}];"
-    filled = f"{declared}\nfor (int i = 0; i < {count}; i++) height[i] = quality.weights[i] = REAL_NAN;"
-    before, after = header.read_text().split(declared)
-    header.write_text(before + filled + after)
+    source = tmp_path / "kernels" / "blob" / "blob.cl"
+    declared = "GROUP_SPACE blob_quality quality;"
+    filled = (
+        f"{declared}\nfor (int i = GROUP_ITEM; i < PADDED_SPOKES + SPOKES / 2 + LANES; i += GROUP_ITEMS) "
+        "quality.height[i] = quality.weights[i] = REAL_NAN;\ngroup_barrier();"
+    )
+    before, after = source.read_text().split(declared)
+    source.write_text(before + filled + after)
     monkeypatch.setattr(FindBlobs, "kernel_folder", tmp_path / "kernels")
     blobs = operation.bind(device, image.shape, image.dtype).on_host([image, place()])
     assert 0.95 < plain.symmetry[0] <= 1.0

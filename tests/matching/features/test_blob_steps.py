@@ -21,20 +21,26 @@ from gpuvision.host import Device
 from gpuvision.host.program import build
 from gpuvision.matching.features.blob import FindBlobs
 from gpuvision.operation import KERNEL_FOLDER
+from gpuvision.status import Status
 
 Reals = NDArray[np.float64]
 SPOKES, PADDED, REACH, OVERLAP = 24, 32, 3.0, 14.0
 RATIO = {"ring": 0.6, "square": 0.6, "cross": 0.35}
 SHAPES = pytest.mark.parametrize("shape", ["ring", "square", "cross"])
 SOURCE = """
+#define GROUP_PER_PROBLEM
 #include "blob/blob_edges.h"
 #include "blob/blob_fit.h"
 #include "blob/blob_grey.h"
 #include "blob/blob_match.h"
 #include "blob/blob_model.h"
 #include "blob/blob_start.h"
-#define PUT(value) out[to++] = (value)
+#define PUT(value) (put(out + to, (value)), to++)
 #define PUT_SHAPE(of) PUT((of).x), PUT((of).y), PUT((of).size), PUT((of).angle)
+
+static inline void put(global real *out, real value) {
+    if (GROUP_ITEM == 0) *out = value;
+}
 
 static inline blob_layout layout_of(constant real *table) {
     return (blob_layout){table, table + PADDED_SPOKES, table + 2 * PADDED_SPOKES, table + 3 * PADDED_SPOKES,
@@ -43,21 +49,32 @@ static inline blob_layout layout_of(constant real *table) {
 
 kernel void fits(global const real *given, global const real *shapes, constant real *table, global real *made,
                  const real scale, const real across, const real reach, const real search, const real overlap) {
-    const size_t n = get_global_id(0);
+    const size_t n = get_group_id(0);
     global const real *from = given + n * 7 * PADDED_SPOKES;
     global real *out = made + n * 512;
     const blob_layout layout = layout_of(table);
     const blob_shape shape = {shapes[4 * n], shapes[4 * n + 1], shapes[4 * n + 2], shapes[4 * n + 3]};
-    blob_edges edges;
-    for (int i = 0; i < PADDED_SPOKES; i++) {
+    local blob_edges edges;
+    local blob_shape start;
+    local blob_fit step, fit;
+    local blob_quality quality;
+    local real distances[PADDED_SPOKES];
+    local blob_room room;
+    for (int i = GROUP_ITEM; i < PADDED_SPOKES; i += GROUP_ITEMS) {
         edges.x[i] = from[i];
         edges.y[i] = from[PADDED_SPOKES + i];
         edges.amplitude[i] = from[2 * PADDED_SPOKES + i];
         edges.blur[i] = from[3 * PADDED_SPOKES + i];
         edges.noise[i] = from[4 * PADDED_SPOKES + i];
         edges.there[i] = from[5 * PADDED_SPOKES + i];
-        edges.saturated[i] = (int)from[6 * PADDED_SPOKES + i];
+        edges.flags[i] = (int)from[6 * PADDED_SPOKES + i];
     }
+    if (GROUP_ITEM == 0) {
+        start = step.shape = fit.shape = shape;
+        step.blur = fit.blur = 1;
+        step.is_regular = fit.is_regular = 1;
+    }
+    group_barrier();
     int to = 0;
     const real cosine = cos(shape.angle), sine = sin(shape.angle);
     for (int i = 0; i < SPOKES; i++) {
@@ -65,38 +82,28 @@ kernel void fits(global const real *given, global const real *shapes, constant r
         PUT(each.residual);
         for (int k = 0; k < FREEDOMS; k++) PUT(each.row[k]);
     }
-    const blob_shape start = start_of(&edges, layout, shape, reach);
+    start_of(&start, &edges, layout, 1, reach, &room);
     PUT_SHAPE(start);
-    PUT(scale_of(&edges, layout, shape, across, reach));
-    blob_shape moved = shape;
-    real blur = 1;
-    PUT(fit_step(&edges, layout, scale, &moved, &blur, across));
-    PUT_SHAPE(moved);
-    PUT(blur);
-    blob_shape fitted = shape;
-    real last = 0;
-    blur = 1;
-    PUT(fit_shape(&edges, layout, reach, 1e-3f, across, &fitted, &blur, &last));
-    PUT_SHAPE(fitted);
-    PUT(blur);
+    PUT(scale_of(&edges, layout, shape, across, reach, distances, &room));
+    fit_step(&step, &edges, layout, scale, across, &room);
+    PUT(step.is_regular);
+    PUT_SHAPE(step.shape);
+    PUT(step.blur);
+    const real last = fit_shape(&fit, &edges, layout, reach, 1e-3f, across, distances, &room);
+    PUT(fit.is_regular);
+    PUT_SHAPE(fit.shape);
+    PUT(fit.blur);
     PUT(last);
-    const blob_quality quality = quality_of(&edges, layout, shape, scale, across, overlap);
+    quality_of(&quality, &edges, layout, shape, scale, across, overlap, &room);
+    group_barrier();
     for (int j = 0; j < FREEDOMS; j++)
         for (int k = 0; k < FREEDOMS; k++) PUT(quality.covariance[j][k]);
     PUT(quality.residual), PUT(quality.symmetry), PUT(quality.contrast);
     PUT(quality.inliers), PUT(quality.saturated), PUT(quality.regular);
-    real noise = 0;
-    PUT(keep_edges(&edges, layout, shape, cosine, sine, search, &noise, &blur));
-    PUT(noise), PUT(blur);
+    const blob_count counted = keep_edges(&edges, layout, shape, search, &room);
+    PUT(counted.found), PUT(counted.noise), PUT(counted.blur);
+    PUT(counted.outside), PUT(counted.broken);
     for (int i = 0; i < SPOKES; i++) PUT(edges.there[i]);
-}
-
-static inline blob_hidden hidden_of(blob_shape shape, constant real *table, global const real *weights, real blur) {
-    real own[PADDED_SPOKES];
-    for (int i = 0; i < PADDED_SPOKES; i++) own[i] = weights[i];
-    blob_hidden hidden;
-    hide(shape, own, layout_of(table), (real)0.3f, blur, &hidden);
-    return hidden;
 }
 
 kernel void models(global const real *places, constant real *shape, global real *made) {
@@ -109,47 +116,83 @@ kernel void models(global const real *places, constant real *shape, global real 
 
 kernel void hiding(global const real *places, global real *made) {
     const size_t n = get_global_id(0);
-    const blob_hidden hidden = {{2, -5}, {1, -3}, {0, 1}, {1, 0}, 2, 3, 2};
+    local blob_hidden hidden;
+    if (GROUP_ITEM == 0) {
+        hidden.x[0] = 2, hidden.y[0] = 1, hidden.nx[0] = 0, hidden.ny[0] = 1;
+        hidden.x[1] = -5, hidden.y[1] = -3, hidden.nx[1] = 1, hidden.ny[1] = 0;
+        hidden.half_width = 2, hidden.half_length = 3, hidden.count = 2;
+    }
+    group_barrier();
     made[n] = hidden_at(&hidden, places[2 * n], places[2 * n + 1]) != 0;
 }
 
 kernel void greys(global const CODE *image, global const real *given, global const real *weights, constant real *table,
                   global real *made, const int rows, const int columns, const real scale) {
-    const size_t n = get_global_id(0);
+    const size_t n = get_group_id(0);
     global const real *at = given + 14 * n;
     global real *out = made + n * 128;
     const real x = at[0], y = at[1];
-    blob_shape shape = {at[2], at[3], at[4], at[5]};
-    blob_grey grey = {at[6], at[7], at[8]};
-    const real slope_x = at[9], slope_y = at[10], reach = at[11];
+    const blob_shape shape = {at[2], at[3], at[4], at[5]};
+    const blob_grey grey = {at[6], at[7], at[8]};
+    const real reach = at[11];
     int to = 0;
-    blob_edges edges;
-    real own[PADDED_SPOKES], to_x, to_y;
+    local blob_edges edges;
+    local blob_hidden hidden;
+    local blob_room room;
+    local real own[PADDED_SPOKES];
+    real to_x, to_y;
     const blob_layout layout = layout_of(table);
-    for (int i = 0; i < PADDED_SPOKES; i++) {
+    for (int i = GROUP_ITEM; i < PADDED_SPOKES; i += GROUP_ITEMS) {
         edges.x[i] = shape.x + shape.size * layout.bx[i];
         edges.y[i] = shape.y + shape.size * layout.by[i];
         own[i] = weights[i];
     }
-    PUT(background_of(image, rows, columns, x, y, shape, &edges, own, layout, grey.blur));
-    PUT(gravity_of(image, rows, columns, x, y, reach, &to_x, &to_y));
+    group_barrier();
+    PUT(background_of(image, rows, columns, x, y, shape, &edges, own, layout, grey.blur, &room));
+    PUT(gravity_of(image, rows, columns, x, y, reach, 1, &room, &to_x, &to_y));
     PUT(to_x), PUT(to_y);
-    blob_hidden hidden = hidden_of(shape, table, weights, grey.blur);
+    if (GROUP_ITEM == 0) hide(shape, own, layout, (real)0.3f, grey.blur, &hidden);
+    group_barrier();
     PUT(hidden.count), PUT(hidden.half_width), PUT(hidden.half_length);
     PUT(hidden.x[0]), PUT(hidden.y[0]), PUT(hidden.nx[0]), PUT(hidden.ny[0]);
-    if (at[12] == 0) hidden.count = 0;
-    match_sums sums;
-    match_summed(image, rows, columns, x + shape.x, y + shape.y, shape, grey, slope_x, slope_y, scale, reach, &hidden,
-                 &sums);
-    PUT(sums.pixels), PUT(sums.count), PUT(sums.weights), PUT(sums.squares);
-    for (int i = 0; i < UNKNOWNS; i++) PUT(sums.right[i]);
-    for (int i = 0; i < UNKNOWN_CELLS; i++) PUT(sums.matrix[i]);
-    real covariance[FREEDOMS][FREEDOMS];
-    PUT(match(image, rows, columns, x, y, at[13], (real)1, &hidden, &shape, &grey, covariance));
-    PUT_SHAPE(shape);
-    PUT(grey.background), PUT(grey.contrast), PUT(grey.blur);
+    group_barrier();
+    if (GROUP_ITEM == 0 && at[12] == 0) hidden.count = 0;
+    group_barrier();
+    reals sums[MATCH_SUMS];
+    match_summed(image, rows, columns, x + shape.x, y + shape.y, shape, grey, at[9], at[10], scale, reach, &hidden,
+                 GROUP_ITEM, sums);
+    group_add_up(sums, MATCH_SUMS, ROUND_SUMS, room.sums);
+    PUT(sums[MATCH_PIXELS]), PUT(sums[MATCH_COUNT]), PUT(sums[MATCH_WEIGHT]), PUT(sums[MATCH_SQUARE]);
+    for (int i = 0; i < UNKNOWNS; i++) PUT(sums[MATCH_RIGHT + i]);
+    for (int i = 0; i < UNKNOWN_CELLS; i++) PUT(sums[i]);
+}
+
+// The match; its numbers come behind the numbers of `greys`.
+kernel void matches(global const CODE *image, global const real *given, global const real *weights,
+                    constant real *table, global real *made, const int rows, const int columns, const real scale) {
+    const size_t n = get_group_id(0);
+    global const real *at = given + 14 * n;
+    global real *out = made + n * 128;
+    int to = 15 + UNKNOWNS + UNKNOWN_CELLS;
+    local blob_hidden hidden;
+    local blob_match match;
+    local blob_room room;
+    if (GROUP_ITEM == 0) {
+        const blob_shape shape = {at[2], at[3], at[4], at[5]};
+        const blob_grey grey = {at[6], at[7], at[8]};
+        match.first = match.shape = shape;
+        match.grey = grey;
+        match.slope_x = match.slope_y = 0;
+        match.state = MATCH_RUNS;
+        hidden.count = 0;
+    }
+    group_barrier();
+    match_image(&match, image, rows, columns, at[0], at[1], at[13], (real)1, &hidden, &room);
+    PUT(match.state == MATCH_ENDS);
+    PUT_SHAPE(match.shape);
+    PUT(match.grey.background), PUT(match.grey.contrast), PUT(match.grey.blur);
     for (int j = 0; j < FREEDOMS; j++)
-        for (int k = 0; k < FREEDOMS; k++) PUT(covariance[j][k]);
+        for (int k = 0; k < FREEDOMS; k++) PUT(match.covariance[j][k]);
 }
 """
 
@@ -198,7 +241,7 @@ def test_levels_and_their_derivatives(device: Device, shape: str, rng: np.random
     numbers = np.array([0.0, 0.0, 9.0, 0.0 if shape == "ring" else 0.35, 1.2])
     places = rng.uniform(-15.0, 15.0, (3000, 2)).astype(np.float32)
     shape_numbers = np.array([*numbers[2:]], np.float32)
-    made = run(device, cl.Kernel(program, "models"), 3000, places, shape_numbers, np.zeros((3000, 6), np.float32))
+    made = run(device, (cl.Kernel(program, "models"),), 3000, places, shape_numbers, np.zeros((3000, 6), np.float32))
     dx, dy = places.astype(np.float64).T
     np.testing.assert_allclose(made[:, 0], level_of(shape, dx, dy, numbers), rtol=0, atol=8e-4)
     expected = slopes_of(shape, dx, dy, numbers)
@@ -221,12 +264,19 @@ def prepared(device: Device, folder: Path, shape: str) -> tuple[Any, Reals]:
     return program, np.asarray(launch.arguments[1])
 
 
-def run(device: Device, kernel: Any, count: int, *arguments: Any) -> Reals:
-    """Return the fifth-last array argument after the kernel."""
+def run(device: Device, kernels: tuple[Any, ...], count: int, *arguments: Any, group: int = 1) -> Reals:
+    """Return the last array argument after the kernels have run with `count` groups, or items with a group of 1."""
     given = [cl.array.to_device(device.queue, each) if isinstance(each, np.ndarray) else each for each in arguments]
-    kernel(device.queue, (count,), None, *(each.data if isinstance(each, cl.array.Array) else each for each in given))
+    data = [each.data if isinstance(each, cl.array.Array) else each for each in given]
+    for kernel in kernels:
+        kernel(device.queue, (count * group,), (group,) if group > 1 else None, *data)
     arrays = [each for each in given if isinstance(each, cl.array.Array)]
     return np.asarray(arrays[-1].get(), np.float64)
+
+
+def grey_kernels(program: Any) -> tuple[Any, Any]:
+    """Return the kernels of the steps on grey levels: sums over the pixels, and the match."""
+    return cl.Kernel(program, "greys"), cl.Kernel(program, "matches")
 
 
 def tukey(z: Reals) -> Reals:
@@ -247,7 +297,7 @@ class Edges:
     blur: Reals
     noise: Reals
     there: Reals
-    saturated: Reals
+    flags: NDArray[np.int_]
     table: Reals
     is_round: bool
     freedoms: int = field(init=False)
@@ -312,7 +362,9 @@ def some_edges(rng: np.random.Generator, table: Reals, shape: Reals, is_round: b
     there = (rng.random(SPOKES) > 0.1).astype(float)
     amplitude = -rng.uniform(40.0, 120.0, SPOKES) * np.where(rng.random(SPOKES) < 0.2, -1.0, 1.0) * there
     numbers = (amplitude, rng.uniform(0.5, 2.0, SPOKES), rng.uniform(0.01, 0.04, SPOKES), there)
-    return Edges(*place.T, *numbers, (rng.random(SPOKES) < 0.05).astype(float), table, is_round)
+    flags = (rng.random((3, SPOKES)) < 0.1).astype(int)
+    every_flag = Status.SATURATED * flags[0] + Status.OUT_OF_RANGE * flags[1] + Status.NOT_FINITE * flags[2]
+    return Edges(*place.T, *numbers, every_flag, table, is_round)
 
 
 @SHAPES
@@ -327,10 +379,10 @@ def test_steps_of_the_fit_to_edges(device: Device, shape: str, rng: np.random.Ge
         shapes.append(true + np.append(rng.normal(0.0, 0.2, 3), 0.0 if is_round else 0.02))
     given = np.zeros((len(edges), 7, PADDED), np.float32)
     for row, each in zip(given, edges, strict=True):
-        row[:, :SPOKES] = (each.x, each.y, each.amplitude, each.blur, each.noise, each.there, each.saturated)
+        row[:, :SPOKES] = (each.x, each.y, each.amplitude, each.blur, each.noise, each.there, each.flags)
     numbers = (np.float32(value) for value in (scale, across, REACH, search, OVERLAP))
     inputs = (given, np.array(shapes, np.float32), table, np.zeros((len(edges), 512), np.float32))
-    made = run(device, cl.Kernel(program, "fits"), len(edges), *inputs, *numbers)
+    made = run(device, (cl.Kernel(program, "fits"),), len(edges), *inputs, *numbers, group=64)
     for each, near, out in zip(edges, shapes, made, strict=True):
         assert_fits(each, near, out, scale, across, search)
 
@@ -338,7 +390,7 @@ def test_steps_of_the_fit_to_edges(device: Device, shape: str, rng: np.random.Ge
 def assert_fits(each: Edges, near: Reals, out: Reals, scale: float, across: float, search: float) -> None:
     """Assert that the numbers of the kernel `fits` for some edges, near a shape, have the values of `Edges`."""
     freedoms, bent = each.freedoms, across
-    parts = np.split(out, np.cumsum([SPOKES * (freedoms + 1), 4, 1, 6, 7, freedoms**2, 6, 3, SPOKES]))
+    parts = np.split(out, np.cumsum([SPOKES * (freedoms + 1), 4, 1, 6, 7, freedoms**2, 6, 5, SPOKES]))
     equations, start, scale_, step, fit, covariance, quality, kept, there, _ = parts
     off, rows = each.residuals(near, bent)
     np.testing.assert_allclose(equations.reshape(SPOKES, -1), np.column_stack([off, rows]), rtol=1e-5, atol=1e-5)
@@ -375,7 +427,7 @@ def assert_fits(each: Edges, near: Reals, out: Reals, scale: float, across: floa
         np.sum(np.sqrt(weight * np.roll(weight, SPOKES // 2)) * alike) / SPOKES,
         -np.sum(weight * each.amplitude) / weight.sum(),
         count,
-        np.any(each.saturated[is_in] > 0.0),
+        np.any(each.flags[is_in] & Status.SATURATED),
         1.0,
     ]
     np.testing.assert_allclose(quality, numbers, rtol=1e-3, atol=1e-5)
@@ -383,7 +435,9 @@ def assert_fits(each: Edges, near: Reals, out: Reals, scale: float, across: floa
     sign = math.copysign(1.0, each.amplitude.sum())
     keeps = (each.there > 0.0) & (np.abs(at_start) <= search) & (sign * each.amplitude > 0.0)
     np.testing.assert_array_equal(there, keeps)
-    np.testing.assert_allclose(kept, [keeps.sum(), each.noise[keeps].mean(), each.blur[keeps].mean()], rtol=1e-5)
+    counts = [np.sum(each.flags & flag > 0) for flag in (Status.OUT_OF_RANGE, Status.NOT_FINITE)]
+    means = [each.noise[keeps].mean(), each.blur[keeps].mean()]
+    np.testing.assert_allclose(kept, [keeps.sum(), *means, *counts], rtol=1e-5)
 
 
 def assert_converged(each: Edges, near: Reals, fit: Reals, across: float) -> None:
@@ -421,7 +475,7 @@ def test_steps_of_the_fit_to_grey_levels(
     weights = np.ones(PADDED)
     weights[[3, 17]] = 0.49, 0.5
     weights[SPOKES:] = 0.0
-    kernel = cl.Kernel(program, "greys")
+    kernels = grey_kernels(program)
     rows, columns = np.indices(SIZE).astype(np.float64)
     for x, y, reach in ((40.0, 33.0, 13.0), (11.45, 22.75, 15.5)):
         numbers = np.array([0.4, -0.3, 9.0, 0.0 if is_round else 0.3, 1.2])
@@ -435,7 +489,7 @@ def test_steps_of_the_fit_to_grey_levels(
         given = [x, y, *numbers[:4], background, contrast, numbers[4], slope_x, slope_y, reach, is_hidden, 3.0]
         arguments = (np.array(given, np.float32), weights.astype(np.float32), table, np.zeros(128, np.float32))
         scale = 0.2
-        out = run(device, kernel, 1, image, *arguments, *map(np.int32, SIZE), np.float32(scale))
+        out = run(device, kernels, 1, image, *arguments, *map(np.int32, SIZE), np.float32(scale), group=64)
         # Background: the nearest pixels 2.5 blurs and half a pixel beyond the edges.
         turn = np.array([[math.cos(numbers[3]), -math.sin(numbers[3])], [math.sin(numbers[3]), math.cos(numbers[3])]])
         beyond = 2.5 * numbers[4] + 0.5
@@ -476,7 +530,7 @@ def test_the_match_finds_all_unknowns(device: Device, shape: Any, rng: np.random
     """From a start that is off in all of them; its covariance is that of least squares over the pixels."""
     program, table = prepared(device, tmp_path, shape)
     is_round = shape == "ring"
-    kernel = cl.Kernel(program, "greys")
+    kernels = grey_kernels(program)
     rows, columns = np.indices(SIZE).astype(np.float64)
     numbers = np.array([0.4, -0.3, 9.0, 0.0 if is_round else 0.3, 1.2])
     dx, dy = columns - 36.0, rows - 30.0
@@ -487,7 +541,7 @@ def test_the_match_finds_all_unknowns(device: Device, shape: Any, rng: np.random
         image = (plane + contrast * level + rng.normal(0.0, noise, SIZE)).astype(np.float32)
         start = [36.0, 30.0, *(numbers[:4] + off), 56.0, 0.9 * contrast, 1.35, 0.0, 0.0, 8.0, 0.0, noise]
         arguments = (np.array(start, np.float32), np.ones(PADDED, np.float32), table, np.zeros(128, np.float32))
-        out = run(device, kernel, 1, image, *arguments, *map(np.int32, SIZE), np.float32(0.2))
+        out = run(device, kernels, 1, image, *arguments, *map(np.int32, SIZE), np.float32(0.2), group=64)
         freedoms = 3 if is_round else 4
         at = 15 + freedoms + 5 + (freedoms + 5) * (freedoms + 6) // 2
         found = out[at : at + 8]
@@ -522,8 +576,8 @@ def test_a_match_of_few_pixels_or_far_from_its_start_fails(
     image[distance > outside[int((1.0 - lost) * (outside.size - 1))]] += 500.0 if lost else 0.0
     start = [36.0, 30.0, off, 0.0, 8.0, 0.1, 50.0, 80.0, 1.2, 0.0, 0.0, 8.0, 0.0, 2.0]
     arguments = (np.array(start, np.float32), np.ones(PADDED, np.float32), table, np.zeros(128, np.float32))
-    kernel = cl.Kernel(program, "greys")
-    out = run(device, kernel, 1, image.astype(np.float32), *arguments, *map(np.int32, SIZE), np.float32(0.2))
+    kernels = grey_kernels(program)
+    out = run(device, kernels, 1, image.astype(np.float32), *arguments, *map(np.int32, SIZE), np.float32(0.2), group=64)
     assert out[15 + 9 + 45] == is_found
 
 
@@ -543,7 +597,7 @@ def test_a_match_ends_with_the_first_small_step(
     scale, reach = (0.1 + 4.0 * noise / contrast) / 6.0, start[2] + 5.0 * start[4] + 2.0
     given = [36.0, 30.0, *start[:4], background, contrast, start[4], 0.0, 0.0, reach, 0.0, noise]
     arguments = (np.array(given, np.float32), np.ones(PADDED, np.float32), table, np.zeros(128, np.float32))
-    out = run(device, cl.Kernel(program, "greys"), 1, image, *arguments, *map(np.int32, SIZE), np.float32(scale))
+    out = run(device, grey_kernels(program), 1, image, *arguments, *map(np.int32, SIZE), np.float32(scale), group=64)
     unknowns = 9
     matrix = np.zeros((unknowns, unknowns))
     matrix[np.tril_indices(unknowns)] = out[15 + unknowns : 15 + unknowns + 45]
@@ -569,7 +623,7 @@ def gravity(image: Reals, x: float, y: float, reach: float) -> Reals:
 def test_centroids(device: Device, rng: np.random.Generator, tmp_path: Path) -> None:
     """Pixels at the limits of disc and ring belong to them; no other pixel matters, and the ring is in the image."""
     program, table = prepared(device, tmp_path, "square")
-    kernel = cl.Kernel(program, "greys")
+    kernels = grey_kernels(program)
     rows, columns = np.indices(SIZE)
     last_x, last_y = SIZE[1] - 1, SIZE[0] - 1
     off = 1.0 / 64.0
@@ -591,7 +645,7 @@ def test_centroids(device: Device, rng: np.random.Generator, tmp_path: Path) -> 
         image = image.astype(np.float32)
         given = [x, y, 0.0, 0.0, 9.0, 0.0, 50.0, 80.0, 1.2, 0.0, 0.0, reach, 0.0, 3.0]
         arguments = (np.array(given, np.float32), np.ones(PADDED, np.float32), table, np.zeros(128, np.float32))
-        out = run(device, kernel, 1, image, *arguments, *map(np.int32, SIZE), np.float32(0.2))
+        out = run(device, kernels, 1, image, *arguments, *map(np.int32, SIZE), np.float32(0.2), group=64)
         assert out[1] == is_inside
         if is_inside:
             np.testing.assert_allclose(out[2:4], gravity(image.astype(np.float64), x, y, reach), rtol=1e-4, atol=1e-4)
@@ -607,8 +661,17 @@ def test_a_centroid_outside_of_the_disc_is_none(device: Device, tmp_path: Path) 
             image = np.where(np.hypot(columns - 30.0, rows - 28.0) <= 5.0, 80.0 * (1.0 + plane), 0.0)
             given = [30.0, 28.0, 0.0, 0.0, 9.0, 0.0, 50.0, 80.0, 1.2, 0.0, 0.0, 5.0, 0.0, 3.0]
             arguments = (np.array(given, np.float32), np.ones(PADDED, np.float32), table, np.zeros(128, np.float32))
-            kernel = cl.Kernel(program, "greys")
-            out = run(device, kernel, 1, image.astype(np.float32), *arguments, *map(np.int32, SIZE), np.float32(0.2))
+            kernels = grey_kernels(program)
+            out = run(
+                device,
+                kernels,
+                1,
+                image.astype(np.float32),
+                *arguments,
+                *map(np.int32, SIZE),
+                np.float32(0.2),
+                group=64,
+            )
             assert out[1] == is_found
 
 
@@ -618,6 +681,6 @@ def test_hidden_parts_of_the_contour(device: Device, tmp_path: Path) -> None:
     places = np.stack(np.meshgrid(np.arange(-9.0, 10.0), np.arange(-9.0, 10.0)), axis=-1).reshape(-1, 2)
     x, y = places.T
     arguments = (places.astype(np.float32), np.zeros(len(places), np.float32))
-    made = run(device, cl.Kernel(program, "hiding"), len(places), *arguments)
+    made = run(device, (cl.Kernel(program, "hiding"),), len(places), *arguments)
     one, other = (np.abs(y - 1.0) < 3.0) & (np.abs(x - 2.0) < 2.0), (np.abs(x + 5.0) < 3.0) & (np.abs(y + 3.0) < 2.0)
     np.testing.assert_array_equal(made, one | other)

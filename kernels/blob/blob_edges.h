@@ -7,6 +7,10 @@
 #include "common/group.h"
 #include "ruler/ruler.h"
 
+#if defined(IN_GROUP) && RULER_GROUP != PARTS
+#error "group_add_up takes a part of the pixels from each item"
+#endif
+
 // LANES values of an array of edges, from edge i on.
 #define AT(array, i) (*(GROUP_SPACE reals_at *)((array) + (i)))
 

@@ -45,8 +45,7 @@
 
 // Function without barriers, on private memory, in which an item computes alone. It is not inlined on PoCL: inlined,
 // the eigenvalues of a pose came out wrong while pose.h was written. With its present state PoCL 3.1 passes the tests
-// of test_pose.py in both cases.
-// A pointer to local memory as an argument made its compiler crash (blob_fit.h, blob_match.h).
+// of test_pose.py in both cases. A pointer to local memory as an argument crashed its compiler (blob_match.h).
 //
 // Loops with barriers run at least once (do ... while) and have one exit. PoCL 3.1 copies what follows a branch around a
 // barrier: with five loops that may not run at all, find_blobs did not compile in five minutes, with these loops in 7 s.

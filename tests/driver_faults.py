@@ -52,8 +52,8 @@ FAULTS = (
         "rusticl",
         "22.3",
         r"test_blob_accuracy\.py::|test_maps\.py::test_\w+\[\w+-blob",
-        "Mesa 22.3 did not compile the blob kernel within a minute; not repeated since work-groups find blobs, which it "
-        "compiles in 20 s of processor time",
+        "Mesa 22.3 did not compile the blob kernel within a minute; not repeated since work-groups find blobs, "
+        "which it compiles in 20 s of processor time",
         ends_process=True,
     ),
     DriverFault(

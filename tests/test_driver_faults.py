@@ -19,7 +19,6 @@ ROOT = Path(__file__).resolve().parents[1]
 AFFECTED = {
     "long searches": ("tests/a/test_field_pose.py::test_clutter_of_70_percent[rusticl]", False),
     "times of events": ("tests/host/test_double_rate.py::test_the_kernel_of_the_measurement_runs[rusticl]", True),
-    "blob kernel": ("tests/matching/features/test_blob.py::test_any[rusticl-uint8]", False),
     "accuracy of blobs": ("tests/matching/features/test_blob_accuracy.py::test_any[rusticl]", False),
     "pose of features": ("tests/a/test_feature_pose.py::test_one_kind_of_features_is_enough[rusticl-rulers]", True),
     "features behind a lens": ("tests/a/test_feature_lens.py::test_every_feature_is_measured[rusticl-lens]", True),

@@ -108,6 +108,7 @@ typedef struct {
 #include "line/line_ml.h"
 
 #define NUMBERS 45
+#define WINDOW (2 * RADIUS + 1)
 static inline int put(real *to, Gaussian from) {
     to[0] = from.position, to[1] = from.sigma, to[2] = from.amplitude, to[3] = from.background;
     return 4;

@@ -24,8 +24,8 @@ EPS = float(np.finfo(np.float32).eps)
 LIMITS = (equal("status", reason="compared"), roundings(2, "value", of="value", reason="sum and product"))
 # Cheap operations, for the fast tier.
 CHEAP = ("MergeHeights", "PsdReadout", "Triangulation")
-# Operations and drivers that broke their limits: kind of the device, and start of the version. Centres of blobs were off by
-# up to 0.03 px on Mesa 22.3, with an earlier kernel; PoCL and Intel's runtime kept the limits with its work-items.
+# Operations and drivers that broke their limits: kind of the device, and start of the version. Centres of blobs were
+# off by up to 0.03 px on Mesa 22.3, with an earlier kernel; PoCL and Intel kept the limits with its work-items.
 FAULTY = {"FindBlobs": ("rusticl", "22.3")}
 COSTLY = sorted(set(agreement.stated_limits()) - set(CHEAP))
 

@@ -1,8 +1,8 @@
 """Numbers of boxes and triangles that rays are tested against in the traversal of kernels/common/bvh.h.
 
 The traversal is written again in Numba, one ray after the other, in double precision. The order of the children, the
-early end of an occluded ray and the second test of boxes behind a hit are those of the kernel. A ray does not remember
-the leaf that occluded the ray before it. Empty places of nodes and leaves do not count.
+early end of an occluded ray and the second test of boxes behind a hit are those of the kernel. The leaf that
+occluded the ray before, which the kernel tries first, is not tried. Empty places of nodes and leaves do not count.
 """
 
 from __future__ import annotations

@@ -131,7 +131,7 @@ def _tree_traffic(bound: Bound[Any], tree: Bvh) -> tuple[int, int]:
 
 
 def _traced_flops(tree: Bvh, rays: NDArray[Any], *, end: float, any_hit: bool) -> float:
-    """Return the operations of all rays, from the tests of every so many of them."""
+    """Return the number of operations of all rays, estimated from a regular sample of them."""
     some = rays[:: max(len(rays) // _COUNTED, 1)]
     return len(rays) * visits(tree, some, end=end, any_hit=any_hit).mean_flops()
 

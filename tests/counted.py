@@ -97,11 +97,11 @@ class Counter:
             return 1
         return self._counting(function)(*arguments, **options)
 
-    def _counting(self, function: Any) -> Callable[..., Any]:
+    def _counting(self, function: Callable[..., Any]) -> Callable[..., Any]:
         plain = getattr(function, "py_func", function)
         is_own = inspect.isfunction(plain) and plain.__module__.startswith("gpuvision.")
         if (not is_own and plain is function) or plain.__code__.co_filename == _REWRITTEN:
-            return function  # type: ignore[no-any-return]
+            return function
         if plain not in self._rewritten:
             tree = ast.parse(textwrap.dedent(inspect.getsource(plain)))
             definition = tree.body[0]

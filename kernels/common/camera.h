@@ -271,7 +271,8 @@ static inline __attribute__((always_inline)) masks LANED(camera_approach)(reals 
     reals g = z * LANED(camera_series)(z, c, CAMERA_GUESS_TERMS);
     reals slope = LANED(camera_series)(z, c + CAMERA_GUESS_TERMS, CAMERA_SLOPE_TERMS);
 #ifdef CAMERA_DECENTRED
-    c += CAMERA_GUESS_TERMS + CAMERA_SLOPE_TERMS;  // v0x, v0y, v1x, ... of v, then those of w, 2 v' / reach and `across`
+    // Coefficients v0x, v0y, v1x, ... of v, then of w, of 2 v' / reach, and of `across`.
+    c += CAMERA_GUESS_TERMS + CAMERA_SLOPE_TERMS;
     const reals v_x = c[0] + z * (c[2] + z * c[4]), v_y = c[1] + z * (c[3] + z * c[5]);
     const reals w_x = c[6] + z * (c[8] + z * c[10]), w_y = c[7] + z * (c[9] + z * c[11]);
     g += x * v_x + y * v_y;

@@ -1,7 +1,7 @@
 """Contract of poses: from features with every transform, outliers and missing rows, and from a frame of a board.
 
-The reference is the fixed point of reweighted least squares in float64, from the true pose. For a frame the edges along
-the rulers are those of the reference in float64, and the lines through them fixed points of total least squares.
+The reference is the fixed point of reweighted least squares in float64, from the true pose. For a frame the
+reference finds the edges along the rulers in float64, and repeats total least squares until the lines stay the same.
 """
 
 from __future__ import annotations

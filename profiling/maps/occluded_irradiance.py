@@ -59,7 +59,8 @@ def _integral(x: Floats, z: Floats) -> Floats:
 
 def _bound(places: Floats) -> Floats:
     # Contract of the irradiance: 2e-6, and the light that a receiver gains or loses when it moves by 8 epsilon of the
-    # scene's size. The end of the shadow moves by 1 / gap of this sideways and by its own place over the gap upwards.
+    # scene's size. A sideways move of the receiver moves the end of the shadow 1 / gap times as far, an
+    # upward move place / gap times as far.
     (gap, place), (x, z) = places.T, _receivers(places)
     end = _HALF * place
     moved = 8.0 * _EPS * _SIZE * (1.0 + np.abs(end) / _HEIGHT) / gap

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.simulation.sensors.readings import height_secant
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 
 Reals = npt.NDArray[np.float64]
@@ -68,8 +69,9 @@ class StripErrorModel:
     ) -> StripErrorModel:
         """Return the model of a sensor's strips under the direct light of one profile.
 
-        The slope of a strip is the largest slope of the height H over u between the edges of its bins. Edges beyond
-        the horizon of the sheet are ignored.
+        The slope of a strip is the largest derivative dH/du of the height at the edges of its bins. Without a lens the
+        derivative has its extremes at the ends of an interval, so that no u between the edges has a larger one. Edges
+        beyond the horizon of the sheet are ignored.
 
         Parameters
         ----------
@@ -80,12 +82,12 @@ class StripErrorModel:
         """
         power = exposure.total()
         u, v = np.broadcast_arrays(view.u_edges, view.v_centres[:, None])
-        height = view.sheet_coordinates(view.points_in_sheet(u, v))[..., 1]
-        slope = np.abs(np.diff(height, axis=1) / np.diff(view.u_edges))
+        is_seen = np.isfinite(view.points_in_sheet(u, v)).all(axis=-1)
+        slope = np.abs(height_secant(view.triangulation, u, u, v))
         return cls(
             power=power,
             moment=exposure.first_moment(view.u_edges),
-            slope=np.where(np.isfinite(slope), slope, 0.0).max(axis=1),
+            slope=np.where(is_seen & np.isfinite(slope), slope, 0.0).max(axis=1),
             limits=(view.u_edges[0], view.u_edges[-1]),
             min_power=min_power,
             max_shift=max_shift,

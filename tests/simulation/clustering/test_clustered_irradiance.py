@@ -209,9 +209,9 @@ def test_a_sensor_says_how_its_readings_follow_light() -> None:
     exposure = Exposure(np.ones((one.samples, one.bins)), np.zeros((one.samples, one.bins)))
     reading = StripErrorModel.from_exposure(one, exposure, min_power=1e-3)
     u, v = np.meshgrid(one.u_edges, one.v_centres)
-    height = one.sheet_coordinates(one.points_in_sheet(u, v))[..., 1]
-    steps = np.abs(np.diff(height, axis=1)) / np.diff(one.u_edges)
-    np.testing.assert_allclose(reading.slope, steps.max(axis=1))
+    step = 1e-6 * (one.u_edges[-1] - one.u_edges[0])
+    above, below = (one.sheet_coordinates(one.points_in_sheet(u + each, v))[..., 1] for each in (step, -step))
+    np.testing.assert_allclose(reading.slope, np.abs((above - below) / (2.0 * step)).max(axis=1), rtol=1e-7)
     np.testing.assert_allclose(reading.power, one.bins)
     np.testing.assert_allclose(reading.position, one.u_centres.mean(), atol=1e-12)
     seen = np.ones((one.samples, one.bins))

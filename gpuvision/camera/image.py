@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
+from statistics import NormalDist
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+
+from gpuvision.normal_distribution import MAD_TO_SIGMA
 
 # Smallest width and height [px] in which rulers and blobs have room.
 _MIN_SIZE = 16
@@ -80,15 +84,49 @@ def estimate_pixel_noise(image: npt.NDArray[Any]) -> float:
     Returns
     -------
     float
-        Standard deviation [grey levels]; 0 for an image without finite second differences.
+        Standard deviation [grey levels]; 0 for an image without finite second differences. It includes the rounding of
+        the pixels to integers, whose variance is 1/12.
+
+    Notes
+    -----
+    The median of the differences of an image of integers is an integer or a half: steps of 0.25 grey levels of noise.
+    For such an image the quantile of a normal distribution is interpolated between the edges of the median's bin. The
+    estimate is then within 2 % from 0.5 grey levels of noise, and within 12 % from 0.3 where the levels of the image
+    differ by fractions of a grey level.
 
     References
     ----------
     J. Immerkaer, Fast noise variance estimation, Computer Vision and Image Understanding 64 (1996) 300: the same
     kernel, with the mean instead of the median.
     """
+    differences = _second_differences(image)
+    return _deviation(np.abs(differences[np.isfinite(differences)]))
+
+
+def _second_differences(image: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    """Return the second differences along rows and columns of the pixels that have all neighbours."""
     kernel = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32)
-    differences = cv2.filter2D(image.astype(np.float32), -1, kernel)[1:-1, 1:-1]
-    finite = np.abs(differences[np.isfinite(differences)])
-    # 0.6745 sigma is the median of |N(0, sigma)|; 6 is the root of the kernel's sum of squares.
-    return float(np.median(finite) / (0.6745 * 6.0)) if finite.size else 0.0
+    return np.asarray(cv2.filter2D(image.astype(np.float32), -1, kernel)[1:-1, 1:-1], np.float32)
+
+
+def _deviation(magnitudes: npt.NDArray[np.float32]) -> float:
+    """Return the standard deviation of the noise by the magnitudes of second differences; 0 without one."""
+    # 6 is the root of the kernel's sum of squares.
+    return _median(magnitudes) * MAD_TO_SIGMA / 6.0 if magnitudes.size else 0.0
+
+
+def _median(magnitudes: npt.NDArray[np.float32]) -> float:
+    """Return the median of the magnitudes of normally distributed values, which may be rounded to integers."""
+    median = float(np.median(magnitudes))
+    if np.any(magnitudes != np.rint(magnitudes)):
+        return median
+    middle = math.floor(median)
+    bins = [(middle - 0.5, np.mean(magnitudes < middle)), (middle + 0.5, np.mean(magnitudes <= middle))]
+    # A value of 0 had a magnitude of 0 to 0.5.
+    edges = [(max(edge, 0.0), _quantile(float(share))) for edge, share in bins]
+    return float(np.interp(1.0 / MAD_TO_SIGMA, [each for _, each in edges], [edge for edge, _ in edges]))
+
+
+def _quantile(share: float) -> float:
+    """Return the magnitude [sigma] below which a share of normally distributed values lies."""
+    return NormalDist().inv_cdf((1.0 + share) / 2.0) if share < 1.0 else math.inf

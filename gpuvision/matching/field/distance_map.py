@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Array, Device, FloatArray, Launch, LaunchBuilder, StatusArray, padded_rows
+from gpuvision.host import Array, Device, FloatArray, Launch, LaunchBuilder, StatusArray, padded_rows, vector_work
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite, numbers
 
@@ -20,6 +20,9 @@ ANGLE_ROUNDING = 1e-9
 """Largest difference [rad] of an arc's opening from 2 pi at which it is a circle: rounding of angles, with a margin."""
 _BLOCK, _NEAREST, _MOST_LINES = 64, 4, 256
 _MOST_CELLS = 1 << 26
+# Tile of the vector variant. Rows: chosen, a field of 20 m in cells of 5 cm has 33 work-items; columns: LANES in
+# kernels/common/lanes.h.
+_TILE_ROWS, _TILE_COLUMNS = 16, 16
 
 
 class Arc(NamedTuple):
@@ -175,14 +178,15 @@ class DistanceMapBuilder(VisionOperation[DistanceMapCells]):
         build.check_shape(len(shape) == 1 and shape[0] > 0, "coordinates (columns,)")
         shapes = self.field.shapes.astype(np.float32)
         cells = (self.rows, *shape)
+        in_tiles = build.uses_vectors and shape[0] >= _TILE_COLUMNS
         return build.launch(
             "distance_map/distance_map.cl",
             "distance_map",
-            work=padded_rows(self.rows, shape[0]),
+            work=vector_work(self.rows, _TILE_ROWS) if in_tiles else padded_rows(self.rows, shape[0]),
             outputs=build.outputs(
                 {"distance": cells, "nearest": (*cells, _NEAREST), "level": cells}, nearest=np.uint8, level=np.uint16
             ),
-            defines={"COST_LEVELS": COST_LEVELS},
+            defines={"COST_LEVELS": COST_LEVELS, "TILE_ROWS": _TILE_ROWS, "MAX_SHAPES": _MOST_LINES},
             arguments=[
                 np.float32(self.first_y),
                 np.float32(self.cell),
@@ -190,6 +194,7 @@ class DistanceMapBuilder(VisionOperation[DistanceMapCells]):
                 np.int32(len(shapes)),
                 np.float32(self.scale**2),
                 np.uint32(shape[0]),
+                np.uint32(self.rows),
             ],
         )
 

@@ -11,7 +11,7 @@ import pytest
 from field_maps import large, small
 from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device
-from gpuvision.matching.field.distance_map import Arc, DistanceMap, Field
+from gpuvision.matching.field.distance_map import Arc, DistanceMap, DistanceMapBuilder, Field
 from gpuvision.reference import field as reference
 
 
@@ -27,24 +27,64 @@ def test_distances_are_those_to_the_nearest_line(device: Device) -> None:
         every += [reference.distance_to_arc(arc, np.stack([x, y], axis=-1)) for arc in field_map.field.arcs]
         of_nearest = np.take_along_axis(np.array(every), field_map.cells.nearest[None, ..., 0].astype(int), axis=0)[0]
         np.testing.assert_allclose(of_nearest, exact, atol=8e-6)
-        assert_candidates(field_map, np.array(every))
+        assert_candidates(field_map.cells.nearest, np.array(every), field_map.cell, least=0.3)
         level = 1023.0 * exact**2 / (field_map.scale**2 + exact**2)
         np.testing.assert_allclose(field_map.cells.level, level, atol=0.51)
 
 
-def assert_candidates(field_map: DistanceMap, every: np.ndarray) -> None:
-    """Assert that a cell holds the up to four lines that can be nearest to one of its points, the nearest one first."""
+def assert_candidates(nearest: np.ndarray, every: np.ndarray, cell: float, *, least: float) -> None:
+    """Assert that a cell holds the up to four lines that can be nearest to one of its points, the nearest one first.
+
+    `every`: distances (lines, rows, columns); `least`: least part of the cells in which rounding cannot decide.
+    """
     order = np.argsort(every, axis=0, kind="stable")[:5]
     far = np.take_along_axis(every, order, axis=0)
     # Of a point of the cell a distance differs by half the diagonal at most.
-    limit = far[0] + 1.42 * field_map.cell
-    nearest = np.where(far[:4] <= limit, order[:4], order[0])
-    expected = np.concatenate([nearest, np.repeat(order[:1], 4 - len(nearest), axis=0)])
+    limit = far[0] + 1.42 * cell
+    within = np.where(far[:4] <= limit, order[:4], order[0])
+    expected = np.concatenate([within, np.repeat(order[:1], 4 - len(within), axis=0)])
     # Rounding decides between lines that are equally far, and at the limit.
     clear = (np.diff(far, axis=0) > 1e-4).all(axis=0) & (np.abs(far - limit) > 1e-4).all(axis=0)
-    assert clear.mean() > 0.3
-    found = np.moveaxis(field_map.cells.nearest, -1, 0)
+    assert clear.mean() > least
+    found = np.moveaxis(nearest, -1, 0)
     np.testing.assert_array_equal(found[:, clear], expected[:, clear])
+
+
+@pytest.mark.parametrize("vectors", [pytest.param(True, marks=pytest.mark.vectors), False])
+@pytest.mark.parametrize(
+    ("columns", "rows", "cell", "away"), [(16, 1, 0.5, 0.0), (49, 37, 0.2, 0.0), (33, 19, 0.05, 500.0)]
+)
+def test_lines_left_out_of_a_tile_are_no_candidates(
+    device: Device, rng: np.random.Generator, vectors: bool, columns: int, rows: int, cell: float, away: float
+) -> None:
+    """A field of 256 lines and arcs at any place; columns at unequal distances, in any order."""
+    single = device if vectors else device.without_vectors()
+    lines, places = rng.uniform(-9.0, 9.0, (200, 4)) + away, rng.uniform(-9.0, 9.0, (56, 2)) + away
+    arcs = [
+        Arc(*place, radius, 0.3 * n, 0.3 * n + 0.1 * n)
+        for n, (place, radius) in enumerate(zip(places, rng.uniform(0.1, 9.0, 56), strict=True), 1)
+    ]
+    field = Field(length=20.0, width=20.0, lines=tuple(map(tuple, lines)), arcs=tuple(arcs))
+    x, first = (rng.uniform(-5.0, 5.0, columns) + away).astype(np.float32), away - 0.5 * cell * (rows - 1)
+    made = DistanceMapBuilder(field=field, first_y=first, cell=cell, rows=rows, scale=0.25)(x, device=single)
+    at = np.stack(np.meshgrid(x.astype(np.float64), first + cell * np.arange(rows)), axis=-1)
+    every = [reference.distance_to_line(line, at) for line in field.lines]
+    every += [reference.distance_to_arc(arc, at) for arc in field.arcs]
+    # Roundings of coordinates up to 9 m, or of 500 m.
+    np.testing.assert_allclose(made.distance, np.min(every, axis=0), atol=1e-7 * (20.0 + away))
+    assert_candidates(made.nearest, np.array(every), cell, least=0.3)
+
+
+@pytest.mark.parametrize("vectors", [pytest.param(True, marks=pytest.mark.vectors), False])
+def test_a_line_far_from_the_middle_of_a_tile_is_nearest_at_its_end(device: Device, vectors: bool) -> None:
+    """Columns from -5 to 5 m: at 0 the second line is 9.5 m farther away than the first one, at 5 m it is nearer."""
+    field = Field(length=40.0, width=4.0, lines=((-5.5, -1.0, -5.5, 1.0), (15.0, -1.0, 15.0, 1.0)))
+    build = DistanceMapBuilder(field=field, first_y=0.0, cell=0.01, rows=1, scale=0.25)
+    x = np.linspace(-5.0, 5.0, 16, dtype=np.float32)
+    for at_x in (x, x[::-1].copy()):
+        made = build(at_x, device=device if vectors else device.without_vectors())
+        np.testing.assert_array_equal(made.nearest[0], np.where(at_x > 4.75, 1, 0)[:, None].repeat(4, axis=1))
+        np.testing.assert_allclose(made.distance[0], np.minimum(at_x + 5.5, 15.0 - at_x), atol=1e-6)
 
 
 def test_searched_positions_are_centred_on_the_field(device: Device) -> None:

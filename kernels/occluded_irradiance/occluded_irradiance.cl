@@ -38,36 +38,46 @@ AS_IT_IS kernel void occluded_irradiance(
 ) {
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
     const ulong group = get_group_id(0), groups = get_num_groups(0);
+    const uint of_strip = (each + LANES - 1) / LANES; // blocks of a strip
+    const ulong end_block = strips * (group + 1) / groups * of_strip;
     chunk lit;
+    block blocks[BATCH];
+    packet packed;
+    packed.count = 0;
+    pieces waiting;
+    waiting.count = 0;
+    place to_left = 0, to_right = 0;
     int loaded = -1; // first segment of the chunk that is loaded
-    for (ulong strip = strips * group / groups; strip < strips * (group + 1) / groups; strip++) {
-        place to_left = 0, to_right = 0;
-        for (uint first = 0; first < each; first += LANES) {
-            const ulong row = strip * each + first;
-            block here;
-            load_block(receivers + 6 * row, middle, min((uint)LANES, each - first), &here);
-            uchar flag = STATUS_OK;
-            pieces waiting;
-            waiting.count = 0;
-#ifdef SELECTED
-            const ulong list = strip * ((each + SELECTION_BLOCK - 1) / SELECTION_BLOCK) + first / SELECTION_BLOCK;
-            if (starts[list] < 0 || starts[list + 1] > (int)pick_count) flag |= STATUS_OUT_OF_RANGE;
-            const int end = min(starts[list + 1], (int)pick_count);
-            for (int next = max(starts[list], 0); next < end;) {
-                next = load_selected(segments, selected, next, end, segment_count, middle, &lit, &flag);
-                light_chunk(&tree, &lit, clearance, samples, &here, &waiting, &flag);
-            }
-#else
-            for (int next = 0; next < (int)segment_count; next += SEGMENTS) {
-                if (loaded != next) load_from(segments, next, (int)segment_count, middle, &lit);
-                loaded = next;
-                light_chunk(&tree, &lit, clearance, samples, &here, &waiting, &flag);
-            }
-#endif
-            finish(&waiting, here.sums);
-            store_block(&here, flag, irradiance + row, status + row, weights + 2 * row, &to_left, &to_right);
+    for (ulong begin = strips * group / groups * of_strip; begin < end_block; begin += BATCH) {
+        const uint count = (uint)min((ulong)BATCH, end_block - begin);
+        uchar flag = STATUS_OK;
+        for (uint n = 0; n < count; n++) {
+            const uint first = (begin + n) % of_strip * LANES;
+            const ulong row = (begin + n) / of_strip * each + first;
+            load_block(receivers + 6 * row, middle, min((uint)LANES, each - first), blocks + n);
         }
-        left[strip] = (real)to_left, right[strip] = (real)to_right;
+#ifdef SELECTED
+        if (starts[begin] < 0 || starts[begin + 1] > (int)pick_count) flag |= STATUS_OUT_OF_RANGE;
+        const int end = min(starts[begin + 1], (int)pick_count);
+        for (int next = max(starts[begin], 0); next < end;) {
+            next = load_selected(segments, selected, next, end, segment_count, middle, &lit, &flag);
+            light_chunk(&tree, &lit, clearance, samples, blocks, count, &packed, &waiting, &flag);
+        }
+#else
+        for (int next = 0; next < (int)segment_count; next += SEGMENTS) {
+            if (loaded != next) load_from(segments, next, (int)segment_count, middle, &lit);
+            loaded = next;
+            light_chunk(&tree, &lit, clearance, samples, blocks, count, &packed, &waiting, &flag);
+        }
+#endif
+        finish(&waiting);
+        for (uint n = 0; n < count; n++) {
+            const uint first = (begin + n) % of_strip * LANES;
+            const ulong strip = (begin + n) / of_strip, row = strip * each + first;
+            if (first == 0) to_left = 0, to_right = 0;
+            store_block(blocks + n, flag, irradiance + row, status + row, weights + 2 * row, &to_left, &to_right);
+            if (first + LANES >= each) left[strip] = (real)to_left, right[strip] = (real)to_right;
+        }
     }
 }
 #else

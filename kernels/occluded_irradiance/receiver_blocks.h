@@ -201,17 +201,16 @@ static inline observer observer_of(const packet *here, int lane) {
                       here->at[3][lane], here->at[4][lane], here->at[5][lane]};
 }
 
-// Append the visible parts of a line that the receiver of a lane faces.
-static inline void add_light(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, real clearance,
-                      uint samples, const packet *here, pieces *waiting) {
+// Append the visible parts of a line, with axes `of`, that the receiver of a lane faces.
+static inline void add_light(const bvh_tree *tree, const chunk *lit, int line, const segment_axes *of, const before *all,
+                             int lane, real clearance, uint samples, const packet *here, pieces *waiting) {
     const uint members = lit->members[line];
 #if defined(INTERVALS)
     if (!(members & lit->unseen)) {
         receiving seen = {lit, line, lane, all, waiting, here->sum[lane]};
-        const segment_axes of = axes_of(&lit->lines, line);
         const placement from = placement_of(&all->whole, lane);
         const observer at = observer_of(here, lane);
-        view v = view_from(&of, &from, &at, clearance);
+        view v = view_from(of, &from, &at, clearance);
         hidden dark;
         if (!add_visible(tree, &from, &v, &dark, &seen)) *here->flag[lane] = STATUS_AMBIGUOUS;
         return;
@@ -224,10 +223,10 @@ static inline void add_light(const bvh_tree *tree, const chunk *lit, int line, c
 #if defined(RAYS)
         if (!(members & lit->unseen)) {
             receiving seen = {lit, line, lane, all, waiting, here->sum[lane], k};
-            const segment_axes of = axes_of(&lit->each, k);
+            const segment_axes own_axes = axes_of(&lit->each, k);
             const placement from = placement_of(own, lane);
             const observer at = observer_of(here, lane);
-            add_sampled(tree, &of, &from, &at, clearance, samples, &seen);
+            add_sampled(tree, &own_axes, &from, &at, clearance, samples, &seen);
             continue;
         }
 #endif
@@ -245,8 +244,9 @@ static inline void light_packet(const bvh_tree *tree, const chunk *lit, int line
         if (members == (1u << k)) all->own[k] = all->whole, all->lanes[k] = lanes;
         else all->lanes[k] = face(here, &lit->each, k, all->own + k);
     }
+    const segment_axes of = axes_of(&lit->lines, line);
     for (; lanes; lanes &= lanes - 1)
-        add_light(tree, lit, line, all, lowest_bit(lanes), clearance, samples, here, waiting);
+        add_light(tree, lit, line, &of, all, lowest_bit(lanes), clearance, samples, here, waiting);
 }
 
 // Copy a receiver to the next lane of a packet.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -79,8 +80,7 @@ class LightCut:
         blocks, pairs = strips * -(-count // BLOCK), strips * count * len(segments)
         return cls(
             np.asarray(segments, np.float64),
-            np.arange(blocks + 1, dtype=np.int32) * np.int32(len(segments)),
-            np.tile(np.arange(len(segments), dtype=np.int32), blocks),
+            *_full_lists(blocks, len(segments)),
             tolerance,
             np.zeros(strips),
             reading.max_error(),
@@ -133,6 +133,16 @@ class LightCut:
             "clusters": len(self.segments) - self.counts["segments"],
             **self.counts,
         }
+
+
+@functools.lru_cache(maxsize=16)
+def _full_lists(blocks: int, segments: int) -> tuple[Integers, Integers]:
+    """Return `starts` and `selected` of lists with all segments for each block: read-only, shared by cuts of a size."""
+    starts = np.arange(blocks + 1, dtype=np.int32) * np.int32(segments)
+    selected = np.tile(np.arange(segments, dtype=np.int32), blocks)
+    for array in (starts, selected):
+        array.flags.writeable = False
+    return starts, selected
 
 
 def _finite_max(values: Reals) -> float | None:

@@ -11,7 +11,7 @@ import pytest
 from gpuvision.host import Device
 from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.reference import light_clustering as reference
-from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance, estimate_facing_pairs
+from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance, estimate_pairs
 from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.sensor_view import Exposure
@@ -152,8 +152,9 @@ def test_where_clustering_costs_more_all_pairs_are_computed(device: Device) -> N
 @pytest.mark.double
 def test_what_faces_each_other_decides_whether_there_is_a_plan(device: Device) -> None:
     scene, segments, receivers, weights, reading = groove(8, 40, 50)
-    pairs = receivers[..., 0].size * len(segments)
-    gain = estimate_facing_pairs(segments, receivers, weights) - pairs // 4
+    facing, pairs = estimate_pairs(segments, receivers, weights)
+    assert pairs == receivers[..., 0].size * len(segments)
+    gain = facing - pairs // 4
     assert 0 < gain < pairs // 2
     results = [
         ClusteredIrradiance(scene=scene, tolerance=1e-4, min_facing_pairs=least, device=device)(
@@ -174,33 +175,54 @@ def test_what_faces_each_other_decides_whether_there_is_a_plan(device: Device) -
 
 def test_few_pairs_face_each_other_on_a_board() -> None:
     triangles, segments = boxes(np.random.default_rng(0), 12)
-    receivers = strips(triangles, 6, 50)
-    weights = np.ones((*receivers.shape[:2], 2))
+    receivers = strips(triangles, 1, 60)
+    weights = np.ones((1, 60, 2))
     middle = 0.5 * (segments[:, :3] + segments[:, 3:6])
     offset = receivers.reshape(-1, 1, 6)[..., :3] - middle
     faces = (np.sum(offset * segments[:, 6:9], axis=2) > 0.0) & (
         np.sum(offset * receivers.reshape(-1, 1, 6)[..., 3:], axis=2) < 0.0
     )
-    expected = int(np.count_nonzero(faces[:100]))
-    weights[2:] = 0.0
-    # The sample contains all of 100 receivers and 23 segments.
-    assert estimate_facing_pairs(segments, receivers, weights) == expected
-    assert 0 < expected < faces[:100].size // 4
+    weights[0, :10] = 0.0
+    weights[0, 10:20, 1] = 0.0
+    expected = int(np.count_nonzero(faces[10:]))
+    # The sample contains all of 60 receivers and 23 segments.
+    assert estimate_pairs(segments, receivers, weights) == (expected, 50 * len(segments))
+    assert 0 < expected < faces.size // 4
 
 
 def test_facing_pairs_are_estimated_where_there_are_many() -> None:
     _, segments, receivers, weights, _ = groove(40, 40, 200)
     pairs = receivers[..., 0].size * len(segments)
-    # Half of the pairs; the counts of receivers and segments of each side are exact to one.
-    assert abs(estimate_facing_pairs(segments, receivers, weights) - pairs / 2) <= pairs * (1 / 127 + 1 / 61)
+    # Half of the pairs; the counts of receivers and segments of each side are exact to one in a sample of 60 and 33.
+    facing, counted = estimate_pairs(segments, receivers, weights)
+    assert abs(facing - pairs / 2) <= pairs * (1 / 60 + 1 / 33)
+    assert counted == pairs
+    weights[20:] = 0.0
+    facing, counted = estimate_pairs(segments, receivers, weights)
+    assert abs(facing - pairs / 4) <= pairs * (1 / 60 + 1 / 33)
+    assert abs(counted - pairs / 2) <= pairs / 60
+
+
+@pytest.mark.parametrize("each", [8, 30, 61, 64])
+def test_the_sample_has_receivers_from_all_parts_of_a_strip(each: int) -> None:
+    count = 20 * each  # strips: the step without this condition would be a multiple of the length of a strip
+    segments = np.array([[-1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]])
+    receivers = np.tile([0.0, 1.0, 1.0, 0.0, 1.0, 0.0], (count, each, 1))
+    for half in (slice(each // 2), slice(each // 2, each)):
+        facing = receivers.copy()
+        facing[:, half, 4] = -1.0
+        share = len(range(each)[half]) / each
+        found, pairs = estimate_pairs(segments, facing, np.ones((count, each, 2)))
+        assert pairs == count * each
+        assert abs(found - share * pairs) <= 0.1 * pairs
 
 
 def test_without_light_or_receivers_nothing_is_lit(device: Device) -> None:
     scene, segments, receivers, weights, reading = groove(2, 16, 20)
     light = ClusteredIrradiance(scene=scene, tolerance=1e-4, device=device)
     assert not light(segments[:0], receivers, weights, reading).irradiance.any()
-    assert estimate_facing_pairs(segments[:0], receivers, weights) == 0
-    assert estimate_facing_pairs(segments, receivers, 0.0 * weights) == 0
+    assert estimate_pairs(segments[:0], receivers, weights) == (0, 0)
+    assert estimate_pairs(segments, receivers, 0.0 * weights) == (0, 0)
 
 
 def test_a_sensor_says_how_its_readings_follow_light() -> None:

@@ -511,6 +511,9 @@ from .workflows.planning import (
     LocationJob as LocationJob,
 )
 from .workflows.planning import (
+    PlacementJob as PlacementJob,
+)
+from .workflows.planning import (
     ScanJob as ScanJob,
 )
 from .workflows.planning import (

@@ -132,14 +132,15 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Any:
     ValueError
         The shape differs, or a number is infinite or NaN.
     """
-    wrong = TypeError(f"{what} must be numbers of shape {shape}, got {values!r}")
     try:
         given = np.asarray(values)
-        if given.dtype.kind not in "iufO":  # a bool, a text or a complex number is not a number here
-            raise wrong
-        array = given.astype(np.float64)
+        # A bool, a text or a complex number is not a number here.
+        array = given.astype(np.float64) if given.dtype.kind in "iufO" else None
     except (TypeError, ValueError):
-        raise wrong from None
+        array = None
+    if array is None:
+        # Made here only: the text of an array takes about 30 us, and a servo loop checks arrays in each frame.
+        raise TypeError(f"{what} must be numbers of shape {shape}, got {values!r}")
     if array.shape != shape:
         raise ValueError(f"{what} has shape {array.shape}, expected {shape}")
     if not np.all(np.isfinite(array)):

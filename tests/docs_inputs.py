@@ -76,6 +76,12 @@ def _board(folder: Path) -> dict[str, Any]:
     return {}
 
 
+def _gerbers(folder: Path) -> dict[str, Any]:
+    (folder / "gerbers").mkdir()
+    board_folder(folder / "gerbers")
+    return {}
+
+
 def _floor(folder: Path) -> dict[str, Any]:
     field = gv.read_field("robocup_msl")
     shape, rng = (400, 440), np.random.default_rng(1)
@@ -108,6 +114,7 @@ INPUTS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "docs/guides/simulate_part.md": _part,
     "docs/guides/locate_board.md": _board,
     "docs/guides/plan_location.md": _board,
+    "docs/guides/plan_placement.md": _gerbers,
     "docs/guides/locate_robot.md": _floor,
     "docs/guides/inspect_paste.md": _paste,
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,10 +18,18 @@ from gpuvision.cli.arguments import (
     prints_report,
     progress_bar,
     quantities,
+    reject_unused,
     write_report,
 )
+from gpuvision.cli.place_plan import claim_placement_plan, make_placement_plan, write_placement_plan
 from gpuvision.cli.select import Side
 
+if TYPE_CHECKING:
+    from gpuvision.matching.artwork.artwork import Artwork
+    from gpuvision.workflows.placement_cell import Repeatability
+    from gpuvision.workflows.placing import PlacementResult
+
+_BUDGET = 60  # number of rulers
 _LARGEST_BOARD = 1.0  # largest coordinate on a board [m] (chosen: panels are smaller)
 _FILES = ("report.json", "placements.png", "features.png", "repeatability.png")
 
@@ -37,8 +45,35 @@ Target = Annotated[
     str,
     typer.Option(metavar="X,Y,THETA", help="Place of the part on the board and its angle, such as 12mm,8mm,90deg."),
 ]
-Rate = Annotated[
+FrameRate = Annotated[
     float | None, typer.Option(min=1.0, max=1e7, help="Frames per second. Default: the value in the machine file.")
+]
+Tolerance = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LENGTH",
+        help="Largest error of the placement, root mean square, such as 5um: choose camera window, observer, gain and "
+        "tolerance of the release, the fastest that meet it.",
+    ),
+]
+PlacementRate = Annotated[
+    float | None, typer.Option(help="With --tolerance: placements per second that the plan must keep up with.")
+]
+PartRadius = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LENGTH",
+        help="With --tolerance: distance from the nozzle at which the error counts, such as 2mm. Default: the "
+        "tolerances of the machine, position over angle.",
+    ),
+]
+OnlyPlan = Annotated[
+    bool,
+    typer.Option(
+        "--plan",
+        help="With --tolerance: only print the settings that were tried with their predicted errors and times, and "
+        "write plan.png and machine.toml to --out. No other placements.",
+    ),
 ]
 Results = Annotated[
     Path,
@@ -55,12 +90,16 @@ def place(
     machine: MachineFile,
     at: Target,
     out: Results,
-    rate: Rate = None,
+    frame_rate: FrameRate = None,
     count: Annotated[int, typer.Option(min=1, max=10_000, help="Number of placements.")] = 20,
-    budget: Annotated[int, typer.Option(min=3, max=1000, help="Number of calipers (rulers).")] = 60,
+    budget: Annotated[int, typer.Option(min=3, max=1000, help="Number of calipers (rulers).")] = _BUDGET,
     seed: Annotated[int, typer.Option(min=0, max=(1 << 32) - 1, help="Seed of all random numbers.")] = 0,
     side: Annotated[Side, typer.Option(help="Side of the board on which parts are placed.")] = Side.top,
     layers: LayerNames = None,
+    tolerance: Tolerance = None,
+    rate: PlacementRate = None,
+    part_radius: PartRadius = None,
+    only_plan: OnlyPlan = False,
     as_json: ReportFile = None,
     device: DeviceLabel = None,
     overwrite: Overwrite = False,
@@ -78,8 +117,6 @@ def place(
     from gpuvision.host.outputs import Outputs
     from gpuvision.matching.artwork.artwork import read_artwork
     from gpuvision.matching.features.feature_set import edge_clearance
-    from gpuvision.plots.board import draw_features
-    from gpuvision.plots.placement import draw_placements, draw_repeatability
     from gpuvision.servoing.placement.plan import placement_imaging
     from gpuvision.workflows.placement_cell import measure_repeatability
     from gpuvision.workflows.placing import simulate_placements
@@ -87,15 +124,29 @@ def place(
     target = quantities(at, "--at", "m,m,rad")
     if max(abs(target[0]), abs(target[1])) > _LARGEST_BOARD:
         raise ValueError(f"--at is {at!r}, expected at most {_LARGEST_BOARD:g} m; numbers need units: 9mm,9mm,90deg")
-    outputs = Outputs("place", inputs=[gerbers, machine, *named_files(machine)], overwrite=overwrite)
-    outputs.claim(as_json)
-    outputs.claim_folder(out, _FILES)
-    described = read_machine(machine, rate=rate)
+    if tolerance is None:
+        reject_unused("without --tolerance", rate=rate, part_radius=part_radius)
+    inputs: list[str | Path] = [gerbers, machine, *named_files(machine)]
+    if only_plan:
+        outputs = claim_placement_plan(tolerance, inputs, out, as_json, overwrite=overwrite)
+    else:
+        outputs = Outputs("place", inputs=inputs, overwrite=overwrite)
+        outputs.claim(as_json)
+        outputs.claim_folder(out, _FILES)
+    described = read_machine(machine, rate=frame_rate)
     clearance = edge_clearance(placement_imaging(described))
     artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=clearance)
     for each in artwork.warnings:
         echo(f"warning: {each}", err=True)
     chosen = None if device is None else Device.named(device)
+    if tolerance is not None:
+        options = {"rate": rate, "budget": budget, "device": chosen}
+        plan = make_placement_plan(artwork, target, described, tolerance, part_radius, options)
+        if only_plan:
+            write_placement_plan(plan, machine, out, as_json, outputs, overwrite=overwrite)
+            return
+        echo(f"plan: {plan}", err=prints_report(as_json))
+        described = plan.chosen.machine
     with progress_bar("placing") as progress:
         result = simulate_placements(
             artwork,
@@ -112,20 +163,27 @@ def place(
     write_report(as_json, report, outputs)
     with outputs.folder(out) as inside:
         write_text_atomic(inside / "report.json", report_text(json_tree(report)))
-        view, region = result.machine.camera.view(result.plan.camera_pose), result.plan.features.region
-        draw_features(
-            inside / "features.png", artwork, result.plan.features, region, view=view, target=result.plan.target[:2]
-        )
-        draw_placements(
-            inside / "placements.png",
-            period=described.period,
-            motion=result.motion,
-            response=result.response,
-            error=result.error,
-            sigmas=result.simulated_sigmas,
-            delay=described.delay.parts,
-            tolerance=(described.tolerance.position, described.tolerance.angle),
-        )
-        if len(resting.error):
-            draw_repeatability(inside / "repeatability.png", **resting._asdict(), period=described.period)
+        _draw(inside, artwork, result, resting)
     echo(f"{result.summary()}\nlook at {out / 'placements.png'} and {out / 'report.json'}", err=prints_report(as_json))
+
+
+def _draw(folder: Path, artwork: Artwork, result: PlacementResult, resting: Repeatability) -> None:
+    """Write the pictures of placements."""
+    from gpuvision.plots.board import draw_features
+    from gpuvision.plots.placement import draw_placements, draw_repeatability
+
+    machine, features = result.machine, result.plan.features
+    view = machine.camera.view(result.plan.camera_pose)
+    draw_features(folder / "features.png", artwork, features, features.region, view=view, target=result.plan.target[:2])
+    draw_placements(
+        folder / "placements.png",
+        period=machine.period,
+        motion=result.motion,
+        response=result.response,
+        error=result.error,
+        sigmas=result.simulated_sigmas,
+        delay=machine.delay.parts,
+        tolerance=(machine.tolerance.position, machine.tolerance.angle),
+    )
+    if len(resting.error):
+        draw_repeatability(folder / "repeatability.png", **resting._asdict(), period=machine.period)

@@ -7,12 +7,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
+
+import tomli_w
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.cmos_sensor import CmosSensor
 from gpuvision.camera.lens import Lens
 from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size, read_lens
 from gpuvision.formats.cmos_sensor_file import CMOS_SENSORS, read_cmos_sensor
+from gpuvision.host.files import atomic_write
 from gpuvision.host.reading import reason_of
 from gpuvision.schema import Section, read_preset, read_toml
 from gpuvision.servoing.axis import Axis, FineStage
@@ -71,6 +75,46 @@ def named_files(path: str | Path) -> tuple[Path, ...]:
     if "lens" in camera:
         camera.file("lens")
     return camera.files
+
+
+def write_settings(source: str | Path, machine: Machine, path: str | Path) -> None:
+    """Write a machine file with other settings: camera window, frame rate, control and tolerance of the release.
+
+    Parameters
+    ----------
+    source : str or Path
+        Machine file, or one of `MACHINES`, with everything else. Files that it names are named by their absolute paths.
+    machine : Machine
+        Machine with the settings.
+    path : str or Path
+        File to write; it must not exist.
+
+    Raises
+    ------
+    OSError
+        The source cannot be read, or the file cannot be written.
+    DescriptionError
+        The source is not valid TOML.
+    """
+    table, control = read_preset(source, "machines", "machine").to_dict(), machine.control
+    camera, loop, tolerance = table["camera"], table["loop"], table["tolerance"]
+    camera["window"] = list(machine.camera.window)
+    for key in ("sensor", "lens"):
+        if key in camera and camera[key] not in CMOS_SENSORS:
+            camera[key] = str((Path(source).parent / camera[key]).resolve())
+    given: dict[str, Any] = {
+        "rate": machine.rate,
+        "observer": control.observer,
+        "controller": control.controller,
+        "gain": machine.loop_gain,
+        "integral": control.integral,
+        "derivative": control.derivative,
+        "motion_sigma": None if control.motion_sigma is None else list(control.motion_sigma),
+    }
+    table["loop"] = {key: each for key, each in (loop | given).items() if each is not None}
+    tolerance |= {"position": machine.tolerance.position, "angle": machine.tolerance.angle}
+    with atomic_write(path) as file:
+        tomli_w.dump(table, file)
 
 
 def _machine(top: Section, rate: float | None) -> Machine:

@@ -26,14 +26,11 @@ from gpuvision.servoing.placement.placing import (
     settled_frames,
 )
 from gpuvision.servoing.placement.plan import PlacementPlan, plan_placement
-from gpuvision.servoing.placement.rehearsal import check_resonances
+from gpuvision.servoing.placement.rehearsal import check_resonances, start_zone
 from gpuvision.validation import integer
 from gpuvision.workflows.placement_cell import PlacementCell
 
 Float64 = npt.NDArray[np.float64]
-
-# Start errors fill this part of the landing zone: the first pose has an error, too (chosen).
-_START = 0.9
 
 
 class PlacementResult(NamedTuple):
@@ -263,10 +260,7 @@ def simulate_placements(
     check_resonances(machine)
     plan = plan_placement(artwork, target, machine, budget=budget, device=device)
     rng = np.random.default_rng(seed)
-    tolerance, calibrated = machine.tolerance, machine.pipette_in_camera.pose
-    zone = _START * np.array([tolerance.landing_zone] * 2 + [tolerance.landing_angle]) - np.array(machine.swing)
-    if not np.all(zone > 0.0):
-        raise ValueError(f"swing is {machine.swing}, expected less than {_START} of the landing zone")
+    calibrated, zone = machine.pipette_in_camera.pose, start_zone(machine)
     draws = {
         "calibration": _normal(rng, machine.pipette_in_camera.pose_covariance, count),
         "drift": _normal(rng, machine.drift.covariance, count),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, overload
@@ -14,8 +15,11 @@ from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.board.measurement_result import Copper
 from gpuvision.sensor.sensor import Sensor
+from gpuvision.servoing.placement.machine import Machine
 from gpuvision.workflows.location_plan import LocationPlan
+from gpuvision.workflows.placement_plan import PlacementSettingsPlan
 from gpuvision.workflows.planning_location import plan_location
+from gpuvision.workflows.planning_placement import plan_placement_settings
 from gpuvision.workflows.planning_scan import plan_scan
 from gpuvision.workflows.scan_plan import ScanPlan
 
@@ -67,6 +71,31 @@ class LocationJob:
     copper: Copper = "auto"
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacementJob:
+    """Placements on a board, for `plan`.
+
+    Attributes
+    ----------
+    artwork, target, machine
+        Side of the board, pose of the part on it [m], [m], [rad], and machine: see
+        `gpuvision.workflows.planning_placement.plan_placement_settings`.
+    part_radius : float, optional
+        Distance from the nozzle at which the errors count [m]. Default: by the tolerances of the machine.
+    max_rate : float, optional
+        Largest frame rate of the camera link and the drives [Hz]. Default: the frame rate of the machine.
+    budget : int
+        Number of rulers. Default 60.
+    """
+
+    artwork: Artwork
+    target: npt.ArrayLike
+    machine: Machine
+    part_radius: float | None = None
+    max_rate: float | None = None
+    budget: int = 60
+
+
 @overload
 def plan(
     job: ScanJob,
@@ -89,32 +118,43 @@ def plan(
 ) -> LocationPlan: ...
 
 
+@overload
 def plan(
-    job: ScanJob | LocationJob,
+    job: PlacementJob,
+    *,
+    tolerance: float,
+    rate: float | None = ...,
+    latency: float | None = ...,
+    device: Device | None = ...,
+) -> PlacementSettingsPlan: ...
+
+
+def plan(
+    job: ScanJob | LocationJob | PlacementJob,
     *,
     tolerance: float,
     rate: float | None = None,
     latency: float | None = None,
     device: Device | None = None,
-) -> ScanPlan | LocationPlan:
+) -> ScanPlan | LocationPlan | PlacementSettingsPlan:
     """Choose the fastest settings of a job whose predicted error meets a tolerance.
 
     Parameters
     ----------
-    job : ScanJob or LocationJob
-        Scan of a recording, or localization of a board.
+    job : ScanJob, LocationJob or PlacementJob
+        Scan of a recording, localization of a board, or placements on a board.
     tolerance : float
-        Largest error of the heights, or of the pose at the features of the board [m].
+        Largest error of the heights, of the pose at the features of the board, or of the placed part [m].
     rate : float, optional
-        Frame rate that the settings must keep up with [frames/s].
+        Frames, or placements, per second that the settings must keep up with [1/s].
     latency : float, optional
-        Longest acceptable time from a frame to its result [s]; needs a rate.
+        Longest acceptable time from a frame to its result, or of a placement [s]; needs a rate.
     device : Device, optional
         Default `Device.best`.
 
     Returns
     -------
-    ScanPlan or LocationPlan
+    ScanPlan, LocationPlan or PlacementSettingsPlan
         Chosen settings, all that were tried, and what another tolerance gives.
 
     Raises
@@ -124,11 +164,18 @@ def plan(
     TypeError
         The job is of another type.
     ValueError
-        As `gpuvision.workflows.planning_scan.plan_scan` and
-        `gpuvision.workflows.planning_location.plan_location`, which also take other options.
+        As `gpuvision.workflows.planning_scan.plan_scan`, `gpuvision.workflows.planning_location.plan_location` and
+        `gpuvision.workflows.planning_placement.plan_placement_settings`, which also take other options.
     """
-    if not isinstance(job, ScanJob | LocationJob):
-        raise TypeError(f"job is a {type(job).__name__}, expected a ScanJob or a LocationJob")
+    planners: dict[type, Callable[..., Any]] = {
+        ScanJob: plan_scan,
+        LocationJob: plan_location,
+        PlacementJob: plan_placement_settings,
+    }
+    planner = planners.get(type(job))
+    if planner is None:
+        raise TypeError(f"job is a {type(job).__name__}, expected a ScanJob, a LocationJob or a PlacementJob")
     options: dict[str, Any] = {each.name: getattr(job, each.name) for each in fields(job)}
     options |= {"tolerance": tolerance, "rate": rate, "latency": latency, "device": device}
-    return plan_scan(**options) if isinstance(job, ScanJob) else plan_location(**options)
+    found: ScanPlan | LocationPlan | PlacementSettingsPlan = planner(**options)
+    return found

@@ -38,6 +38,7 @@ SLOW = {
     "docs/tutorials/first_pose.md",
     "docs/guides/calibrate_sensor.md",
     "docs/guides/plan_location.md",
+    "docs/guides/plan_placement.md",
     "docs/guides/plan_scan.md",
 }
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gpuvision.accuracy.plan import PlanError
-from gpuvision.profiling import location_plans, scan_plans
+from gpuvision.profiling import location_plans, placement_plans, scan_plans
 from gpuvision.profiling.location_plans import Measured
 from gpuvision.profiling.plan_outcomes import Outcome, cost_of, summary
 
@@ -125,3 +125,84 @@ def test_outcome_of_a_localization(
     # More than 5 % of the images without a pose count as no accuracy.
     true[chosen] = Measured(0.1, 1.0, 0.06)
     assert location_plans.judge(np.random.default_rng(1), device).error == math.inf
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "rate", "chosen", "cost", "possible"),
+    [
+        (2.2, 0.25, "middle", 1.0, True),
+        (1.4, 0.2, "slow", 1.0, True),
+        (1.95, 0.2, "slow", 2.0, True),
+        (1.95, 0.3, None, math.nan, True),
+        (1.05, 0.1, None, math.nan, False),
+    ],
+)
+def test_outcome_of_placements(
+    monkeypatch: pytest.MonkeyPatch, tolerance: float, rate: float, chosen: str | None, cost: float, possible: bool
+) -> None:
+    """The setting "extra", which the plan left out, is faster than all others and not accurate."""
+    truth = {name: placement_plans.Measured(each[2], each[0]) for name, each in SETTINGS.items()}
+    truth["extra"] = placement_plans.Measured(5.0, 0.5)
+    trials = tuple(
+        SimpleNamespace(name=name, seconds=each[0], error=each[1], aborted=0.0) for name, each in SETTINGS.items()
+    )
+
+    def choose(trials: Any, check: Any, *, tolerance: float, rate: float) -> Any:
+        fits = [each for each in trials if 1.1 * each.error <= tolerance]
+        if not fits or fits[0].seconds * rate > 1.0:
+            raise PlanError("none", (), ())
+        return SimpleNamespace(chosen=fits[0], trials=trials)
+
+    asked: list[str] = []
+
+    def measure(job: Any, trial: Any, device: Any, *, seed: int) -> placement_plans.Measured:
+        asked.append(trial.name)
+        return truth[trial.name]
+
+    job: Any = SimpleNamespace(
+        artwork=None, target=None, machine=None, part_radius=1e-3, tolerance=tolerance, rate=rate
+    )
+    extra = SimpleNamespace(name="extra", seconds=0.4, aborted=0.0)
+    tried = SimpleNamespace(trials=trials, left_out=("extra",), check=None)
+    monkeypatch.setattr(placement_plans, "random_job", lambda rng: job)
+    monkeypatch.setattr(placement_plans, "try_placements", lambda *_, **__: tried)
+    monkeypatch.setattr(placement_plans, "choose_placement", choose)
+    monkeypatch.setattr(placement_plans, "rehearse", lambda setting, radius, runs: extra)
+    monkeypatch.setattr(placement_plans, "measure", measure)
+    device: Any = None
+    found = placement_plans.judge(np.random.default_rng(1), device)
+    assert found.possible == possible
+    assert "extra" in asked
+    assert len(asked) == len(set(asked))
+    if chosen is None:
+        assert found.plan is None
+        return
+    assert found.plan is not None
+    assert (found.plan.chosen.name, found.error) == (chosen, SETTINGS[chosen][2])
+    assert (found.cost, found.keeps_up) == (cost, SETTINGS[chosen][0] * rate <= 1.0)
+    # A faster setting that the plan left out counts for the cost.
+    truth["extra"] = placement_plans.Measured(0.1, 0.5)
+    assert placement_plans.judge(np.random.default_rng(1), device).cost == SETTINGS[chosen][0] / 0.5
+
+
+def test_a_setting_that_drops_a_part_is_no_accurate_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The true error: vision and servo of the runs, and the covariance of calibration and drift."""
+    runs = [SimpleNamespace(released=True, record=SimpleNamespace(time=np.array([0.0, each]))) for each in (1.0, 3.0)]
+    sources = {"vision and servo": np.array([[3.0, 0.0, 0.2], [0.0, 4.0, 0.0]])}
+    result = SimpleNamespace(placements=runs, sources=sources)
+    monkeypatch.setattr(placement_plans, "simulate_placements", lambda *_, **__: result)
+    covariances = (np.diag([1.0, 2.0, 0.25]), np.diag([0.5, 0.0, 0.0]))
+    machine: Any = SimpleNamespace(
+        pipette_in_camera=SimpleNamespace(pose_covariance=covariances[0]),
+        drift=SimpleNamespace(covariance=covariances[1]),
+        delay=SimpleNamespace(latency=0.5),
+        settling=SimpleNamespace(lead=0.25),
+    )
+    job: Any = SimpleNamespace(artwork=None, target=None, machine=machine, part_radius=2.0)
+    trial: Any = SimpleNamespace(machine=machine, budget=60)
+    device: Any = None
+    found = placement_plans.measure(job, trial, device, seed=1)
+    square = (4.5 + 1.0 + 0.5) + (8.0 + 2.0) + 4.0 * (0.02 + 0.25)
+    assert found == (pytest.approx(math.sqrt(square)), 2.75)
+    runs[1].released = False
+    assert placement_plans.measure(job, trial, device, seed=1) == (math.inf, math.inf)

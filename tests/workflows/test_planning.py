@@ -10,16 +10,19 @@ import pytest
 
 import gpuvision as gv
 from gpuvision.workflows import planning
-from gpuvision.workflows.planning import LocationJob, ScanJob
+from gpuvision.workflows.planning import LocationJob, PlacementJob, ScanJob
 from gpuvision.workflows.planning_location import plan_location
+from gpuvision.workflows.planning_placement import plan_placement_settings
 from gpuvision.workflows.planning_scan import plan_scan
 
-PIECES: Any = {"recording": object(), "sensor": object(), "image": object(), "artwork": object(), "device": object()}
+NAMES = ("recording", "sensor", "image", "artwork", "machine", "device")
+PIECES: Any = {name: object() for name in NAMES}
 
 
 def test_a_job_goes_to_its_planner(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planning, "plan_scan", lambda **given: ("scan", given))
     monkeypatch.setattr(planning, "plan_location", lambda **given: ("location", given))
+    monkeypatch.setattr(planning, "plan_placement_settings", lambda **given: ("placement", given))
     asked = {"tolerance": 2e-6, "rate": 50.0, "latency": 0.1, "device": PIECES["device"]}
     scan: Any = gv.plan(gv.ScanJob(recording=PIECES["recording"], sensor=PIECES["sensor"]), **asked)
     assert scan == ("scan", {"recording": PIECES["recording"], "sensor": PIECES["sensor"], **asked})
@@ -28,11 +31,17 @@ def test_a_job_goes_to_its_planner(monkeypatch: pytest.MonkeyPatch) -> None:
     assert name == "location"
     assert given["initial_pose"] == (1.0, 2.0, 3.0)
     assert (given["tolerance"], given["rate"], given["latency"], given["device"]) == (3e-6, None, None, None)
+    placement = gv.PlacementJob(artwork=PIECES["artwork"], target=(1.0, 2.0, 3.0), machine=PIECES["machine"], budget=9)
+    name, given = gv.plan(placement, **asked)  # type: ignore[misc]
+    assert name == "placement"
+    assert (given["target"], given["machine"], given["budget"]) == ((1.0, 2.0, 3.0), PIECES["machine"], 9)
+    assert given["rate"] == 50.0
 
 
 def test_the_fields_of_a_job_are_the_parameters_of_its_planner() -> None:
     common = {"tolerance", "rate", "latency", "device", "limits", "progress"}
-    for job, planner in ((ScanJob, plan_scan), (LocationJob, plan_location)):
+    pairs = ((ScanJob, plan_scan), (LocationJob, plan_location), (PlacementJob, plan_placement_settings))
+    for job, planner in pairs:
         parameters: Any = inspect.signature(planner).parameters
         assert {each.name for each in fields(job)} == set(parameters) - common
         for each in fields(job):
@@ -43,5 +52,5 @@ def test_the_fields_of_a_job_are_the_parameters_of_its_planner() -> None:
 
 def test_another_job_is_refused() -> None:
     other: Any = "recording.npy"
-    with pytest.raises(TypeError, match="job is a str, expected a ScanJob or a LocationJob"):
+    with pytest.raises(TypeError, match="job is a str, expected a ScanJob, a LocationJob or a PlacementJob"):
         gv.plan(other, tolerance=1e-6)

@@ -102,6 +102,7 @@ def plan_placement(
     budget: float = 60,
     reflectance: BoardReflectance | None = None,
     device: Device | None = None,
+    advises: bool = True,
 ) -> PlacementPlan:
     """Select the features of the artwork that guide a placement.
 
@@ -120,6 +121,9 @@ def plan_placement(
         Reflectances of the board, for contrast and thresholds. Default: `BoardReflectance`.
     device : Device, optional
         Where to check the coarse registration, if one is needed; None: `Device.best`.
+    advises : bool
+        Search for the nearest targets and the window that work, for the message of a refusal. Default True. The search
+        can take seconds.
 
     Returns
     -------
@@ -153,6 +157,8 @@ def plan_placement(
     try:
         features, landing = guidance.at(camera_pose)
     except ValueError as error:
+        if not advises:
+            raise
         raise ValueError(explain_refusal(str(error), artwork, place, camera_pose, machine, guidance)) from error
     noise, etch_bias = _split_covariance(features)
     sampling, reported = _sampling_and_reported(features)

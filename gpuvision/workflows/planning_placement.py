@@ -1,0 +1,291 @@
+"""Planning of placements: try settings of a machine, and choose the fastest that meets a tolerance.
+
+Errors and times come from theory, then from runs of the loop without images, then from rendered images.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.accuracy.plan import PlanError, check_time, fastest_within, time_limit
+from gpuvision.host import Device
+from gpuvision.matching.artwork.artwork import Artwork
+from gpuvision.servoing.placement.machine import Machine
+from gpuvision.servoing.placement.rehearsal import check_resonances, rehearse_placements, start_zone
+from gpuvision.validation import finite, integer
+from gpuvision.workflows.placement_plan import (
+    PlacementPlanLimits,
+    PlacementSettingsPlan,
+    PlacementTrial,
+    placement_error,
+    usable_settings,
+)
+from gpuvision.workflows.placement_settings import PlacementSettings, Setting, best_fronts
+from gpuvision.workflows.placing import simulate_placements
+
+Float64 = npt.NDArray[np.float64]
+Progress = Callable[[int, int | None], object]
+Check = Callable[[PlacementTrial], PlacementTrial]
+
+
+class TriedPlacements(NamedTuple):
+    """Settings for placements at a target.
+
+    Attributes
+    ----------
+    trials : tuple of PlacementTrial
+        Settings that ran without images, fastest first.
+    left_out : tuple of Setting
+        Settings that theory left out.
+    check : callable
+        Function that runs a trial with rendered images.
+    """
+
+    trials: tuple[PlacementTrial, ...]
+    left_out: tuple[Setting, ...]
+    check: Check
+
+
+_TRIED = 24  # settings that run without images: the best by theory (chosen: a few seconds)
+_RUNS_SEED, _IMAGES_SEED = 1, 2  # of the runs without images, and of the rendered ones
+
+
+def plan_placement_settings(
+    artwork: Artwork,
+    target: npt.ArrayLike,
+    machine: Machine,
+    *,
+    tolerance: float,
+    rate: float | None = None,
+    latency: float | None = None,
+    part_radius: float | None = None,
+    max_rate: float | None = None,
+    budget: int = 60,
+    device: Device | None = None,
+    limits: PlacementPlanLimits = PlacementPlanLimits(),
+    progress: Progress = lambda done, of: None,
+) -> PlacementSettingsPlan:
+    """Choose the settings of a machine with the shortest placements whose error meets a tolerance.
+
+    Camera windows, each with its highest frame rate, observers with different averaging, and tolerances of the release
+    are tried. All other settings are the machine's.
+
+    Parameters
+    ----------
+    artwork : Artwork
+        Side of the board on which parts are placed, read with the clearance of `placement_imaging`.
+    target : array_like
+        (3,): pose of the part in the frame of the board's files, x, y [m], theta [rad].
+    machine : Machine
+        Machine with the release rule "response". `Machine.for_side` turns it to the side of the artwork.
+    tolerance : float
+        Largest error of the placement [m], above 0: distance by which it moves the points of the part at the distance
+        ``part_radius`` from the nozzle, root mean square over the points and over placements.
+    rate : float, optional
+        Placements per second under the camera [1/s], without the long move: the mean time must keep up with it.
+    latency : float, optional
+        Longest acceptable mean time of a placement [s]; needs a rate.
+    part_radius : float, optional
+        Distance from the nozzle at which the errors count [m], 0 or more. Default: the tolerances of the machine,
+        position over angle.
+    max_rate : float, optional
+        Largest frame rate of the camera link and the drives [Hz]. Default: the frame rate of the machine.
+    budget : int
+        Number of rulers, 3 or more; default 60. The time of the stage "vision" of the machine is for this number.
+    device : Device, optional
+        Where to render and measure. Default `Device.best`.
+    limits : PlacementPlanLimits
+        Margins of the choice.
+    progress : callable, optional
+        Called with the number of tried settings and the number of all.
+
+    Returns
+    -------
+    PlacementSettingsPlan
+
+    Raises
+    ------
+    PlanError
+        No setting meets the tolerance, or none of them keeps up with the rate.
+    ValueError
+        A number is out of its range, the release rule is not "response", a latency has no rate, or the features of no
+        window guide the placement.
+
+    Notes
+    -----
+    Theory (`predict_budget`, `predicted_frames`) orders all settings; loops that are unstable with a small error of
+    their model are left out. The best 24 or more run without images: on the simulated axes, with poses of the predicted
+    covariance (`rehearse_placements`). A setting that does not release each part is not used. The fastest setting that
+    meets the tolerance then runs with rendered images and other seeds (`simulate_placements`); if its true error there
+    is above the tolerance, the next one is taken. The time counts from the exposure of the first frame to the contact.
+    Not covered: boards that differ from the artwork other than by etch bias, and jitter of the delay.
+    """
+    finite(tolerance, "tolerance", above=0.0)
+    time_limit(rate, latency, limits.rate_margin, PlacementSettingsPlan.unit)  # refuses wrong values before the work
+    found = try_placements(
+        artwork,
+        target,
+        machine,
+        part_radius=part_radius,
+        max_rate=max_rate,
+        budget=budget,
+        device=device,
+        limits=limits,
+        progress=progress,
+    )
+    return choose_placement(found.trials, found.check, tolerance=tolerance, rate=rate, latency=latency, limits=limits)
+
+
+def try_placements(
+    artwork: Artwork,
+    target: npt.ArrayLike,
+    machine: Machine,
+    *,
+    part_radius: float | None = None,
+    max_rate: float | None = None,
+    budget: int = 60,
+    device: Device | None = None,
+    limits: PlacementPlanLimits = PlacementPlanLimits(),
+    progress: Progress = lambda done, of: None,
+) -> TriedPlacements:
+    """Try settings at a target, for `choose_placement`.
+
+    Parameters and errors are those of `plan_placement_settings`.
+    """
+    device = Device.best() if device is None else device
+    machine = machine.for_side(artwork.side)
+    if machine.settling.rule != "response":
+        raise ValueError(f'the release rule is "{machine.settling.rule}", expected "response" for a plan')
+    start_zone(machine)  # refuses a vibration that leaves no room
+    tolerance = machine.tolerance
+    radius = tolerance.position / tolerance.angle if part_radius is None else part_radius
+    finite(radius, "part_radius", minimum=0.0)
+    choices = PlacementSettings(
+        artwork,
+        target,
+        machine,
+        part_radius=radius,
+        max_rate=machine.rate if max_rate is None else finite(max_rate, "max_rate", above=0.0),
+        budget=integer(budget, "budget", minimum=3),
+        device=device,
+        limits=limits,
+    )
+    settings = [one for each in choices.machines() for one in choices.settings(each)]
+    if not settings:
+        raise ValueError(f"no settings to plan from: {choices.refusal or 'each loop is too sensitive to its model'}")
+    tried = best_fronts(settings, _TRIED)
+    trials = []
+    for number, each in enumerate(tried):
+        trials.append(rehearse(each, radius, limits.runs))
+        progress(number + 1, len(tried))
+
+    def check(trial: PlacementTrial) -> PlacementTrial:
+        return check_with_images(trial, artwork, radius, limits.placements, device, seed=_IMAGES_SEED)
+
+    chosen = {id(each) for each in tried}
+    left_out = tuple(each for each in settings if id(each) not in chosen)
+    return TriedPlacements(tuple(sorted(trials, key=lambda each: (each.seconds, each.error))), left_out, check)
+
+
+def choose_placement(
+    trials: Sequence[PlacementTrial],
+    check: Check,
+    *,
+    tolerance: float,
+    rate: float | None = None,
+    latency: float | None = None,
+    limits: PlacementPlanLimits = PlacementPlanLimits(),
+) -> PlacementSettingsPlan:
+    """Choose the fastest of the settings that were tried, checked with rendered images.
+
+    Parameters
+    ----------
+    trials, check
+        Result of `try_placements`.
+    tolerance : float
+        Largest error of the placement [m], above 0.
+    rate, latency, limits
+        As in `plan_placement_settings`.
+
+    Raises
+    ------
+    PlanError, ValueError
+        As `plan_placement_settings`.
+    """
+    finite(tolerance, "tolerance", above=0.0)
+    limit = time_limit(rate, latency, limits.rate_margin, PlacementSettingsPlan.unit)
+    left = list(trials)
+    while True:
+        usable = usable_settings(left)
+        if not usable:
+            raise PlanError("no setting releases the part in each run", left, usable)
+        chosen = fastest_within(left, usable, tolerance, limits.margin, PlacementSettingsPlan.kind)
+        if not math.isnan(chosen.images):
+            break
+        checked = check(chosen)
+        left = [checked if each is chosen else each for each in left]
+        # The images measure the error and need no margin. A larger error takes the setting out of the choice.
+        if checked.error <= tolerance and not checked.aborted:
+            chosen = checked
+            break
+    left.sort(key=lambda each: (each.seconds, each.error))
+    check_time(chosen, left, usable_settings(left), limit, limits.margin, PlacementSettingsPlan.kind)
+    return PlacementSettingsPlan(chosen=chosen, trials=tuple(left), tolerance=tolerance, limit=limit, limits=limits)
+
+
+def rehearse(setting: Setting, part_radius: float, runs: int) -> PlacementTrial:
+    """Return a setting with the errors and times of runs without images."""
+    machine, plan = setting.machine, setting.plan
+    fixed, vision = setting.fixed, setting.vision
+    try:
+        check_resonances(machine)
+    except ValueError:  # a resonance swings up
+        return PlacementTrial(machine, setting.budget, plan, math.nan, math.nan, fixed, vision, math.nan, math.nan, 1.0)
+    found = rehearse_placements(machine, plan, count=runs, seed=_RUNS_SEED)
+    loop, seconds, aborted = _runs(found.error, found.seconds, part_radius)
+    error = math.hypot(fixed, max(vision, loop))
+    return PlacementTrial(machine, setting.budget, plan, seconds, error, fixed, vision, loop, math.nan, aborted)
+
+
+def check_with_images(
+    trial: PlacementTrial, artwork: Artwork, part_radius: float, placements: int, device: Device, *, seed: int
+) -> PlacementTrial:
+    """Return a setting with the errors and times of placements with rendered images.
+
+    Parameters
+    ----------
+    trial : PlacementTrial
+        Result of `rehearse`.
+    artwork, part_radius, device
+        As in `plan_placement_settings`.
+    placements : int
+        Number of placements.
+    seed : int
+        Seed of start errors and noise.
+    """
+    machine, settling = trial.machine, trial.machine.settling
+    result = simulate_placements(
+        artwork, trial.plan.target, machine, count=placements, budget=trial.budget, seed=seed, device=device
+    )
+    waits = [each.record.time[-1] if each.released else math.nan for each in result.placements]
+    seconds = machine.delay.latency + np.array(waits) + settling.lead
+    images, mean, aborted = _runs(result.sources["vision and servo"], seconds, part_radius)
+    error = math.hypot(trial.fixed, max(trial.vision, trial.loop, images))
+    return trial._replace(
+        images=images, error=error, seconds=max(trial.seconds, mean), aborted=max(trial.aborted, aborted)
+    )
+
+
+def _runs(error: Float64, seconds: Float64, part_radius: float) -> tuple[float, float, float]:
+    """Return the root mean square error [m] and the mean time [s] of released parts, and the fraction of the others."""
+    released = np.isfinite(seconds)
+    if not released.any():
+        return math.nan, math.nan, 1.0
+    found = error[released]
+    square = placement_error(found.T @ found / len(found), part_radius)
+    return square, float(np.mean(seconds[released])), float(np.mean(~released))

@@ -1,0 +1,180 @@
+"""Plans of placements against truth: ``python -m gpuvision.profiling.placement_plans``.
+
+Each job is a machine over a random board: camera, light, delay, axes, calibration, landing zone, a tolerance and a
+rate. The true error of a setting is that of placements with rendered images, with other start errors and other noise
+than in the plan, and with the covariance of calibration and drift. A plan holds if the root mean square error is at
+most the tolerance, if each part is released, and if the mean time keeps up with the rate. Its cost is its true time
+over that of the fastest setting that truly meets the tolerance. The search for it goes through all settings that were
+tried, and through eight random ones that the plan left out by theory, in the order of their predicted times.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from gpuvision.accuracy.plan import PlanError
+from gpuvision.formats.cmos_sensor_file import read_cmos_sensor
+from gpuvision.host import Device
+from gpuvision.matching.artwork.artwork import Artwork
+from gpuvision.profiling.location_plans import random_board
+from gpuvision.profiling.plan_outcomes import Outcome, run_jobs
+from gpuvision.servoing.axis import Axis
+from gpuvision.servoing.frames import CAMERA, PIPETTE, Transform
+from gpuvision.servoing.placement.machine import Machine, PlacementCamera, ThermalDrift, Tolerance
+from gpuvision.workflows.placement_plan import PlacementTrial, usable_settings
+from gpuvision.workflows.placement_settings import Setting
+from gpuvision.workflows.placing import simulate_placements
+from gpuvision.workflows.planning_placement import choose_placement, rehearse, try_placements
+
+_SIZE = (16e-3, 12e-3)  # of a board [m]
+_PLACEMENTS = 24  # of the truth of a setting
+_LEFT_OUT = 8  # settings of the search that the plan left out
+
+
+class Job(NamedTuple):
+    """Machine over a board, and what is asked of its placements.
+
+    Attributes
+    ----------
+    artwork : Artwork
+        The board.
+    target : (float, float, float)
+        Place of the part [m], [m], [rad].
+    machine : Machine
+        The machine.
+    part_radius : float
+        Distance from the nozzle at which the errors count [m].
+    tolerance : float
+        Largest error, as a multiple of the smallest predicted one.
+    rate : float
+        Placements per second, as a fraction of the rate of the fastest setting.
+    """
+
+    artwork: Artwork
+    target: tuple[float, float, float]
+    machine: Machine
+    part_radius: float
+    tolerance: float
+    rate: float
+
+
+class Measured(NamedTuple):
+    """True error and time of a setting.
+
+    Attributes
+    ----------
+    error : float
+        Root mean square error [m]; infinite if a part is not released.
+    seconds : float
+        Mean time [s].
+    """
+
+    error: float
+    seconds: float
+
+
+def random_job(rng: np.random.Generator) -> Job:
+    """Draw a board, a machine, a target, a tolerance and a rate."""
+    sensor = read_cmos_sensor("pb1024")
+    away = rng.uniform(-1e-3, 1e-3, 2)
+    camera = PlacementCamera(
+        sensor=sensor,
+        pixel=float(rng.uniform(12e-6, 25e-6)),
+        window=(int(rng.integers(160, 321)), int(rng.integers(160, 321))),
+        exposure=0.2e-3,
+        electrons=float(sensor.saturation * math.exp(rng.uniform(math.log(0.05), math.log(0.8)))),
+        blur_px=float(rng.uniform(0.4, 1.0)),
+    )
+    sigma, turn = rng.uniform(0.05e-6, 0.5e-6), rng.uniform(0.01e-3, 0.1e-3)
+    lag = float(rng.choice([0.0, rng.uniform(0.3e-3, 3e-3)]))
+    axis = Axis(lag=lag, encoder=0.05e-6)
+    position = float(rng.uniform(2e-6, 8e-6))
+    zone = float(rng.uniform(50e-6, 120e-6))
+    machine = Machine(
+        camera=camera,
+        pipette_in_camera=Transform.rigid(PIPETTE, CAMERA, (*away, 0.0), np.diag([sigma, sigma, turn]) ** 2),
+        tolerance=Tolerance(
+            position=position, angle=position / 3e-3, landing_zone=zone, landing_angle=float(rng.uniform(2e-3, 6e-3))
+        ),
+        axes=(axis, axis, Axis(lag=lag, encoder=1e-5)),
+        rate=float(rng.uniform(500.0, 2000.0)),
+        transfer=0.1e-3,
+        stages={"vision": float(rng.uniform(0.2e-3, 1.5e-3)), "control": 0.1e-3},
+        landing=float(rng.uniform(5e-3, 20e-3)),
+        drift=ThermalDrift(expansion=(0.3e-6, 0.3e-6), temperature_sigma=float(rng.uniform(0.0, 1.0))),
+    )
+    target = np.array(_SIZE) * rng.uniform(0.35, 0.65, 2) + away
+    tolerance, rate = math.exp(rng.uniform(math.log(0.9), math.log(4.0))), float(rng.uniform(0.05, 0.9))
+    place = (float(target[0]), float(target[1]), float(rng.uniform(-math.pi, math.pi)))
+    return Job(random_board(rng), place, machine, float(rng.uniform(0.0, 4e-3)), tolerance, rate)
+
+
+def judge(rng: np.random.Generator, device: Device) -> Outcome:
+    """Plan a random job and measure the plan against truth; a job without features is drawn again."""
+    while True:
+        job = random_job(rng)
+        try:
+            found = try_placements(job.artwork, job.target, job.machine, part_radius=job.part_radius, device=device)
+            break
+        except ValueError:
+            continue
+    trials, check = found.trials, found.check
+    usable = usable_settings(trials)
+    tolerance, rate = job.tolerance * min(each.error for each in usable), job.rate / usable[0].seconds
+    measured: dict[str, Measured] = {}
+
+    def true(trial: PlacementTrial) -> Measured:
+        if trial.name not in measured:
+            measured[trial.name] = measure(job, trial, device, seed=1000 + len(measured))
+        return measured[trial.name]
+
+    left = list(found.left_out)
+    others = [left[number] for number in rng.permutation(len(left))[:_LEFT_OUT]]
+    searched = _in_order(trials, others, job.part_radius)
+    try:
+        plan = choose_placement(trials, check, tolerance=tolerance, rate=rate)
+    except PlanError:
+        return Outcome(None, tolerance, possible=_fastest(searched, true, tolerance) * rate <= 1.0)
+    chosen = true(plan.chosen)
+    best = min(_fastest(searched, true, tolerance), chosen.seconds if chosen.error <= tolerance else math.inf)
+    cost = chosen.seconds / best if math.isfinite(best) else math.nan
+    return Outcome(plan, tolerance, chosen.error, best * rate <= 1.0, cost, chosen.seconds * rate <= 1.0)
+
+
+def _in_order(trials: Iterable[PlacementTrial], others: Iterable[Setting], part_radius: float) -> list[PlacementTrial]:
+    """Return all settings of the search, fastest first."""
+    found = [*trials, *(rehearse(each, part_radius, 8) for each in others)]
+    return sorted((each for each in found if each.aborted < 1.0), key=lambda each: each.seconds)
+
+
+def _fastest(searched: Iterable[PlacementTrial], true: Callable[[PlacementTrial], Measured], tolerance: float) -> float:
+    """Return the true time of the first setting that truly meets the tolerance; infinite without one."""
+    return next((true(each).seconds for each in searched if true(each).error <= tolerance), math.inf)
+
+
+def measure(job: Job, trial: PlacementTrial, device: Device, *, seed: int) -> Measured:
+    """Measure a setting in placements with rendered images, apart from the planner.
+
+    Calibration and drift move the nozzle independently of the loop: their covariance is that of the job, and needs no
+    samples.
+    """
+    result = simulate_placements(
+        job.artwork, job.target, trial.machine, count=_PLACEMENTS, budget=trial.budget, seed=seed, device=device
+    )
+    if not all(each.released for each in result.placements):
+        return Measured(math.inf, math.inf)
+    machine, radius = trial.machine, job.part_radius
+    x, y, theta = np.mean(result.sources["vision and servo"] ** 2, axis=0).tolist()
+    for covariance in (job.machine.pipette_in_camera.pose_covariance, job.machine.drift.covariance):
+        x, y, theta = x + covariance[0, 0], y + covariance[1, 1], theta + covariance[2, 2]
+    times = [each.record.time[-1] for each in result.placements]
+    seconds = machine.delay.latency + float(np.mean(times)) + machine.settling.lead
+    return Measured(math.sqrt(x + y + radius**2 * theta), seconds)
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_jobs(judge, (__doc__ or "").partition("\n\n")[2]))

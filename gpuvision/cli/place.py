@@ -67,6 +67,14 @@ PartRadius = Annotated[
         "tolerances of the machine, position over angle.",
     ),
 ]
+TimeVision = Annotated[
+    bool,
+    typer.Option(
+        "--time-vision",
+        help="With --tolerance: measure the time of the vision on the device, instead of the value in the machine "
+        "file, for several numbers of calipers (rulers) up to --budget.",
+    ),
+]
 OnlyPlan = Annotated[
     bool,
     typer.Option(
@@ -99,6 +107,7 @@ def place(
     tolerance: Tolerance = None,
     rate: PlacementRate = None,
     part_radius: PartRadius = None,
+    time_vision: TimeVision = False,
     only_plan: OnlyPlan = False,
     as_json: ReportFile = None,
     device: DeviceLabel = None,
@@ -125,7 +134,7 @@ def place(
     if max(abs(target[0]), abs(target[1])) > _LARGEST_BOARD:
         raise ValueError(f"--at is {at!r}, expected at most {_LARGEST_BOARD:g} m; numbers need units: 9mm,9mm,90deg")
     if tolerance is None:
-        reject_unused("without --tolerance", rate=rate, part_radius=part_radius)
+        reject_unused("without --tolerance", rate=rate, part_radius=part_radius, time_vision=time_vision)
     inputs: list[str | Path] = [gerbers, machine, *named_files(machine)]
     if only_plan:
         outputs = claim_placement_plan(tolerance, inputs, out, as_json, overwrite=overwrite)
@@ -140,13 +149,13 @@ def place(
         echo(f"warning: {each}", err=True)
     chosen = None if device is None else Device.named(device)
     if tolerance is not None:
-        options = {"rate": rate, "budget": budget, "device": chosen}
+        options = {"rate": rate, "budget": budget, "times_vision": time_vision, "device": chosen}
         plan = make_placement_plan(artwork, target, described, tolerance, part_radius, options)
         if only_plan:
             write_placement_plan(plan, machine, out, as_json, outputs, overwrite=overwrite)
             return
         echo(f"plan: {plan}", err=prints_report(as_json))
-        described = plan.chosen.machine
+        described, budget = plan.chosen.machine, plan.chosen.budget
     with progress_bar("placing") as progress:
         result = simulate_placements(
             artwork,

@@ -78,7 +78,9 @@ def named_files(path: str | Path) -> tuple[Path, ...]:
 
 
 def write_settings(source: str | Path, machine: Machine, path: str | Path) -> None:
-    """Write a machine file with other settings: camera window, frame rate, control and tolerance of the release.
+    """Write a machine file with other settings.
+
+    These are camera window, frame rate, control, tolerance of the release, and times of the stages.
 
     Parameters
     ----------
@@ -112,6 +114,7 @@ def write_settings(source: str | Path, machine: Machine, path: str | Path) -> No
         "motion_sigma": None if control.motion_sigma is None else list(control.motion_sigma),
     }
     table["loop"] = {key: each for key, each in (loop | given).items() if each is not None}
+    table["delay"] = {**table.get("delay", {}), **machine.stages}
     tolerance |= {"position": machine.tolerance.position, "angle": machine.tolerance.angle}
     with atomic_write(path) as file:
         tomli_w.dump(table, file)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.accuracy.trial import median_times
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.servoing.loop import SimulatedClock
@@ -33,6 +34,7 @@ Float64 = npt.NDArray[np.float64]
 _MARGIN_PX = 32
 # Time in which the vibration of the steered head is identified [periods of the slowest resonance] (chosen).
 _IDENTIFICATION = 12.0
+_TIMED = 15  # frames of the timing, of which the median counts (chosen)
 # True poses in the time after the contact, in which a swing must stay within the tolerance.
 _LATER = 33
 
@@ -67,7 +69,7 @@ class PlacementCell:
         board = ReflectanceMap.of(
             artwork, pixel=camera.pixel, region=(centre - half, centre + half), blur_px=camera.blur_px
         )
-        self.machine, self._plan = machine, plan
+        self.machine, self._plan, self._device = machine, plan, device
         rest = np.zeros(3)
         self._camera = SimulatedCamera(board, machine, lambda _: rest, rest, device=device, seed=seed)
         self._sensor = BoardPoseSensor(self._camera, machine, plan, self._camera.dtype, device=device)
@@ -116,6 +118,17 @@ class PlacementCell:
         frames = (self._sensor(frame * machine.period) for frame in range(landing + count))
         found = [each.pose - target for poses in frames for each in poses if each.status == 0]
         return np.array(found, np.float64).reshape(-1, 3)
+
+    def vision_seconds(self) -> float:
+        """Return the median time from a frame of a head that rests at the target to its pose [s]."""
+        target, machine = self._plan.target, self.machine
+        self._camera.follow(lambda time: np.broadcast_to(target, (*np.shape(time), 3)), machine.pipette_in_camera.pose)
+        (frame,) = self._camera(0.0)
+        sensor = BoardPoseSensor(
+            lambda time: [frame._replace(arrived=time)], machine, self._plan, self._camera.dtype, device=self._device
+        )
+        sensor(0.0)  # the coarse registration, or a first pose
+        return median_times([lambda: sensor(machine.landing)], _TIMED)[0]
 
     def _steer(
         self, machine: Machine, start: Float64, swing: Float64, true: Float64

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,10 +14,11 @@ from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.servoing.placement.budget import ModelTolerance, model_tolerance, predict_budget
 from gpuvision.servoing.placement.control import Control
-from gpuvision.servoing.placement.machine import Machine
+from gpuvision.servoing.placement.machine import Machine, PlacementCamera
 from gpuvision.servoing.placement.placing import predicted_frames
 from gpuvision.servoing.placement.plan import PlacementPlan, plan_placement, tracking_imaging
 from gpuvision.servoing.placement.rehearsal import start_zone
+from gpuvision.workflows.placement_cell import PlacementCell
 from gpuvision.workflows.placement_plan import PlacementPlanLimits, placement_error
 
 Float64 = npt.NDArray[np.float64]
@@ -26,6 +27,9 @@ Float64 = npt.NDArray[np.float64]
 _WINDOWS = (0.25, 0.5, math.sqrt(0.5), 1.0, math.sqrt(2.0))
 # Least side of a window, and step of the sides [px] (chosen: rulers are 10 to 30 px long).
 _MIN_WINDOW, _STEP = 64, 16
+_MIN_RULERS = 3  # a pose has three unknowns
+# Numbers of rulers to try, relative to the largest one: a factor of 2 apart.
+_RULERS = (0.25, 0.5, 1.0)
 # Gains, relative to the default of the observer: half the gain averages about twice as many frames.
 _GAINS = {"latest": (1.0, 0.5), "smith": (1.0, 0.5)}
 # Random motion in a frame of the Kalman filter, in standard deviations of a pose: 0.1 averages about ten frames.
@@ -75,6 +79,8 @@ class PlacementSettings:
         Distance from the nozzle at which the errors count [m].
     max_rate : float
         Largest frame rate of the camera link and the drives [Hz].
+    times_vision : bool
+        Measure the time of the vision, for several numbers of rulers.
     limits : PlacementPlanLimits
         Robustness of the loops.
     """
@@ -88,11 +94,13 @@ class PlacementSettings:
         part_radius: float,
         max_rate: float,
         budget: int,
+        times_vision: bool,
         device: Device,
         limits: PlacementPlanLimits,
     ) -> None:
         self._artwork, self._target, self._machine, self._device = artwork, target, machine, device
         self._part_radius, self._max_rate, self._budget, self._limits = part_radius, max_rate, budget, limits
+        self._times_vision = times_vision
         self._plans: dict[tuple[object, ...], PlacementPlan | str] = {}
         self.refusal = ""
         """Reason of the last refused window."""
@@ -118,21 +126,47 @@ class PlacementSettings:
 
     def _with_window(self, window: tuple[int, int]) -> Machine:
         """Return the machine with a window, at the highest frame rate of camera, stages and drives."""
-        machine = self._machine
-        camera = replace(machine.camera, window=window)
-        timing = camera.sensor.timing(window, exposure=camera.exposure)
-        # The stages work at the same time, each on another frame. The machine's own rate is possible in any case.
-        longest = max([machine.transfer, *machine.stages.values()])
-        stages = max(1.0 / longest, machine.rate) if longest else math.inf
-        rate = min(self._max_rate, timing.rate, stages)
-        return replace(machine, camera=camera, rate=rate)
+        camera = replace(self._machine.camera, window=window)
+        return replace(self._machine, camera=camera, rate=self._rate(camera, self._machine.stages))
+
+    def _rate(self, camera: PlacementCamera, stages: Mapping[str, float]) -> float:
+        """Return the highest frame rate of camera, stages and drives.
+
+        The stages work at the same time, each on another frame. The machine's own rate is possible with its own stages.
+        """
+        timing = camera.sensor.timing(camera.window, exposure=camera.exposure)
+        longest = max([self._machine.transfer, *stages.values()])
+        rate = 1.0 / longest if longest else math.inf
+        if stages == self._machine.stages:
+            rate = max(rate, self._machine.rate)
+        return min(self._max_rate, timing.rate, rate)
 
     def settings(self, machine: Machine) -> Iterator[Setting]:
-        """Yield the settings of a machine with a camera window: controls, and tolerances of the release."""
-        loosest = _released(machine, max(_RELEASES))
-        plan = self._planned(loosest)
-        if plan is None:
-            return
+        """Yield the settings of a machine with a camera window: rulers, controls, and tolerances of the release."""
+        rulers = 0
+        for budget in self._budgets():
+            plan = self._planned(_released(machine, max(_RELEASES)), budget)
+            if plan is None or len(plan.features.length) == rulers:  # refused, or no more rulers have room
+                continue
+            rulers = len(plan.features.length)
+            yield from self._controlled(self._timed(machine, plan), budget, plan)
+
+    def _budgets(self) -> list[int]:
+        """Return the numbers of rulers to try: without a measured time, fewer rulers take as long and see less."""
+        if not self._times_vision:
+            return [self._budget]
+        return sorted({max(round(part * self._budget), _MIN_RULERS) for part in _RULERS})
+
+    def _timed(self, machine: Machine, plan: PlacementPlan) -> Machine:
+        """Return the machine with the measured time of the vision."""
+        if not self._times_vision:
+            return machine
+        seconds = PlacementCell(self._artwork, machine, plan, self._device, seed=0).vision_seconds()
+        stages = {**machine.stages, "vision": seconds}
+        return replace(machine, stages=stages, rate=self._rate(machine.camera, stages))
+
+    def _controlled(self, machine: Machine, budget: int, plan: PlacementPlan) -> Iterator[Setting]:
+        """Yield the settings of a machine with rulers: controls, and tolerances of the release."""
         robust: dict[Control, bool] = {}
         for control in controls(self._machine.control, machine, plan):
             for release in _RELEASES:
@@ -140,13 +174,13 @@ class PlacementSettings:
                     controlled = replace(_released(machine, release), control=control)
                 except ValueError:  # unstable with this delay
                     continue
-                features = self._planned(controlled, plan)
+                features = self._planned(controlled, budget, plan)
                 if features is None:
                     continue
                 if control not in robust:
                     robust[control] = self._is_robust(model_tolerance(controlled, features), controlled)
                 if robust[control]:
-                    yield self._by_theory(controlled, features)
+                    yield self._by_theory(controlled, budget, features)
 
     def _is_robust(self, tolerance: ModelTolerance | None, machine: Machine) -> bool:
         """Return whether a loop stays stable with the errors of the model that the limits ask for."""
@@ -155,16 +189,16 @@ class PlacementSettings:
         longer = self._limits.longer_delay * machine.period
         return tolerance.plant_gain >= self._limits.plant_gain and tolerance.longer_delay >= longer
 
-    def _planned(self, machine: Machine, wide: PlacementPlan | None = None) -> PlacementPlan | None:
+    def _planned(self, machine: Machine, budget: int, wide: PlacementPlan | None = None) -> PlacementPlan | None:
         """Return the features for a machine, None where they are refused; `wide` are those of a looser release."""
         if wide is not None and wide.landing is None and _is_precise(wide, machine):
             return wide
         imaging = tracking_imaging(machine)
-        key = (machine.camera.window, imaging, wide is None or _is_precise(wide, machine))
+        key = (machine.camera.window, budget, imaging, wide is None or _is_precise(wide, machine))
         if key not in self._plans:
             try:
                 self._plans[key] = plan_placement(
-                    self._artwork, self._target, machine, budget=self._budget, device=self._device, advises=False
+                    self._artwork, self._target, machine, budget=budget, device=self._device, advises=False
                 )
             except ValueError as refused:
                 self._plans[key] = str(refused)
@@ -174,19 +208,19 @@ class PlacementSettings:
             return None
         return found
 
-    def _by_theory(self, machine: Machine, plan: PlacementPlan) -> Setting:
+    def _by_theory(self, machine: Machine, budget: int, plan: PlacementPlan) -> Setting:
         """Return a setting with its error budget and the mean number of frames of the step response."""
         zone = start_zone(machine)
         frames = [predicted_frames(machine, part * zone) for part in _STARTS]
-        budget = predict_budget(machine, plan, frames)
+        errors = predict_budget(machine, plan, frames)
         fixed, vision, total = (
-            placement_error(np.sum([budget.sources[name] for name in names], axis=0), self._part_radius)
-            for names in (("calibration", "drift", "etch bias"), ("vision", "sampling"), tuple(budget.sources))
+            placement_error(np.sum([errors.sources[name] for name in names], axis=0), self._part_radius)
+            for names in (("calibration", "drift", "etch bias"), ("vision", "sampling"), tuple(errors.sources))
         )
         landing = 0.0 if plan.landing is None else machine.landing
         wait = landing + float(np.mean(frames)) * machine.period
         seconds = machine.delay.latency + wait + machine.settling.lead
-        return Setting(machine, self._budget, plan, seconds, total, fixed, vision)
+        return Setting(machine, budget, plan, seconds, total, fixed, vision)
 
 
 def controls(given: Control, machine: Machine, plan: PlacementPlan) -> list[Control]:

@@ -85,7 +85,9 @@ class PlacementJob:
     max_rate : float, optional
         Largest frame rate of the camera link and the drives [Hz]. Default: the frame rate of the machine.
     budget : int
-        Number of rulers. Default 60.
+        Largest number of rulers. Default 60.
+    times_vision : bool
+        Measure the time of the vision, for several numbers of rulers. Default False: as in the machine file.
     """
 
     artwork: Artwork
@@ -94,6 +96,7 @@ class PlacementJob:
     part_radius: float | None = None
     max_rate: float | None = None
     budget: int = 60
+    times_vision: bool = False
 
 
 @overload

@@ -32,6 +32,9 @@ Float64 = npt.NDArray[np.float64]
 Progress = Callable[[int, int | None], object]
 Check = Callable[[PlacementTrial], PlacementTrial]
 
+_TRIED = 24  # settings that run without images: the best by theory (chosen: a few seconds)
+_RUNS_SEED, _IMAGES_SEED = 1, 2  # of the runs without images, and of the rendered ones
+
 
 class TriedPlacements(NamedTuple):
     """Settings for placements at a target.
@@ -51,10 +54,6 @@ class TriedPlacements(NamedTuple):
     check: Check
 
 
-_TRIED = 24  # settings that run without images: the best by theory (chosen: a few seconds)
-_RUNS_SEED, _IMAGES_SEED = 1, 2  # of the runs without images, and of the rendered ones
-
-
 def plan_placement_settings(
     artwork: Artwork,
     target: npt.ArrayLike,
@@ -66,6 +65,7 @@ def plan_placement_settings(
     part_radius: float | None = None,
     max_rate: float | None = None,
     budget: int = 60,
+    times_vision: bool = False,
     device: Device | None = None,
     limits: PlacementPlanLimits = PlacementPlanLimits(),
     progress: Progress = lambda done, of: None,
@@ -96,7 +96,10 @@ def plan_placement_settings(
     max_rate : float, optional
         Largest frame rate of the camera link and the drives [Hz]. Default: the frame rate of the machine.
     budget : int
-        Number of rulers, 3 or more; default 60. The time of the stage "vision" of the machine is for this number.
+        Largest number of rulers, 3 or more; default 60. The stage "vision" of the machine is the time for this number.
+    times_vision : bool
+        Measure the time of the vision on the device instead, for this number of rulers, a half and a quarter of it. The
+        frame rate of the machine must then hold for its camera link and drives only. Default False.
     device : Device, optional
         Where to render and measure. Default `Device.best`.
     limits : PlacementPlanLimits
@@ -134,6 +137,7 @@ def plan_placement_settings(
         part_radius=part_radius,
         max_rate=max_rate,
         budget=budget,
+        times_vision=times_vision,
         device=device,
         limits=limits,
         progress=progress,
@@ -149,6 +153,7 @@ def try_placements(
     part_radius: float | None = None,
     max_rate: float | None = None,
     budget: int = 60,
+    times_vision: bool = False,
     device: Device | None = None,
     limits: PlacementPlanLimits = PlacementPlanLimits(),
     progress: Progress = lambda done, of: None,
@@ -172,6 +177,7 @@ def try_placements(
         part_radius=radius,
         max_rate=machine.rate if max_rate is None else finite(max_rate, "max_rate", above=0.0),
         budget=integer(budget, "budget", minimum=3),
+        times_vision=times_vision,
         device=device,
         limits=limits,
     )

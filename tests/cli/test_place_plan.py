@@ -80,6 +80,8 @@ def test_options_without_effect_are_refused(folder: Path) -> None:
         run("--plan")
     with pytest.raises(ValueError, match="--rate has no effect without --tolerance"):
         run("--rate", "100")
+    with pytest.raises(ValueError, match="--time-vision has no effect without --tolerance"):
+        run("--time-vision")
     with pytest.raises(ValueError, match="--part-radius has no effect without --tolerance"):
         run("--part-radius", "1mm")
     assert {path.name for path in folder.iterdir()} == {"gerbers", "machine.toml"}

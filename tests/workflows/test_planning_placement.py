@@ -23,6 +23,7 @@ from gpuvision.servoing.placement.control import Control, Settling
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.plan import placement_imaging, plan_placement
 from gpuvision.workflows import placement_settings, planning_placement
+from gpuvision.workflows.placement_cell import PlacementCell
 from gpuvision.workflows.placement_plan import (
     PlacementPlanLimits,
     PlacementSettingsPlan,
@@ -229,6 +230,7 @@ def test_loops_that_a_small_error_of_the_model_makes_unstable_are_left_out(
             part_radius=RADIUS,
             max_rate=machine.rate,
             budget=30,
+            times_vision=False,
             device=device,
             limits=PlacementPlanLimits(**limits),  # type: ignore[arg-type]
         )
@@ -249,6 +251,7 @@ def choices_of(machine: Machine, max_rate: float) -> PlacementSettings:
         part_radius=RADIUS,
         max_rate=max_rate,
         budget=60,
+        times_vision=False,
         device=missing,
         limits=PlacementPlanLimits(),
     )
@@ -268,6 +271,46 @@ def test_each_window_has_the_highest_rate_of_camera_stages_and_drives() -> None:
     assert {each.rate for each in choices_of(slow, 1e4).machines()} == {1000.0}
     unlimited = choices_of(replace(machine, stages={}, transfer=0.0), 1e4).machines()
     assert unlimited[0].rate == pytest.approx(1.0 / machine.camera.exposure)
+
+
+def test_rulers_are_tried_with_the_measured_time_of_their_vision(
+    artwork: Artwork, machine: Machine, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A busy machine must not change the times: 0.1 ms for the first number of rulers, 0.2 and 4 ms for the others."""
+    monkeypatch.setattr(placement_settings, "_RELEASES", (1.0,))
+    times = iter((1e-4, 2e-4, 4e-3))
+    monkeypatch.setattr(PlacementCell, "vision_seconds", lambda cell: next(times))
+    choices = PlacementSettings(
+        artwork,
+        TARGET,
+        machine,
+        part_radius=RADIUS,
+        max_rate=1e4,
+        budget=24,
+        times_vision=True,
+        device=device,
+        limits=PlacementPlanLimits(),
+    )
+    found = list(choices.settings(machine))
+    rates = {(each.budget, len(each.plan.features.length), each.machine.stages["vision"]): each for each in found}
+    assert list(rates) == [(6, 6, 1e-4), (12, 12, 2e-4), (24, 24, 4e-3)]
+    # The camera allows 5 kHz; the slowest stage is the exposure, then the vision.
+    assert [each.machine.rate for each in rates.values()] == pytest.approx([5000.0, 5000.0, 250.0])
+    assert {each.machine.stages["control"] for each in found} == {1e-4}
+    visions = [each.vision for each in rates.values()]
+    assert visions == sorted(visions, reverse=True)
+
+
+def test_the_time_of_the_vision_is_that_of_a_pose(artwork: Artwork, machine: Machine, device: Device) -> None:
+    """With a coarse registration, the time is that of the frames after it."""
+    for landing in (False, True):
+        plan = plan_placement(artwork, TARGET, machine, device=device)
+        if landing:
+            nearer = replace(machine.tolerance, position=0.1e-6, angle=1e-5)
+            plan = plan_placement(artwork, TARGET, replace(machine, tolerance=nearer), device=device)
+        assert (plan.landing is not None) == landing
+        seconds = PlacementCell(artwork, machine, plan, device, seed=0).vision_seconds()
+        assert 2e-5 < seconds < 0.1
 
 
 def test_controls_have_the_watchdog_and_average_differently(artwork: Artwork, machine: Machine, device: Device) -> None:
@@ -329,12 +372,13 @@ def test_the_settings_go_to_a_machine_file(tmp_path: Path) -> None:
     camera = replace(source.camera, window=(96, 128))
     tolerance = replace(source.tolerance, position=1.5e-6, angle=0.5e-3)
     control = Control(observer="kalman", motion_sigma=(1e-7, 2e-7, 3e-5), gain=0.7, watchdog=1.5)
-    changed = replace(source, camera=camera, tolerance=tolerance, rate=1250.0, control=control)
+    stages = {**source.stages, "vision": 0.2e-3}
+    changed = replace(source, camera=camera, tolerance=tolerance, rate=1250.0, control=control, stages=stages)
     write_settings("look_while_place", changed, tmp_path / "machine.toml")
     read = read_machine(tmp_path / "machine.toml")
     assert read.camera == camera
     assert (read.tolerance, read.control, read.rate) == (tolerance, control, 1250.0)
-    assert (read.stages, read.axes, read.drift) == (source.stages, source.axes, source.drift)
+    assert (read.stages, read.axes, read.drift) == (stages, source.axes, source.drift)
     folder = tmp_path / "machines"
     folder.mkdir()
     sensor = Path(placement_settings.__file__).parents[1] / "presets" / "cameras" / "pb1024.toml"

@@ -24,12 +24,12 @@ from gpuvision.host import (
     LaunchBuilder,
     Precision,
     StatusArray,
-    WorkSize,
     capacity,
     ceil_div,
     flags,
     group_per_element,
     type_defines,
+    vector_work,
 )
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite, integer
@@ -40,6 +40,7 @@ Direction = Literal["x", "-x", "y", "-y"]
 # lines of a group: MAX_LINES in kernels/regrid/line_group.h. Least lines of a group where lines are adjacent: eight
 # floats fill a sector of 32 bytes.
 _GROUP, _MAX_LINES, _LINES_OF_SECTOR = 256, 16, 8
+_LANES = 16  # LANES of the vector variant (kernels/common/lanes.h)
 _DIRECTIONS = ("x", "-x", "y", "-y")
 MAX_MAP_CELLS = 1 << 26
 """Largest number of cells of a height map. Chosen: bounds the memory, 256 MiB of float32 heights."""
@@ -332,6 +333,9 @@ class RegridCounts(NamedTuple):
     drop_folded: int
     lines: int
     lines_per_group: int
+    tile_pitch: int
+    out_set_pitch: int
+    out_lines: int
 
 
 class RegridTable(NamedTuple):
@@ -351,7 +355,10 @@ def _lines_per_group(samples: int, least: int) -> int:
 
 
 class _Lines(NamedTuple):
-    """Profiles resampled along their samples: arrays of shape (profiles, cells)."""
+    """Profiles resampled along their samples: arrays of shape (profiles, cells).
+
+    Vector variant: (sets, cells, 16), for sets of 16 neighbouring profiles; profiles beyond the last one are NO_DATA.
+    """
 
     z: FloatArray
     intensity: FloatArray
@@ -392,11 +399,10 @@ class _Pass(VisionOperation[R]):
     def _builder(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> LaunchBuilder:
         build = LaunchBuilder(self, device, shape, dtype, precision=self.regrid.precision, name="Regrid")
         build.check_dtype("float32", "float64", of="points")
-        build.check_shape(len(shape) == 2 and 0 not in shape, "arrays (profiles, samples) with one sample at least")
         return build
 
     def _resample(
-        self, build: LaunchBuilder, lines: int, made: tuple[int, int], counts: RegridCounts, *, with_other: bool
+        self, build: LaunchBuilder, lines: int, made: tuple[int, ...], counts: RegridCounts, *, with_other: bool
     ) -> Launch:
         """Describe the launch that resamples lines; `with_other`: also interpolate the other coordinate.
 
@@ -410,20 +416,19 @@ class _Pass(VisionOperation[R]):
             Sizes and pitches of the inputs and outputs.
         """
         value = (build.shape, build.dtype)
-        with_sigma, in_groups = self.regrid.sigma, not build.device.prefers_vectors
+        with_sigma = self.regrid.sigma
         groups = ceil_div(lines, counts.lines_per_group)
         made_by_name = {name: made if name != "sigma" or with_sigma else None for name in self.Result._fields}
         return build.launch(
             "regrid/regrid.cl",
             "resample",
-            # A CPU runtime that runs several lines in one group spills the state of each line.
-            work=group_per_element(groups, _GROUP) if in_groups else WorkSize((lines,), (1,)),
+            work=vector_work(lines, _LANES) if build.uses_vectors else group_per_element(groups, _GROUP),
             more_inputs=[value, value, (build.shape, np.dtype(np.uint8)), *([value] * (with_other + with_sigma))],
             outputs=build.outputs(made_by_name),
             defines={
-                **type_defines("INPUT", build.dtype),
+                **type_defines("INPUT", build.dtype, _LANES),
                 **flags(WITH_OTHER=with_other, WITH_SIGMA=with_sigma),
-                **({"GROUP": _GROUP} if in_groups else {}),
+                **({} if build.uses_vectors else {"GROUP": _GROUP}),
             },
             # Without the other coordinate the kernel gets a null pointer for its output, the last one.
             arguments=[
@@ -431,7 +436,7 @@ class _Pass(VisionOperation[R]):
                 np.array(counts, np.uint32),
                 np.array(self._table(), build.real),
             ],
-            problem_per_group=in_groups,
+            problem_per_group=not build.uses_vectors,
         )
 
 
@@ -444,44 +449,55 @@ class _AlongSamples(_Pass[_Lines]):
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         build = self._builder(device, shape, dtype)
+        build.check_shape(len(shape) == 2 and 0 not in shape, "arrays (profiles, samples) with one sample at least")
         profiles, samples = shape
         cells = self._cells()
+        sets = ceil_div(profiles, _LANES)
+        made = (sets, cells, _LANES) if build.uses_vectors else (profiles, cells)
         counts = RegridCounts(
             samples=samples,
             line_pitch=samples,
             sample_pitch=1,
             cells=cells,
-            out_line_pitch=cells,
-            out_cell_pitch=1,
+            out_line_pitch=1 if build.uses_vectors else cells,
+            out_cell_pitch=_LANES if build.uses_vectors else 1,
             drop_folded=0,
             lines=profiles,
             lines_per_group=_lines_per_group(samples, 1),
+            tile_pitch=_LANES,
+            out_set_pitch=_LANES * cells,
+            out_lines=_LANES * sets,
         )
-        return self._resample(build, profiles, (profiles, cells), counts, with_other=True)
+        return self._resample(build, profiles, made, counts, with_other=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _AlongProfiles(_Pass[HeightMap]):
-    """Second pass: a line is a cell of the first pass over all profiles."""
+    """Second pass: a line is a cell of the first pass over all profiles, in `_Lines` of either layout."""
 
     Result: ClassVar[type[Any]] = HeightMap
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         build = self._builder(device, shape, dtype)
-        profiles, lines = shape
+        in_sets = build.uses_vectors and len(shape) == 3 and shape[2] == _LANES
+        build.check_shape(in_sets or len(shape) == 2, "the lines of the first pass")
+        lines, profiles = shape[1], shape[0] * (_LANES if in_sets else 1)
         cells = self._cells()
         # A line is a row of the map or a column of it.
         line_pitch, cell_pitch = (cells, 1) if self.direction[-1] == "x" else (1, lines)
         counts = RegridCounts(
             samples=profiles,
-            line_pitch=1,
-            sample_pitch=lines,
+            line_pitch=_LANES if in_sets else 1,
+            sample_pitch=1 if in_sets else lines,
             cells=cells,
             out_line_pitch=line_pitch,
             out_cell_pitch=cell_pitch,
             drop_folded=int(self.regrid.folded == "drop"),
             lines=lines,
             lines_per_group=_lines_per_group(profiles, _LINES_OF_SECTOR),
+            tile_pitch=_LANES * lines,
+            out_set_pitch=_LANES * line_pitch,
+            out_lines=lines,
         )
         return self._resample(build, lines, self.regrid.grid.shape, counts, with_other=False)

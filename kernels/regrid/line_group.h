@@ -24,28 +24,22 @@
 // adjacent), and store cells in the same way.
 #ifndef LINE_GROUP_H
 #define LINE_GROUP_H
-#include "common/lanes.h"
 
 #define MAX_LINES 16             // MAX_LINES in regrid.py
 #define ROOM (GROUP + MAX_LINES) // one more place for each line: the last good sample of the tiles before
 #define NO_PLACE (-1)
 
-typedef struct {
-    global const INPUT *along, *height, *intensity;
-    global const uchar *given;
-#ifdef WITH_OTHER
-    global const INPUT *other;
-#endif
-#ifdef WITH_SIGMA
-    global const INPUT *sigma;
-#endif
-} line_inputs;
+// First and last cell whose centre lies in [low, high]; no cell if first > last.
+static inline int first_cell(real low, int cells) {
+    const real kept = low < 0 ? 0 : low < cells ? low : cells;
+    const int cell = (int)kept;
+    return cell < kept ? cell + 1 : cell;
+}
+static inline int last_cell(real high, int cells) { return high < 0 ? -1 : high < cells ? (int)high : cells - 1; }
 
-typedef struct {
-    global real *height, *intensity;
-    global uchar *status;
-    global real *sigma, *other;
-} line_outputs;
+static inline int is_joined(real length, real rise, constant RegridTable *grid) {
+    return !(fabs(length) > grid->max_gap || fabs(rise) > grid->max_step);
+}
 
 // Samples of a tile. A line has places 0 to n, at line * (n + 1) + place: place 0 is the last good sample of the tiles
 // before, the others are the samples of the tile. Coordinates are in cells; all but `at` are times the sense, so that they

@@ -315,3 +315,16 @@ def test_window_and_light_of_a_camera() -> None:
     dataclasses.replace(camera, window=(rows, columns))
     with pytest.raises(ValueError, match=f"window columns is {columns + 1}"):
         dataclasses.replace(camera, window=(rows, columns + 1))
+
+
+def test_a_refusal_without_advice_searches_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> Any:
+        raise ValueError("too few edges; more")
+
+    monkeypatch.setattr(plan._Guidance, "at", refuse)
+    monkeypatch.setattr(plan, "explain_refusal", lambda reason, *_: f"explained: {reason}")
+    artwork: Any = SimpleNamespace(side="top")
+    with pytest.raises(ValueError, match=r"^too few edges; more$"):
+        plan.plan_placement(artwork, (0.0, 0.0, 0.0), PRESET, advises=False)
+    with pytest.raises(ValueError, match=r"^explained: too few edges; more$"):
+        plan.plan_placement(artwork, (0.0, 0.0, 0.0), PRESET)

@@ -147,9 +147,14 @@ static inline ints common_flags(const Profiles *profiles, codes peak, ints not_f
 }
 
 #ifdef METHOD_CENTROID
-// Light of sample k of every lane.
-static inline reals light_at(const Profiles *profiles, int k) {
-    return over_threshold(sample_of(profiles, k), profiles->threshold);
+// Mask of the lanes whose sample has at least half of the light of the peak.
+static inline ints reaches_half(codes level, codes peak, CODE threshold) {
+#if CODE_BITS == 32
+    return int_mask(over_threshold(level, threshold) >= over_threshold(peak, threshold) / 2);
+#else
+    const codes limit = threshold, light = max(level, limit) - limit;
+    return int_mask(light >= max(peak, limit) - limit - light);
+#endif
 }
 
 static inline void finish_centroid(const Profiles *profiles, const Centroid *centroid, constant LineTable *table,
@@ -162,9 +167,8 @@ static inline void finish_centroid(const Profiles *profiles, const Centroid *cen
     dark |= int_mask(centroid->width < table->min_width) | int_mask(centroid->width > table->max_width);
 #endif
     // A line whose half maximum lies beyond the border is cut: its centroid is wrong.
-    const reals least = over_threshold(centroid->peak, profiles->threshold) / 2;
-    const reals begin = light_at(profiles, 0), end = light_at(profiles, profiles->length - 1);
-    const ints cut = int_mask(begin >= least) | int_mask(end >= least);
+    const codes border = higher_of(sample_of(profiles, 0), sample_of(profiles, profiles->length - 1));
+    const ints cut = reaches_half(border, centroid->peak, profiles->threshold);
     const ints flags = flag_where(dark, STATUS_LOW_SIGNAL) | flag_where(cut & ~dark, STATUS_OUT_OF_RANGE) |
                        common_flags(profiles, centroid->peak, centroid->not_finite);
 #ifdef NOISE

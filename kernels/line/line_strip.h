@@ -21,7 +21,7 @@ static inline void highest_of_strip(Highest *highest, global const CODE *at, int
     _Pragma("unroll") for (int i = 0; i < MAX_GROUPS; i++) kept[i] = darkest();
     for (int k = 0; k < steps; k++, at += stride) {
         _Pragma("unroll") for (int i = 0; i < MAX_GROUPS; i++) {
-            prefetch_line(at + i * WIDE + (long)STEPS * stride);
+            prefetch_from_memory(at + i * WIDE + (long)STEPS * stride);
             raise_highest(&kept[i], wide_load(at + i * WIDE));
         }
     }
@@ -52,15 +52,22 @@ static inline Profiles profiles_of_quarter(const Profiles *frame, int begin, int
     return profiles;
 }
 
-#if defined(METHOD_CENTROID) && !defined(ALONG_ROWS)
-// Add a block of at most STEPS rows to the sums of a group of columns, see add_steps(). `highest`: its largest samples.
-// Most blocks of a frame have no light: their sums are zero, and cost one instruction for each vector, not seven.
-static inline void add_block_of_rows(WideSums *sums, const Highest *highest, global const CODE *at, int stride,
-                                     int steps, int first, CODE threshold) {
-    if (any_greater(highest->level, threshold)) add_steps(sums, at, stride, steps, first, threshold);
-    else raise_peak(sums, highest);
+#ifdef METHOD_CENTROID
+// Add a block of at most STEPS samples of every lane to the sums, see add_steps(). `highest`: its largest samples. Most
+// blocks of a frame have no light: their sums are zero, and cost one instruction for each vector, not seven. The sums of
+// a block with light come from the first-level cache; meanwhile the same lanes of the next block are fetched.
+static inline void add_samples(WideSums *sums, const Highest *highest, global const CODE *at, int stride, int steps,
+                               int first, CODE threshold) {
+    raise_peak(sums, highest);
+    if (!any_greater(highest->level, threshold)) return;
+#if CODE_BITS == 8
+    _Pragma("unroll") for (int k = STEPS; k < 2 * STEPS; k++) prefetch_line(at + (long)k * stride);
+#endif
+    add_steps(sums, at, stride, steps, first, threshold);
 }
+#endif
 
+#if defined(METHOD_CENTROID) && !defined(ALONG_ROWS)
 // Read the columns begin <= column < end, at most MAX_STRIP: blocks of STEPS rows outside, groups of WIDE columns
 // inside.
 static inline void read_strip(const Profiles *frame, int begin, int end, constant LineTable *table, const Outputs *to,
@@ -74,19 +81,19 @@ static inline void read_strip(const Profiles *frame, int begin, int end, constan
         const int steps = min(STEPS, frame->length - row);
         highest_of_block(highest, at, begin, groups, columns, steps);
         for (int i = 0; i < groups; i++) {
-            add_block_of_rows(&sums[i], &highest[i], at + group_start(begin, i, columns), columns, steps, row,
-                              frame->threshold);
+            add_samples(&sums[i], &highest[i], at + group_start(begin, i, columns), columns, steps, row,
+                        frame->threshold);
         }
     }
     for (int i = 0; i < groups; i++) {
         Centroid centroids[QUARTERS];
-        for (int k = 0; k < QUARTERS; k++) centroids[k] = wide_centroid(&sums[i], k);
+        _Pragma("unroll") for (int k = 0; k < QUARTERS; k++) centroids[k] = wide_centroid(&sums[i], k);
 #ifdef NOISE
         int from;
         const Profiles group = profiles_of_quarter(frame, begin, i * QUARTERS, &from);
         set_variances(centroids, &group, table);
 #endif
-        for (int k = 0; k < QUARTERS; k++) {
+        _Pragma("unroll") for (int k = 0; k < QUARTERS; k++) {
             int sample;
             const Profiles profiles = profiles_of_quarter(frame, begin, i * QUARTERS + k, &sample);
             finish_centroid(&profiles, &centroids[k], table, to, first + sample, sample);
@@ -102,8 +109,9 @@ static inline void read_row(global const CODE *row, int length, CODE threshold, 
     const int blocks = length / WIDE;
     for (int block = 0; block < blocks; block += STEPS) {
         const int steps = min(STEPS, blocks - block);
-        for (int k = block; k < block + steps; k++) prefetch_line(row + k * WIDE + LANES * length);
-        add_steps(&wide, row + block * WIDE, WIDE, steps, block, threshold);
+        global const CODE *at = row + block * WIDE;
+        const Highest highest = highest_of_steps(at, WIDE, steps);
+        add_samples(&wide, &highest, at, WIDE, steps, block, threshold);
     }
     sum_lanes(&wide, sums);
     for (int k = blocks * WIDE; k < length; k++) add_sample(sums, row[k], k, threshold);

@@ -3,7 +3,7 @@
 //
 // Vectors of 32 and 64 elements are an extension of clang, which all CPU runtimes use; OpenCL C ends at 16. Only builds
 // under VECTOR_VARIANT include this file. A wide vector consists of QUARTERS groups of 16 lanes.
-// Build options: PREFETCH fetches memory ahead of its use, see highest_of_steps().
+// Build options: PREFETCH (the frames do not fit the caches), see highest_of_steps().
 #ifndef LINE_WIDE_H
 #define LINE_WIDE_H
 
@@ -65,9 +65,14 @@ static inline void raise_highest(Highest *highest, wides x) {
 #endif
 }
 
-static inline void prefetch_line(global const CODE *at) {
+// Fetch a cache line into the first-level cache.
+static inline void prefetch_line(global const CODE *at) { __builtin_prefetch((const void *)(ulong)at, 0, 3); }
+
+// The same where the frames come from memory. For frames in a cache, a prefetch of every line takes more time than it
+// saves.
+static inline void prefetch_from_memory(global const CODE *at) {
 #ifdef PREFETCH
-    __builtin_prefetch((const void *)(ulong)at, 0, 3);
+    prefetch_line(at);
 #endif
 }
 
@@ -81,7 +86,7 @@ static inline Highest highest_of_steps(global const CODE *at, int stride, int st
     Highest highest = darkest();
     if (steps == STEPS) {
         _Pragma("unroll") for (int k = 0; k < STEPS; k++) {
-            prefetch_line(at + (long)(k + STEPS) * stride);
+            prefetch_from_memory(at + (long)(k + STEPS) * stride);
             raise_highest(&highest, wide_load(at + (long)k * stride));
         }
     } else {

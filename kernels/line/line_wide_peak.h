@@ -187,7 +187,6 @@ static inline void find_in_row(global const CODE *row, int length, int *at, CODE
     const int blocks = length / WIDE;
     for (int block = 0; block < blocks; block++) {
         const wides x = wide_load(row + block * WIDE);
-        prefetch_line(row + block * WIDE + LANES * length);
         peak.block = x > peak.highest.level ? (wide_steps)block : peak.block;
         raise_highest(&peak.highest, x);
     }

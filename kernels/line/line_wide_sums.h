@@ -12,7 +12,10 @@
 
 // Sums over the blocks. Element 2h holds the even lanes and element 2h + 1 the odd lanes of the 32 lanes of half h.
 typedef struct {
-    uint16 total[QUARTERS], width[QUARTERS];
+    uint16 total[QUARTERS];
+#ifdef COUNT_WIDTH
+    uint16 width[QUARTERS];
+#endif
     big16 moment[QUARTERS];
     wides peak;
 } WideSums;
@@ -23,13 +26,15 @@ typedef struct {
 #ifdef COUNT_WIDTH
     wide_pairs width, width_odd;
 #endif
-    wides peak;
 } BlockSums;
 
 static inline void clear_sums(WideSums *sums) {
     for (int i = 0; i < QUARTERS; i++) {
-        sums->total[i] = sums->width[i] = 0;
+        sums->total[i] = 0;
         sums->moment[i] = 0;
+#ifdef COUNT_WIDTH
+        sums->width[i] = 0;
+#endif
     }
     sums->peak = 0;
 }
@@ -37,7 +42,6 @@ static inline void clear_sums(WideSums *sums) {
 static inline wide_pairs even_part(wide_pairs both, wide_pairs odd) { return both - (odd << (wide_pairs)CODE_BITS); }
 
 static inline void add_step(BlockSums *block, wides x, wides threshold) {
-    block->peak = x > block->peak ? x : block->peak;
     const wide_pairs v = __builtin_astype((x > threshold ? x : threshold) - threshold, wide_pairs);
     block->s += v;
     block->s_odd += v >> (wide_pairs)CODE_BITS;
@@ -48,13 +52,6 @@ static inline void add_step(BlockSums *block, wides x, wides threshold) {
     block->width += bright;
     block->width_odd += bright >> (wide_pairs)CODE_BITS;
 #endif
-}
-
-static inline void add_four_steps(BlockSums *block, global const CODE *at, int stride, wides threshold) {
-    add_step(block, wide_load(at), threshold);
-    add_step(block, wide_load(at + stride), threshold);
-    add_step(block, wide_load(at + 2 * stride), threshold);
-    add_step(block, wide_load(at + 3 * stride), threshold);
 }
 
 // Add the sums of 16 lanes of a block to element i: see line_centroid.h for the moment.
@@ -89,26 +86,23 @@ static inline void add_block(WideSums *sums, const BlockSums *block, int first, 
 #endif
 }
 
-// Add `steps` samples of every lane, at most STEPS: the first at `at`, the next ones `stride` elements further; `first`
-// is the index of the first sample. Full blocks are unrolled by hand, so that the sums stay in registers.
+// Add the light of `steps` samples of every lane, at most STEPS: the first at `at`, the next ones `stride` elements
+// further; `first` is the index of the first sample. The caller calls raise_peak(). Full blocks are unrolled, so that the
+// sums stay in registers.
 static inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold) {
     BlockSums block;
     block.s = block.s_odd = block.m = block.m_odd = 0;
 #ifdef COUNT_WIDTH
     block.width = block.width_odd = 0;
 #endif
-    block.peak = sums->peak;
     const wides limit = threshold;
     if (steps == STEPS) {
-        add_four_steps(&block, at, stride, limit);
-        add_four_steps(&block, at + 4 * (long)stride, stride, limit);
-        add_four_steps(&block, at + 8 * (long)stride, stride, limit);
-        add_four_steps(&block, at + 12 * (long)stride, stride, limit);
-        add_four_steps(&block, at + 16 * (long)stride, stride, limit);
+        _Pragma("unroll") for (int k = 0; k < STEPS; k++) {
+            add_step(&block, wide_load(at + (long)k * stride), limit);
+        }
     } else {
         for (int k = 0; k < steps; k++, at += stride) add_step(&block, wide_load(at), limit);
     }
-    sums->peak = block.peak;
     add_block(sums, &block, first, steps);
 }
 
@@ -117,26 +111,26 @@ static inline void raise_peak(WideSums *sums, const Highest *highest) {
     sums->peak = highest->level > sums->peak ? highest->level : sums->peak;
 }
 
-// Interleave even and odd lanes.
-static inline uint16 interleave_uints(uint8 e, uint8 o) {
-    return (uint16)(e.s0, o.s0, e.s1, o.s1, e.s2, o.s2, e.s3, o.s3, e.s4, o.s4, e.s5, o.s5, e.s6, o.s6, e.s7, o.s7);
-}
-static inline big16 interleave_bigs(big8 e, big8 o) {
-    return (big16)(e.s0, o.s0, e.s1, o.s1, e.s2, o.s2, e.s3, o.s3, e.s4, o.s4, e.s5, o.s5, e.s6, o.s6, e.s7, o.s7);
-}
+// The 16 lanes of a quarter: even and odd lanes of a half interleaved, the first 16 or the last 16 of them.
+#define INTERLEAVE(even, odd, last)                                                                             \
+    ((last) ? __builtin_shufflevector(even, odd, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31)  \
+            : __builtin_shufflevector(even, odd, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23))
 static inline uint16 uints_of_quarter(const uint16 *sums, int quarter) {
-    const uint16 even = sums[quarter & ~1], odd = sums[quarter | 1];
-    return (quarter & 1) ? interleave_uints(even.hi, odd.hi) : interleave_uints(even.lo, odd.lo);
+    return INTERLEAVE(sums[quarter & ~1], sums[quarter | 1], quarter & 1);
 }
 static inline big16 bigs_of_quarter(const big16 *sums, int quarter) {
-    const big16 even = sums[quarter & ~1], odd = sums[quarter | 1];
-    return (quarter & 1) ? interleave_bigs(even.hi, odd.hi) : interleave_bigs(even.lo, odd.lo);
+    return INTERLEAVE(sums[quarter & ~1], sums[quarter | 1], quarter & 1);
 }
 
 // Centroids of the 16 lanes of a quarter.
 static inline Centroid wide_centroid(const WideSums *sums, int quarter) {
-    return centroid_of_integers(uints_of_quarter(sums->total, quarter), bigs_of_quarter(sums->moment, quarter),
-                                uints_of_quarter(sums->width, quarter), ((const codes *)&sums->peak)[quarter]);
+#ifdef COUNT_WIDTH
+    const uint16 width = uints_of_quarter(sums->width, quarter);
+#else
+    const uint16 width = 0;
+#endif
+    return centroid_of_integers(uints_of_quarter(sums->total, quarter), bigs_of_quarter(sums->moment, quarter), width,
+                                ((const codes *)&sums->peak)[quarter]);
 }
 
 #ifdef ALONG_ROWS
@@ -165,7 +159,9 @@ static inline void sum_lanes(const WideSums *wide, RowSums *sums) {
     for (int i = 0; i < QUARTERS; i++) {
         const uint16 lane = convert_uint16(2 * LANE_NUMBERS + (i / 2 * 32 + i % 2));  // the lanes of element i
         total += wide->total[i];
+#ifdef COUNT_WIDTH
         width += wide->width[i];
+#endif
         moment += wide->moment[i] * (big)WIDE + convert_big16(lane * wide->total[i]);
         peak = max(peak, highest_level(((const codes *)&wide->peak)[i]));
     }

@@ -7,16 +7,13 @@
 typedef Sums WideSums;
 static inline void clear_sums(WideSums *sums) { *sums = zero_sums(); }
 
-// Add `steps` samples of every lane: the first at `at`, the next ones `stride` elements further; `first` is the index
-// of the first sample.
+// Add the light of `steps` samples of every lane: the first at `at`, the next ones `stride` elements further; `first` is
+// the index of the first sample. The caller calls raise_peak() first.
 static inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold) {
-    reals s = 0, m = 0, width = 0, poison = sums->poison;
-    codes peak = sums->peak;
+    reals s = 0, m = 0, width = 0;
     for (int k = 0; k < steps; k++, at += stride) {
         const float16 x = wide_load(at);
         const reals v = over_threshold(x, threshold);
-        peak = x > peak ? x : peak;
-        poison += to_reals(x) * 0;
         s += v;
         m += s;
 #ifdef COUNT_WIDTH
@@ -24,8 +21,6 @@ static inline void add_steps(WideSums *sums, global const CODE *at, int stride, 
 #endif
     }
     add_block(sums, s, m, first, steps);
-    sums->peak = peak;
-    sums->poison = poison;
     sums->width += width;
 }
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -95,3 +96,20 @@ def test_every_output(device: Device, kernel: tuple[Any, str, Any, Any], rng: np
     for found, rows, positions in zip(reading.sigma, profiles, expected["position"], strict=True):
         exact = sigmas(rows, positions, method, LEVEL[dtype], quantised, gain)
         np.testing.assert_allclose(found, exact, rtol=3e-4)
+
+
+@pytest.mark.vectors
+@pytest.mark.parametrize("method", ["centroid", "windowed"])
+def test_prefetching_changes_no_result(device: Device, method: Any, rng: np.random.Generator) -> None:
+    """On a device with small caches the kernel prefetches the frames: strips of 1024 columns, the last block a part."""
+    profiles = np.stack([profiles_of(rng, "uint8", 1024, 75) for _ in range(2 * device.compute_units)])
+    frames = np.ascontiguousarray(np.swapaxes(profiles, 1, 2))
+    readout = LineReadout(method=method, threshold=LEVEL["uint8"], window=WINDOW, variant="vector")
+    small = copy.copy(device)
+    small.cache_bytes = frames.nbytes
+    builds = [readout.launch(each, frames.shape, frames.dtype).defines for each in (device, small)]
+    assert ["PREFETCH" in build for build in builds] == [False, True]
+    plain, prefetched = readout(frames, device=device), readout(frames, device=small)
+    for name in ("position", "peak", "width", "total", "status"):
+        np.testing.assert_array_equal(getattr(prefetched, name), getattr(plain, name), err_msg=name)
+    assert np.any(plain.status == 0)

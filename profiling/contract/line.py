@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.camera.lens import Lens
 from gpuvision.profiling.contract.agreement import Case, equal, roundings
 from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.reference.line import read_lines
+from gpuvision.reference.triangulation import triangulate
 
 _GAUSS3, _FIR = 'method="gauss3"', 'method="fir"'
 _LEVER = "lever: half of the window, or the profile for the centroid [px]"
@@ -32,6 +36,12 @@ LIMITS = {
 _TOP = {"uint8": 180.0, "uint16": 40_000.0, "float32": 128.0}
 _LEVEL = {"uint8": 20.0, "uint16": 4000.0, "float32": 8.5}
 _WINDOW = 6
+# Sensor of 137 rows and 201 columns. The denominator of the homography is 1 in row 68 and 0.3 in row 118: there is the
+# horizon. The lens folds at 90 px from the middle, within the corners of the image.
+_HOMOGRAPHY = ((1e-5, 2e-4, -0.01), (-2e-4, 1e-6, 0.012), (-0.014, 0.0, 1.952))
+_REGION = ((36.0, 100.0), (50.0, 150.0))
+_HORIZON = 0.3
+_LENS = Lens(k1=-1.0 / (3.0 * 90.0**2), centre=(100.0, 68.0))
 
 
 def cases() -> Iterator[Case]:
@@ -50,6 +60,7 @@ def cases() -> Iterator[Case]:
     holes[0, 5:9, ::7] = np.nan
     holes[1, 30, 3::7] = np.inf
     yield _case("holes, float32", holes)
+    yield from _triangulated(_frames(rng, "uint8", (2, 137, 201), "columns"))
 
 
 def _frames(
@@ -92,6 +103,19 @@ def _case(name: str, frames: npt.NDArray[Any], **settings: Any) -> Case:
         lever = 2.0
     quantities = {"position": np.abs(expected["position"]) + lever, "total": np.abs(expected["total"])}
     return Case("LineReadout", name, LineReadout(**parameters), (frames,), exact, quantities, when=when)
+
+
+def _triangulated(frames: npt.NDArray[Any]) -> Iterator[Case]:
+    """Yield readouts with the flags of the triangulation: beyond the horizon, and beyond the fold of a lens."""
+    column = np.broadcast_to(np.arange(frames.shape[2]), (len(frames), frames.shape[2]))
+    for name, lens in (("horizon", None), ("fold of the lens", _LENS)):
+        sheet = Triangulation(homography=_HOMOGRAPHY, region=_REGION, horizon=_HORIZON, lens=lens)
+        terms = None if lens is None else (lens.k1, lens.k2, lens.centre)
+        case = _case(f"{name}, uint8", frames)
+        position, status = case.exact["position"], case.exact["status"]
+        _, _, flags = triangulate(position, column, _HOMOGRAPHY, _REGION, horizon=_HORIZON, lens=terms)
+        exact = {**case.exact, "status": np.where(np.isfinite(position), status | flags, status)}
+        yield replace(case, template=replace(case.template, triangulation=sheet), exact=exact)
 
 
 def _spread_of_logarithms(frames: npt.NDArray[Any], position: npt.NDArray[Any], threshold: float) -> npt.NDArray[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,6 +11,7 @@ from gpuvision.plots.figure import new_figure, write_png
 
 _WIDTH, _HEIGHT = 6.5, 4.5  # of the page [in]
 _MAX_NAMES = 12  # with more settings only those get a name that no other one beats
+_NEAR = 0.01  # relative difference of times and errors of two points that have one name (chosen: a marker's size)
 _CHOSEN, _OTHER, _TOLERANCE = "#009e73", "#0072b2", "#d55e00"
 
 
@@ -45,7 +47,8 @@ def draw_plan(
 ) -> None:
     """Draw the error of each setting over its time, with the tolerance as a line, as PNG.
 
-    Of more than 12 settings only the chosen one and those have a name that no other one beats in time and error.
+    Of more than 12 settings only the chosen one and those have a name that no other one beats in time and error, and
+    of these one at each place.
 
     Parameters
     ----------
@@ -70,7 +73,12 @@ def draw_plan(
         colour = _CHOSEN if each.chosen else _OTHER
         place = (1e6 * each.seconds, 1e6 * each.error)
         axes.plot(
-            *place, "o", color=colour, markersize=8 if each.chosen else 5, label="chosen" if each.chosen else None
+            *place,
+            "o",
+            color=colour,
+            markersize=8 if each.chosen else 5,
+            label="chosen" if each.chosen else None,
+            zorder=3 if each.chosen else 2,
         )
         if each in named:
             axes.annotate(each.name, place, xytext=(6, 4), textcoords="offset points", fontsize=8, color=colour)
@@ -85,8 +93,15 @@ def _named(settings: Sequence[PlannedSetting]) -> Sequence[PlannedSetting]:
     """Return the settings that get a name."""
     if len(settings) <= _MAX_NAMES:
         return settings
-    return [
-        each
-        for each in settings
-        if each.chosen or not any(one.seconds < each.seconds and one.error < each.error for one in settings)
-    ]
+    named: list[PlannedSetting] = []
+    for each in sorted(settings, key=lambda one: not one.chosen):
+        is_beaten = any(one.seconds < each.seconds and one.error < each.error for one in settings)
+        if each.chosen or not (is_beaten or any(_is_near(each, one) for one in named)):
+            named.append(each)
+    return named
+
+
+def _is_near(one: PlannedSetting, other: PlannedSetting) -> bool:
+    """Return whether the names of two settings would cover each other."""
+    pairs = ((one.seconds, other.seconds), (one.error, other.error))
+    return all(math.isclose(*each, rel_tol=_NEAR) for each in pairs)

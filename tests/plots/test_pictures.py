@@ -546,3 +546,11 @@ def test_a_picture_of_many_settings_names_those_that_no_other_one_beats(drawn: l
     assert [each.get_text() for each in axes.texts] == [f"s{k}" for k in range(13) if k % 3 != 2 or k == 5]
     draw_plan(tmp_path / "b.png", settings[1:], 8e-6)
     assert len(drawn[1].axes[0].texts) == 12
+    # Of settings at one place the chosen one has the name and is on top, otherwise the first one.
+    apart = [each for each in settings if each.error < 29e-6 or each.chosen]
+    same = [each._replace(name=f"{each.name} again", seconds=1.009 * each.seconds, chosen=False) for each in apart]
+    draw_plan(tmp_path / "c.png", [*same, *settings], 8e-6)
+    axes = drawn[2].axes[0]
+    assert [each.get_text() for each in axes.texts] == [*(each.name for each in same if each.name[:2] != "s5"), "s5"]
+    chosen = next(each for each in axes.lines if each.get_label() == "chosen")
+    assert all(chosen.get_zorder() > each.get_zorder() for each in axes.lines if each is not chosen)

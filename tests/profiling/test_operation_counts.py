@@ -234,10 +234,32 @@ def test_line():
     assert line.profile_flops("ml") is None
 
 
+def expected_tests(tree, ray, *, any_hit, node=0):
+    """Return the numbers of boxes and of triangles below a node of a tree that a ray without a hit is tested against.
+
+    A search for the closest hit tests the boxes of a node again when it returns to it from another node.
+    """
+    origin, direction = ray[:3] - tree.middle, ray[3:]
+    low, high = tree.boxes[node, :3], tree.boxes[node, 3:]
+    cuts = np.sort([(each - origin[:, None]) / direction[:, None] for each in (low, high)], axis=0)
+    is_met = np.maximum(cuts[0].max(axis=0), 0.0) <= np.minimum(cuts[1].min(axis=0), 1.0 if any_hit else np.inf)
+    boxes = np.isfinite(low[0]).sum()
+    met = tree.children[node, is_met & np.isfinite(low[0])][:: -1 if direction[tree.axes[node]] < 0.0 else 1]
+    counts = [(boxes, 0)]
+    for child in met:
+        if child < 0:
+            counts.append((0, np.sum(tree.members[~child] >= 0)))
+            continue
+        counts.append(expected_tests(tree, ray, any_hit=any_hit, node=child))
+        if not any_hit and child != met[-1]:
+            counts.append((boxes, 0))
+    return np.sum(counts, axis=0)
+
+
 @pytest.mark.parametrize("width", [WIDTH, GPU_WIDTH])
 @pytest.mark.parametrize("any_hit", [True, False])
 def test_boxes_and_triangles_of_rays(width, any_hit):
-    """Hits equal the hits of the reference; a ray that misses the scene tests only the boxes of the root."""
+    """Hits equal the hits of the reference, and rays without one test all that the boxes on their way hold."""
     numba_cache.keep_compiled(ray_visits)
     rng = np.random.default_rng(4)
     corners = rng.uniform(-1.0, 1.0, (300, 1, 3)) + rng.uniform(-0.1, 0.1, (300, 3, 3))
@@ -250,7 +272,10 @@ def test_boxes_and_triangles_of_rays(width, any_hit):
         np.testing.assert_array_equal(found.is_hit, ((t > 0.0) & (t < end)).any(axis=1))
     root = np.isfinite(tree.boxes[0, 0]).sum()
     assert found.boxes.min() == root
-    assert np.all(found.triangles[found.boxes == root] <= len(corners))
+    missed, within = ~found.is_hit, np.array([expected_tests(tree, each, any_hit=any_hit) for each in rays])
+    assert np.sum(missed & (found.triangles > 0)) > 20
+    np.testing.assert_array_equal(np.transpose([found.boxes, found.triangles])[missed], within[missed])
+    assert np.all(found.triangles <= within[:, 1])
     assert 0 < found.triangles.mean() < 0.3 * len(corners)
     nothing = ray_visits.visits(tree, rays + np.array([9.0, 0, 0, 0, 0, 0]), end=1.0, any_hit=any_hit)
     assert nothing.mean_flops() == ray_visits._RAY_FLOPS + ray_visits._BOX_FLOPS * root

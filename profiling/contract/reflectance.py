@@ -82,10 +82,28 @@ def _condition(model: Brdf, pairs: npt.NDArray[np.float64]) -> npt.NDArray[np.fl
         if isinstance(model, OrenNayar):
             return np.asarray(1.0 + 1.0 / np.maximum(light[:, 2], eye[:, 2]))
         if isinstance(model, Ggx):
-            # The half vector of grazing, mirrored directions is short: their rounding turns it more.
-            return np.asarray(1.0 + 1.0 / (model.alpha * np.minimum(0.5 * np.linalg.norm(half, axis=-1), 1.0)))
+            return _condition_of_ggx(model, half)
         if isinstance(model, Ward):
             x, y = half[:, 0] / (model.alpha_x * half[:, 2]), half[:, 1] / (model.alpha_y * half[:, 2])
             away = np.hypot(x, y)
             return np.asarray(1.0 + away**2 + (away / min(model.alpha_x, model.alpha_y) + 1.0) / half[:, 2])
     return np.ones(len(pairs))
+
+
+def _condition_of_ggx(model: Ggx, half: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the condition of the microfacet model from half vectors h, the sums of the two unit directions.
+
+    The logarithm of the normals' distribution is 2 ln(z^2 + s^2) - 2 ln(s^2 + alpha^2 z^2), with the height z of h and
+    its length s along the surface. Its derivatives are -g / s by s and g / z by z, with
+    g = 4 (1 - alpha^2) s^2 z^2 / ((s^2 + alpha^2 z^2) (s^2 + z^2)). An error e of each direction changes s by 2 e; of
+    grazing, mirrored directions s and z are both small, and the value changes by up to 2 e / (alpha z). Heights have a
+    relative error e: z and both heights in the shadowing change the value by (g + 2) e. The Fresnel term
+    f0 + (1 - f0) a^5, with a = 1 - |h| / 2, changes by 5 (1 - f0) a^4 e. With e = 8 epsilon the sum is 32 epsilon times
+    a quarter of the derivatives; 32 epsilon more are the roundings of the model.
+    """
+    s, z = np.hypot(half[:, 0], half[:, 1]), half[:, 2]
+    length = np.hypot(s, z)
+    share = 4.0 * (1.0 - model.alpha**2) * z**2 / ((s**2 + (model.alpha * z) ** 2) * length**2)  # g / s^2
+    away = np.maximum(1.0 - 0.5 * length, 0.0)
+    fresnel = 5.0 * (1.0 - model.f0) * away**4 / (model.f0 + (1.0 - model.f0) * away**5)
+    return np.asarray(1.0 + 0.25 * (2.0 * share * s + share * s**2 + 2.0 + fresnel))

@@ -290,6 +290,7 @@ void pose_solved(GROUP_SPACE solved_pose *fit, pose_rows all, constant const int
         judged.pose = *pose;
         judged.present = present;
         judged.scale = scale;
+        judged.is_singular = fit->is_singular;
         pose_judged(&judged, &of_rows, &sums, all.etch / (1 / scale), rank_tolerance);
         *fit = judged;
     }

@@ -92,7 +92,9 @@ static inline void store_pose(GROUP_SPACE const solved_pose *fit, pose_rows all,
     // Below an inlier fraction of 0.75 two outliers may agree by chance. Half the leverage limit then requires that two
     // other rows check each row.
     const real leverage = fit->inlier_fraction > 0.75f ? limits.leverage : limits.leverage / 2;
-    const int refused = fit->rank < POSE_PARAMETERS || fit->inliers < POSE_PARAMETERS ||
+    // Where the normal equations of the last step were singular, the steps ended before the pose of least loss: the
+    // weights of Huber's loss can be so unequal although all rows count as inliers.
+    const int refused = fit->is_singular || fit->rank < POSE_PARAMETERS || fit->inliers < POSE_PARAMETERS ||
                         !(fit->inlier_fraction >= limits.inlier_fraction) || !(fit->leverage < leverage) ||
                         !(fit->covariance_factor < (real)INFINITY);
     const real axx = 1 + FIRST(fit->pose.dxx), axy = FIRST(fit->pose.dxy), ayx = FIRST(fit->pose.dyx),

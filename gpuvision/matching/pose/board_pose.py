@@ -379,7 +379,7 @@ class BoardPoseEstimator(OperationSequence[BoardPoseEstimate]):
         found = (self.lines, self.rulers_per_line)
         shapes = solver.shapes((), (self.lines, self._rows_of_line))
         shapes |= dict.fromkeys(("edges", "edge_status", "edge_weights"), found)
-        limits = (*solver.limits, *solver.placement, solver.etch_bias_certainty)
+        limits = (*solver.limits(build.real), *solver.placement, solver.etch_bias_certainty)
         return build.launch(
             "board_pose/board_pose.cl",
             "board_pose",

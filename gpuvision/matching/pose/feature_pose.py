@@ -291,7 +291,7 @@ class SolveFeatures(VisionOperation[FeaturePose]):
         types: dict[str, Any] = {"pose": dtype, "covariance": dtype, "feature_status": np.uint8}
         types |= {"rank": np.int32, "inliers": np.int32}
         sigmas = (self.ruler_sigma_px, self.matched_sigma_px, self.drilled_sigma_px)
-        limits = (solver.min_scale, *solver.limits, solver.etch_bias_certainty, *sigmas, self.size_tolerance)
+        limits = (solver.min_scale, *solver.limits(real), solver.etch_bias_certainty, *sigmas, self.size_tolerance)
         return build.launch(
             "feature_pose/feature_pose.cl",
             "feature_pose",

@@ -44,6 +44,8 @@ _LANES, _GROUP = 16, 64  # _GROUP: up to PARTS of common/group.h
 _MOST_ROWS = 1024
 _MIN_CAPACITY = 128  # of the row arrays on CPUs, so that poses of many sizes share programs; on GPUs it costs memory
 _START_STEPS = 3  # Gauss-Newton iterations for the pose through a few features
+# Least ratio of eigenvalues of accepted normal equations [epsilons], derived in the notes of `SolvePose`.
+_LEAST_EIGENVALUE = 32.0
 
 
 class BoardPose(NamedTuple):
@@ -81,9 +83,9 @@ class BoardPose(NamedTuple):
         Number of rows with a weight above 0.
     status : uint8, (...,)
         `Status` flags. NO_DATA: fewer rows than unknowns. AMBIGUOUS (refused): the features do not determine all
-        unknowns (``rank``), too few of them agree on one (``inlier_fraction``), or an unknown has no second feature
-        that checks it (``leverage``). OUT_OF_RANGE (refused): the pose lies outside ``search_range``. NOT_FINITE: the
-        initial pose is not finite.
+        unknowns (``rank``; or with their weights, which ended the iteration), too few of them agree on one
+        (``inlier_fraction``), or an unknown has no second feature that checks it (``leverage``). OUT_OF_RANGE
+        (refused): the pose lies outside ``search_range``. NOT_FINITE: the initial pose is not finite.
     etch_bias : float, (...,)
         Distance from the drawn edges to the copper's edges [m], one value for the board; 0 without ``etch_bias_sigma``.
     inlier_fraction : float, (...,)
@@ -230,7 +232,8 @@ class SolvePose(VisionOperation[BoardPose]):
         initial pose is no motion. Edges determine the turn from initial errors up to about 30 degrees, points up to 90
         degrees. Default False.
     max_condition : float
-        Largest accepted `BoardPose.condition`, above 0, default 300.
+        Largest accepted `BoardPose.condition`, above 0, default 300. Range: up to 512 in single and 1.18e7 in double
+        precision; a call with a larger limit raises an error.
     min_inlier_fraction : float
         Least accepted `BoardPose.inlier_fraction`, 0 to 1, default 0.3. It is checked for each parameter combination:
         where four rows determine x and only one of them agrees with the pose, x is doubtful, however many rows
@@ -263,8 +266,11 @@ class SolvePose(VisionOperation[BoardPose]):
     Error: the unknowns are displacements relative to the centre of the rows, not positions. Single precision costs a
     millionth of the displacement, and in the pose 3e-7 of the extent of the rows; at a placement point outside the rows
     the error grows with its distance.
-    Both grow with the condition. The normal equations square it: in single precision a pose with a condition above 1400
-    may be wrong without a flag. ``max_condition`` refuses such a pose by default.
+    Both grow with the condition c. The normal equations square it: their least eigenvalue is 1 / c^2 of the largest
+    one, and the rounding of their sums changes it by up to 8 epsilon (1024 rows; the largest change that a directed
+    search found is 7.6). While c^2 < 1 / (32 epsilon), a step leaves at most a quarter of the distance to the solution,
+    and the factorisation, which takes a pivot below 8 epsilon of its diagonal for 0, succeeds. This is the upper limit
+    of ``max_condition``; beyond it, poses may be wrong without a flag.
 
     References
     ----------
@@ -334,7 +340,7 @@ class SolvePose(VisionOperation[BoardPose]):
         batch, count = shape[:-2], shape[-2]
         poses = math.prod(batch)
         work = build.work(poses, each=1, group=_GROUP, grouping="per_element")
-        limits = (self.min_scale, *self.limits, *self.placement, self.etch_bias_certainty)
+        limits = (self.min_scale, *self.limits(build.real), *self.placement, self.etch_bias_certainty)
         return build.launch(
             "pose/pose.cl",
             "pose_sets",
@@ -377,9 +383,19 @@ class SolvePose(VisionOperation[BoardPose]):
         """Number of unknowns: parameters of the transform, and the etch bias where it is solved for."""
         return TRANSFORM_PARAMETERS[self.transform] + (self.etch_bias_sigma is not None)
 
-    @property
-    def limits(self) -> tuple[float, ...]:
-        """Limits beyond which a pose is refused, in the order of the kernel arguments."""
+    def limits(self, real: np.dtype[Any]) -> tuple[float, ...]:
+        """Return the limits beyond which a pose is refused, in the order of the kernel arguments.
+
+        Raises
+        ------
+        ValueError
+            Numbers of this type do not resolve `max_condition`.
+        """
+        largest = (_LEAST_EIGENVALUE * float(np.finfo(real).eps)) ** -0.5
+        if self.max_condition > largest:
+            raise ValueError(
+                f"SolvePose.max_condition is {self.max_condition:g}, expected up to {largest:g} in {real.name}"
+            )
         checked = self.max_leverage if self.max_leverage < 1.0 else math.inf
         return self.max_condition**-2, self.min_inlier_fraction, checked, *(self.search_range or (math.inf, math.inf))
 

@@ -14,6 +14,7 @@ from canary import Guarded
 from gpuvision.host import Device
 from gpuvision.matching.features.line_fit import FitLines
 from gpuvision.matching.pose.pose import BoardPose, SolvePose, fitted_line_rows, line_rows, point_rows
+from gpuvision.matching.robust import sample_subsets
 from gpuvision.reference import robust
 from gpuvision.status import Status
 
@@ -400,6 +401,78 @@ def test_the_condition_is_compared_with_its_limit(device: Device, variant: Any, 
         assert found.condition[0] == pytest.approx(50.0, rel=0.1)
         assert (found.status[0], found.rank[0]) == (status, rank)
         assert np.isnan(found.pose).all() == (status != Status.OK)
+
+
+# Angles of 1016 parallel edges whose sums rounding changes most, of 4 million random ones in an emulation of the sums.
+BIASED = (2.4331034946954203, 0.7523015129366443)
+
+
+def parallel_edges(rng: np.random.Generator, dtype: Any, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return shifts (200, 2) along parallel edges, and rows whose condition is ``least`` to 30 ``least``.
+
+    Only 8 of 1024 edges measure the shift, with large sigmas.
+    """
+    boards, count, few, size = 200, 1024, 8, 0.02
+    angle = rng.choice(BIASED, (boards, 1)) + rng.normal(0.0, 1e-5, (boards, 1))
+    shift = 1e-4 * np.concatenate([-np.sin(angle), np.cos(angle)], axis=-1)
+    angles = np.repeat(angle, count, axis=1)
+    angles[:, :few] += np.pi / 2.0
+    normal = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    sigma = np.repeat(10.0 ** rng.uniform(-6.0, -5.0, (boards, 1)), count, axis=1)
+    sigma[:, :few] *= least * 30.0 ** rng.uniform(0.0, 1.0, (boards, 1)) * np.sqrt(few / (count - few))
+    point = rng.uniform(-0.5 * size, 0.5 * size, (boards, count, 2))
+    moved = np.sum(normal * shift[:, None], axis=-1, keepdims=True) * normal
+    return shift, np.concatenate([normal, point, moved, sigma[..., None]], axis=-1).astype(dtype)
+
+
+@pytest.mark.double
+@VARIANTS
+@pytest.mark.parametrize(("dtype", "largest"), [(np.float32, 512.0), (np.float64, 1.18e7)])
+def test_poses_up_to_the_largest_condition(
+    device: Device, dtype: Any, largest: float, variant: Any, rng: np.random.Generator
+) -> None:
+    """Poses are refused, or right: 12 steps that leave a quarter of the distance each leave 6e-8 of the shift."""
+    shift, rows = parallel_edges(rng, dtype, largest / 10.0)
+    operation = SolvePose(loss="least_squares", max_condition=largest, variant=variant)
+    found = operation(rows, device=device)
+    is_good = found.status == Status.OK
+    assert np.all(found.status[~is_good] == Status.AMBIGUOUS)
+    assert np.any(is_good & (found.condition > 0.9 * largest))
+    assert np.linalg.norm(found.pose[is_good, :2] - shift[is_good], axis=1).max() < 1e-4 * 1e-6
+    with pytest.raises(ValueError, match=f"max_condition is .*, expected up to .* in {np.dtype(dtype).name}"):
+        replace(operation, max_condition=1.01 * largest)(rows, device=device)
+
+
+@VARIANTS
+def test_poses_beyond_the_largest_condition_are_wrong(
+    device: Device, variant: Any, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the limit there are poses that are off by a tenth of the shift and more, without a flag."""
+    monkeypatch.setattr("gpuvision.matching.pose.pose._LEAST_EIGENVALUE", 1e-9)
+    shift, rows = parallel_edges(rng, np.float32, 500.0)
+    found = SolvePose(loss="least_squares", max_condition=1e5, variant=variant)(rows, device=device)
+    error = np.linalg.norm(found.pose[:, :2] - shift, axis=1)
+    assert np.any(error[found.status == Status.OK] > 1e-5)
+
+
+@VARIANTS
+def test_a_pose_whose_steps_ended_at_a_singular_matrix_is_refused(
+    device: Device, variant: Any, rng: np.random.Generator
+) -> None:
+    """Three edges of 200 measure x + y, and disagree by 1e7 sigmas: Huber's weights are below 1e-6 for two of them.
+
+    The best pose lies on the third one. No start candidate has it.
+    """
+    rows = np.zeros((200, 7))
+    rows[:, :2], rows[:3, :2] = np.sqrt(0.5), (np.sqrt(0.5), -np.sqrt(0.5))
+    rows[:, 2:4], rows[:, 6] = rng.uniform(-0.02, 0.02, (200, 2)), 1e-9
+    rows[:3, 4:6] = np.array([[1e-2], [-1e-2], [-5e-3]]) * rows[:3, :2]
+    chosen = sample_subsets(200, 3, 16)
+    assert chosen.min() > 2
+    found = SolvePose(loss="huber", max_trials=16, variant=variant)(rows.astype(np.float32), device=device)
+    assert (found.status, found.rank) == (Status.AMBIGUOUS, 3)
+    assert found.condition < 20.0
+    assert np.isnan(found.pose).all()
 
 
 @pytest.mark.double

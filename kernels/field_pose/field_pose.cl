@@ -101,15 +101,19 @@ kernel void field_pose_refinement(global const float *restrict points, global co
     const float lever = 1.0f / sqrt(sum_squares / fmax(used, 1.0f) + 1e-12f);
     normal_equations here = {0};
     if (finite) here = equations_at(points, count, pose, shapes, nearest, grid, scale_squared, max_range_squared);
+    // Rounding of the coordinates changes a distance by up to e = epsilon (|x| + |y| + size of the view), and the sum of
+    // the costs r^2 share / c^2 by up to 2 e sum |psi| / c^2 <= (2 e / c) sqrt(used sum) (Cauchy-Schwarz).
+    const float rounding = FLT_EPSILON * (fabs(pose.x) + fabs(pose.y) + 1.0f / lever);
+    const float slack = 2.0f * rounding * sqrt(used / scale_squared);
     float damping = 1e-4f;
     for (int step = 0; finite && step < steps && damping < 1e6f; step++) {
         const float3 by = damped_step(here, damping, lever);
         const float3 next = pose + by;
         const normal_equations there =
             equations_at(points, count, next, shapes, nearest, grid, scale_squared, max_range_squared);
-        // Accept a cost that is equal within the rounding of the sum: near the minimum the step is more accurate than
-        // the difference of costs.
-        const int better = there.cost <= here.cost * 1.000004f;
+        // Accept a cost that is equal within the rounding of the distances and of the sum: near the minimum the step is
+        // more accurate than the difference of costs.
+        const int better = there.cost <= here.cost * 1.000004f + slack * sqrt(here.cost);
         damping = better ? fmax(0.1f * damping, 1e-7f) : 10.0f * damping;
         pose = better ? next : pose;
         here = better ? there : here;

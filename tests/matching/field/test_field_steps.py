@@ -83,10 +83,15 @@ def residuals(pose: Reals, points: Reals, candidates: NDArray[np.uint8]) -> Real
     return np.array([column[list(set(each))].min() for column, each in zip(every.T, candidates, strict=True)])
 
 
-@pytest.mark.parametrize("kinds", [1, 4])
-def test_equations_and_steps(device: Device, kinds: int, rng: np.random.Generator, tmp_path: Path) -> None:
-    """Cells with one candidate, and cells with up to four of them; points beyond the grid and beyond the range."""
-    count, scale, reach, damping, lever = 60, 0.3, 2.2, 0.07, 0.8
+@pytest.mark.parametrize(("kinds", "scale"), [(1, 0.3), (4, 0.3), (4, 300.0)])
+def test_equations_and_steps(
+    device: Device, kinds: int, scale: float, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    """Cells with one candidate, and cells with up to four of them; points beyond the grid and beyond the range.
+
+    With a scale that is large compared with the distances the costs are far below 1, and have all digits.
+    """
+    count, reach, damping, lever = 60, 2.2, 0.07, 0.8
     nearest = rng.integers(0, 4, (ROWS, COLUMNS, 4)).astype(np.uint8)
     if kinds == 1:
         nearest[...] = nearest[..., :1]
@@ -116,7 +121,8 @@ def test_equations_and_steps(device: Device, kinds: int, rng: np.random.Generato
         share = scale**2 / (scale**2 + r**2)
         matrix, right = rows.T @ (share[:, None] ** 2 * rows), rows.T @ (share**2 * r)
         lower = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
-        np.testing.assert_allclose(out[:4], [np.sum(1.0 - share), *right], rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(out[0], np.sum(r**2 / (scale**2 + r**2)), rtol=1e-5)
+        np.testing.assert_allclose(out[1:4], right, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(out[4:10], [matrix[each] for each in lower], rtol=1e-4, atol=1e-4)
         scales = np.array([1.0, 1.0, lever])
         scaled = matrix * np.outer(scales, scales)

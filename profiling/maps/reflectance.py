@@ -39,7 +39,7 @@ def _errors(device: Device, places: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _bound(places: Floats) -> Floats:
-    # Each component of a direction is divided, and multiplied by one over the length, whose own roundings are up to 3.5:
+    # Each component of a direction is divided, and multiplied by one over the length, which has up to 3.5 roundings:
     # 5.5 roundings, 2.75 epsilon. Where two grazing directions nearly cancel, the half vector, twice the cosine long,
     # turns by 2 x 2.75 epsilon over twice the cosine. The value changes by up to two over alpha of this turn. Heights
     # and the Fresnel term have a relative error of 2.75 epsilon, to the powers 4 + 2 and up to 5 (1 - f0) / f0 times

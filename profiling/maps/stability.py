@@ -15,7 +15,8 @@ from gpuvision.host import Device
 OPERATIONS = (
     *("psd", "triangulation", "line", "undistort_points", "ruler", "line_fit", "pose"),
     *("range_image", "merge_heights", "deposits", "reflectance", "line_irradiance", "rays", "blob", "board_image"),
-    *("any_hit", "occluded_irradiance", "undistort_image"),
+    *("any_hit", "occluded_irradiance", "undistort_image", "board_pose", "feature_pose", "field_search"),
+    "field_refinement",
 )
 """Operations with a map: names of the modules of this package."""
 LIMITS = (1e-6, 1e-3)

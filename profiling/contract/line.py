@@ -90,7 +90,7 @@ def _extremes(dtype: str) -> npt.NDArray[Any]:
     return frame
 
 
-def _case(name: str, frames: npt.NDArray[Any], **settings: Any) -> Case:
+def _case(name: str, frames: npt.NDArray[Any], *, triangulation: Triangulation | None = None, **settings: Any) -> Case:
     parameters = {"method": "windowed", "threshold": _LEVEL[frames.dtype.name], "window": _WINDOW, **settings}
     expected = read_lines(frames, **parameters)
     exact = {key: expected[key] for key in ("position", "peak", "width", "total", "status")}
@@ -102,7 +102,8 @@ def _case(name: str, frames: npt.NDArray[Any], **settings: Any) -> Case:
     elif method == "fir":
         lever = 2.0
     quantities = {"position": np.abs(expected["position"]) + lever, "total": np.abs(expected["total"])}
-    return Case("LineReadout", name, LineReadout(**parameters), (frames,), exact, quantities, when=when)
+    template = LineReadout(triangulation=triangulation, **parameters)
+    return Case("LineReadout", name, template, (frames,), exact, quantities, when=when)
 
 
 def _triangulated(frames: npt.NDArray[Any]) -> Iterator[Case]:
@@ -111,11 +112,11 @@ def _triangulated(frames: npt.NDArray[Any]) -> Iterator[Case]:
     for name, lens in (("horizon", None), ("fold of the lens", _LENS)):
         sheet = Triangulation(homography=_HOMOGRAPHY, region=_REGION, horizon=_HORIZON, lens=lens)
         terms = None if lens is None else (lens.k1, lens.k2, lens.centre)
-        case = _case(f"{name}, uint8", frames)
+        case = _case(f"{name}, uint8", frames, triangulation=sheet)
         position, status = case.exact["position"], case.exact["status"]
         _, _, flags = triangulate(position, column, _HOMOGRAPHY, _REGION, horizon=_HORIZON, lens=terms)
-        exact = {**case.exact, "status": np.where(np.isfinite(position), status | flags, status)}
-        yield replace(case, template=replace(case.template, triangulation=sheet), exact=exact)
+        status = np.where(np.isfinite(position), status | flags, status)
+        yield replace(case, exact={**case.exact, "status": status})
 
 
 def _spread_of_logarithms(frames: npt.NDArray[Any], position: npt.NDArray[Any], threshold: float) -> npt.NDArray[Any]:

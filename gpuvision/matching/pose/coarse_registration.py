@@ -308,9 +308,10 @@ class CoarseRegistration:
     def _distinct_from(self, best: ScoredMotion, tried: list[ScoredMotion]) -> list[ScoredMotion]:
         """Return the motions whose rulers lie at other places than the rulers of the best motion, best first."""
         limit = (2.0 * self.tolerance_px + 1.0) / self._pixels_per_unit
-        change = np.stack([each.motion for each in tried]) - best.motion
-        points = (self.rulers.point - self.placement) @ change[..., :2].swapaxes(1, 2) + change[:, None, :, 2]
-        is_other = np.median(np.hypot(points[..., 0], points[..., 1]), axis=1) > limit
+        change = (np.stack([each.motion for each in tried]) - best.motion)[..., None]
+        px, py = (self.rulers.point - self.placement).T
+        x, y = (change[:, k, 0] * px + change[:, k, 1] * py + change[:, k, 2] for k in range(2))
+        is_other = np.median(np.sqrt(x * x + y * y), axis=1) > limit
         return sorted(itertools.compress(tried, is_other), key=lambda each: -each.score)
 
     def _measure(

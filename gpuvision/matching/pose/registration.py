@@ -286,15 +286,15 @@ def find_template_edges(template: npt.NDArray[Any], ruler: RulerEdges, *, device
         Where to run; None: `Device.best`.
     """
     smooth = cv2.GaussianBlur(template.astype(np.float32), (0, 0), ruler.smoothing_px, borderType=cv2.BORDER_REPLICATE)
-    gradient = np.stack([cv2.Scharr(smooth, cv2.CV_32F, *order, scale=1 / 32) for order in ((1, 0), (0, 1))], axis=-1)
-    steep = np.hypot(gradient[..., 0], gradient[..., 1])
+    gradient = [cv2.Scharr(smooth, cv2.CV_32F, *order, scale=1 / 32) for order in ((1, 0), (0, 1))]
+    steep = cv2.magnitude(*gradient)
     rows, columns = (each // _TILE_PX for each in steep.shape)
     tiles = steep[: rows * _TILE_PX, : columns * _TILE_PX].reshape(rows, _TILE_PX, columns, _TILE_PX).swapaxes(1, 2)
     place = np.argmax(tiles.reshape(rows, columns, -1), axis=-1)
     x = np.arange(columns) * _TILE_PX + place % _TILE_PX
     y = np.arange(rows)[:, None] * _TILE_PX + place // _TILE_PX
     at = np.stack([x, y], axis=-1).reshape(-1, 2)
-    slope = gradient[at[:, 1], at[:, 0]].astype(np.float64)
+    slope = np.stack([each[at[:, 1], at[:, 0]] for each in gradient], axis=-1).astype(np.float64)
     height = np.hypot(*slope.T)
     # Half of the gradient of a sharp step of the threshold: the ruler makes the decision.
     good = height > 0.5 * ruler.threshold / (math.sqrt(2.0 * math.pi) * ruler.smoothing_px)

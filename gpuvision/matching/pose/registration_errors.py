@@ -162,7 +162,7 @@ def _fit(edges: FittedEdges, columns: Float64, blocks: int, overlap: int = 1) ->
     cell = _cells(edges.place, blocks * overlap)
     clustered = overlapping_jackknife(weighted, normal, left, cell, cells=blocks * overlap, overlap=overlap)
     covariance = not_below(clustered, independent) + np.outer(shrunk, shrunk)
-    return _Fit(parameters / scale, covariance / np.outer(scale, scale), len(np.unique(cell, axis=0)))
+    return _Fit(parameters / scale, covariance / np.outer(scale, scale), len(np.unique(cell @ (1, blocks * overlap))))
 
 
 def _cells(place: Float64, count: int) -> npt.NDArray[np.intp]:

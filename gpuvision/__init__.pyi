@@ -517,6 +517,9 @@ from .workflows.planning import (
     ScanJob as ScanJob,
 )
 from .workflows.planning import (
+    SimulationJob as SimulationJob,
+)
+from .workflows.planning import (
     plan as plan,
 )
 

@@ -111,6 +111,7 @@ INPUTS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "docs/guides/calibrate_lens.md": _one_image,
     "docs/guides/calibrate_tilted_camera.md": _images,
     "docs/guides/calibrate_sensor.md": _laser_images,
+    "docs/guides/plan_simulation.md": _part,
     "docs/guides/simulate_part.md": _part,
     "docs/guides/locate_board.md": _board,
     "docs/guides/plan_location.md": _board,

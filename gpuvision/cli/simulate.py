@@ -20,6 +20,7 @@ from gpuvision.cli.arguments import (
     reject_unused,
     write_report,
 )
+from gpuvision.cli.simulate_plan import check_plan_options, planned_task, write_simulation_plan
 
 if TYPE_CHECKING:
     from gpuvision.sensor.sensor import Sensor
@@ -72,16 +73,31 @@ Albedo = Annotated[
     float | None, typer.Option(min=0.0, max=1.0, help="Albedo of all surfaces; not with --materials. Default: 0.5.")
 ]
 Paths = Annotated[
-    str,
+    str | None,
     typer.Option(
         metavar="PATHS",
-        help="Light paths: all, or a list of direct, specular, diffuse-specular, diffuse-diffuse, multi-bounce.",
+        help="Light paths: all, or a list of direct, specular, diffuse-specular, diffuse-diffuse, multi-bounce. "
+        "Default: all but multi-bounce; with --tolerance all.",
     ),
 ]
 Tolerance = Annotated[
-    float,
+    str | None,
     typer.Option(
-        min=0.0, help="Largest range error [m] that the approximation of indirect light may cause; 0: no approximation."
+        metavar="LENGTH",
+        help="Largest error of the simulated range, such as 5um: choose the fastest light paths, slabs, rays per bin, "
+        "patches and clusters of pairs that are predicted to meet it on some of the profiles.",
+    ),
+]
+Rate = Annotated[
+    float | None,
+    typer.Option(min=0.0, help="With --tolerance: profiles per second that the simulation must reach."),
+]
+OnlyPlan = Annotated[
+    bool,
+    typer.Option(
+        "--plan",
+        help="With --tolerance: only print the settings that were tried with their predicted errors and times, and "
+        "write plan.png. No simulation.",
     ),
 ]
 PatchSize = Annotated[
@@ -108,7 +124,7 @@ Limit = Annotated[
     typer.Option(
         min=0.0,
         help="Smallest error [m] that counts as wrong in the summary. Default: 5 standard deviations of the noise, "
-        "or --tolerance if that is larger.",
+        "or the tolerance of clustered pairs that a plan chose if that is larger.",
     ),
 ]
 Profiles = Annotated[
@@ -139,8 +155,10 @@ def simulate(
     unit: Annotated[Unit, typer.Option(help="Length unit of the mesh.")] = Unit.metre,
     materials: MaterialsFile = None,
     albedo: Albedo = None,
-    paths: Paths = "direct,specular,diffuse-specular,diffuse-diffuse",
-    tolerance: Tolerance = 0.0,
+    paths: Paths = None,
+    tolerance: Tolerance = None,
+    rate: Rate = None,
+    only_plan: OnlyPlan = False,
     patch_size: PatchSize = None,
     mask: MaskChoice = "none",
     second: SecondSensor = None,
@@ -160,7 +178,8 @@ def simulate(
     """Predict the range image that a sensor makes of a PART, its errors, and their causes.
 
     The light of each profile is stored in DIR. A stopped run continues there; a run with another --mask, --seed or
-    --noise reuses the stored light. With --recording, gpuvision scan can read the simulated frames.
+    --noise reuses the stored light. With --recording, gpuvision scan can read the simulated frames. With --tolerance,
+    light that the range does not need is left out.
     """
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
@@ -169,35 +188,62 @@ def simulate(
     reject_unused("with --materials", albedo=None if materials is None else albedo)
     reject_unused("without --second", rule=rule if second is None else None)
     reject_unused("with --no-noise", seed=None if noise else seed)
-    names = _names(paths)
-    _check_unused_paths(names, tolerance, patch_size)
+    check_plan_options(
+        tolerance,
+        rate,
+        only_plan=only_plan,
+        mask=None if mask == "none" else mask,
+        second=second,
+        limit=limit,
+        seed=seed,
+        no_noise=not noise,
+        recording=recording,
+        scheduler=scheduler,
+    )
+    names = _names(paths, is_planned=tolerance is not None)
+    if "multi-bounce" not in names:
+        reject_unused("without multi-bounce in --paths", patch_size=patch_size)
     described = Sensor.load(sensor)
     second_sensor = None if second is None else Sensor.load(second)
     read = [each for each in (part, sensor, second, materials, mask) if each is not None]
     read += [*described.files, *(() if second_sensor is None else second_sensor.files)]
+    chosen = None if device is None else Device.named(device)
+    light = {"paths": names, "patch_size": patch_size}
+    if only_plan:
+        assert tolerance is not None  # checked above
+        task, _ = _prepare(*_load_part(part, unit, materials, albedo, described), described, None, light, profiles)
+        write_simulation_plan(task, part.name, tolerance, rate, chosen, out, as_json, read, overwrite=overwrite)
+        return
     outputs = Outputs("simulate", inputs=read, overwrite=overwrite)
     described_by = [sensor] if second is None else [sensor, second]
     outputs.claim_folder(out, _files(len(described_by), has_mask=mask == "best", has_recording=recording))
     outputs.claim(as_json)
     before = _mask(mask)
     loaded = _load_part(part, unit, materials, albedo, described)
-    light = {"paths": names, "tolerance": tolerance, "patch_size": patch_size}
     task, other = _prepare(*loaded, described, second_sensor, light, profiles)
     if recording:
         _check_recordings([task] if other is None else [task, other], described_by)
+    lines = []
+    if tolerance is not None:
+        task, line = planned_task(task, part.name, tolerance, rate, chosen)
+        lines.append(line)
+        if other is not None:
+            other, line = planned_task(other, f"{part.name}, second sensor", tolerance, rate, chosen)
+            lines.append(line)
     made: dict[str, Any] = {
         "mask": before,
         "seed": (1 if seed is None else seed) if noise else None,
         "limit": limit,
-        "device": None if device is None else Device.named(device),
+        "device": chosen,
         "scheduler": scheduler,
     }
     found, summary = _run(task, other, rule or Rule.stronger, out, made, f"simulating {part.name}", read, overwrite)
     if recording:
         summary += f"\n{_write_recordings(found, described_by, out, made, read, overwrite)}"
     write_report(as_json, found[0].report(), outputs)
+    lines.append(summary)
     echo(
-        f"{summary}\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}",
+        "\n".join(lines) + f"\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}",
         err=prints_report(as_json),
     )
 
@@ -238,21 +284,16 @@ def _check_recordings(tasks: Sequence[SimulationTask], sensor_files: Sequence[st
         recording_sensor(task, file)
 
 
-def _names(paths: str) -> tuple[str, ...]:
-    """Return the light paths that ``--paths`` names."""
+def _names(paths: str | None, *, is_planned: bool = False) -> tuple[str, ...]:
+    """Return the light paths that ``--paths`` names; by default those of a simulation, or all for a plan."""
     from gpuvision.simulation.sensors.readings import PATHS
+    from gpuvision.workflows.simulating import DEFAULT_PATHS
 
+    if paths is None:
+        return PATHS if is_planned else DEFAULT_PATHS
     if paths.strip() == "all":
         return PATHS
     return tuple(each.strip() for each in paths.split(",") if each.strip())
-
-
-def _check_unused_paths(names: tuple[str, ...], tolerance: float, patch_size: float | None) -> None:
-    """Refuse options of light paths that are left out."""
-    if not {"diffuse-diffuse", "multi-bounce"} & set(names):
-        reject_unused("without diffuse-diffuse or multi-bounce in --paths", tolerance=tolerance or None)
-    if "multi-bounce" not in names:
-        reject_unused("without multi-bounce in --paths", patch_size=patch_size)
 
 
 def _load_part(

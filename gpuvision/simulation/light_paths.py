@@ -19,7 +19,7 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.readings import BEYOND_ENDS, PATHS, GroundTruth
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.simulation.sensors.view_rays import ViewRays, VisibleSurface
-from gpuvision.simulation.transport.direct import DirectLight
+from gpuvision.simulation.transport.direct import DirectLight, DirectLimits
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
 from gpuvision.simulation.transport.line_irradiance import LitSegments
 from gpuvision.simulation.transport.mirrors import Mirrors
@@ -83,6 +83,10 @@ class LightPaths:
         Power of a sample below which it is not read [W]. Default 0.0.
     device : Device, optional
         Device of the kernels; None: `Device.best`.
+    direct_limits : DirectLimits
+        Numerical limits of the direct light, such as the division of glossy lobes.
+    mirror_steps : float
+        Number of steps per sample in which a line in a curved mirror is imaged, above 0. Default 2.0.
 
     Raises
     ------
@@ -124,6 +128,8 @@ class LightPaths:
     tolerance: float = 0.0
     min_power: float = 0.0
     device: Device | None = None
+    direct_limits: DirectLimits = DirectLimits()
+    mirror_steps: float = 2.0
     _direct: DirectLight = field(init=False, repr=False)
     _mirrors: Mirrors = field(init=False, repr=False)
     view_rays: ViewRays = field(init=False, repr=False)
@@ -150,8 +156,15 @@ class LightPaths:
             sub_sheets=self.sub_sheets,
             device=device,
             ends=(float(self.view.u_edges[0]), float(self.view.u_edges[-1])),
+            limits=self.direct_limits,
         )
-        mirrors = Mirrors(view=self.view, scene=self.scene, materials=self.materials, device=device)
+        mirrors = Mirrors(
+            view=self.view,
+            scene=self.scene,
+            materials=self.materials,
+            steps_per_sample=self.mirror_steps,
+            device=device,
+        )
         clustered = ClusteredIrradiance(scene=self.scene, tolerance=self.tolerance, device=device)
         object.__setattr__(self, "_clustered", clustered)
         object.__setattr__(self, "_direct", direct)

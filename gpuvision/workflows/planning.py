@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, overload
@@ -16,12 +16,17 @@ from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.board.measurement_result import Copper
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.servoing.placement.machine import Machine
+from gpuvision.simulation.scene.material import Material
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.readings import PATHS
 from gpuvision.workflows.location_plan import LocationPlan
 from gpuvision.workflows.placement_plan import PlacementSettingsPlan
 from gpuvision.workflows.planning_location import plan_location
 from gpuvision.workflows.planning_placement import plan_placement_settings
 from gpuvision.workflows.planning_scan import plan_scan
+from gpuvision.workflows.planning_simulation import plan_simulation
 from gpuvision.workflows.scan_plan import ScanPlan
+from gpuvision.workflows.simulation_plan import SimulationPlan
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,6 +104,35 @@ class PlacementJob:
     times_vision: bool = False
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SimulationJob:
+    """Simulation of a scan, for `plan`.
+
+    Attributes
+    ----------
+    part : Scene
+        Part in the sensor's coordinates.
+    materials : sequence of Material
+        A material for every number in `Scene.material`.
+    sensor : Sensor
+        Sensor with a light and a straight transport.
+    paths : sequence of str
+        Light paths that may be needed, out of "direct", "specular", "diffuse-specular", "diffuse-diffuse" and
+        "multi-bounce". Default: all.
+    patch_size, profiles, transports
+        Smallest patches of multi-bounce light [m], number of profiles, and positions of the sheet [m]. Default: as in
+        `gpuvision.workflows.simulating.prepare_simulation`.
+    """
+
+    part: Scene
+    materials: Sequence[Material]
+    sensor: Sensor
+    paths: Sequence[str] = PATHS
+    patch_size: float | None = None
+    profiles: int | None = None
+    transports: npt.ArrayLike | None = None
+
+
 @overload
 def plan(
     job: ScanJob,
@@ -132,32 +166,44 @@ def plan(
 ) -> PlacementSettingsPlan: ...
 
 
+@overload
 def plan(
-    job: ScanJob | LocationJob | PlacementJob,
+    job: SimulationJob,
+    *,
+    tolerance: float,
+    rate: float | None = ...,
+    latency: float | None = ...,
+    device: Device | None = ...,
+) -> SimulationPlan: ...
+
+
+def plan(
+    job: ScanJob | LocationJob | PlacementJob | SimulationJob,
     *,
     tolerance: float,
     rate: float | None = None,
     latency: float | None = None,
     device: Device | None = None,
-) -> ScanPlan | LocationPlan | PlacementSettingsPlan:
+) -> ScanPlan | LocationPlan | PlacementSettingsPlan | SimulationPlan:
     """Choose the fastest settings of a job whose predicted error meets a tolerance.
 
     Parameters
     ----------
-    job : ScanJob, LocationJob or PlacementJob
-        Scan of a recording, localization of a board, or placements on a board.
+    job : ScanJob, LocationJob, PlacementJob or SimulationJob
+        Scan of a recording, localization of a board, placements on a board, or simulation of a scan.
     tolerance : float
-        Largest error of the heights, of the pose at the features of the board, or of the placed part [m].
+        Largest error of the heights, of the pose at the features of the board, of the placed part, or of the simulated
+        range [m].
     rate : float, optional
-        Frames, or placements, per second that the settings must keep up with [1/s].
+        Frames, placements, or simulated profiles per second that the settings must keep up with [1/s].
     latency : float, optional
-        Longest acceptable time from a frame to its result, or of a placement [s]; needs a rate.
+        Longest acceptable time from a frame to its result, of a placement, or of a simulated profile [s]; needs a rate.
     device : Device, optional
         Default `Device.best`.
 
     Returns
     -------
-    ScanPlan, LocationPlan or PlacementSettingsPlan
+    ScanPlan, LocationPlan, PlacementSettingsPlan or SimulationPlan
         Chosen settings, all that were tried, and what another tolerance gives.
 
     Raises
@@ -167,18 +213,21 @@ def plan(
     TypeError
         The job is of another type.
     ValueError
-        As `gpuvision.workflows.planning_scan.plan_scan`, `gpuvision.workflows.planning_location.plan_location` and
-        `gpuvision.workflows.planning_placement.plan_placement_settings`, which also take other options.
+        As `gpuvision.workflows.planning_scan.plan_scan`, `gpuvision.workflows.planning_location.plan_location`,
+        `gpuvision.workflows.planning_placement.plan_placement_settings` and
+        `gpuvision.workflows.planning_simulation.plan_simulation`, which also take other options.
     """
     planners: dict[type, Callable[..., Any]] = {
         ScanJob: plan_scan,
         LocationJob: plan_location,
         PlacementJob: plan_placement_settings,
+        SimulationJob: plan_simulation,
     }
     planner = planners.get(type(job))
     if planner is None:
-        raise TypeError(f"job is a {type(job).__name__}, expected a ScanJob, a LocationJob or a PlacementJob")
+        expected = "a ScanJob, a LocationJob, a PlacementJob or a SimulationJob"
+        raise TypeError(f"job is a {type(job).__name__}, expected {expected}")
     options: dict[str, Any] = {each.name: getattr(job, each.name) for each in fields(job)}
     options |= {"tolerance": tolerance, "rate": rate, "latency": latency, "device": device}
-    found: ScanPlan | LocationPlan | PlacementSettingsPlan = planner(**options)
+    found: ScanPlan | LocationPlan | PlacementSettingsPlan | SimulationPlan = planner(**options)
     return found

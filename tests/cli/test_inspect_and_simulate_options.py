@@ -205,16 +205,9 @@ def test_what_an_inspection_of_paste_needs() -> None:
 def test_light_paths_by_name() -> None:
     assert simulate._names(" all ") == PATHS
     assert simulate._names("direct, specular,,multi-bounce ") == ("direct", "specular", "multi-bounce")
-    for names in (("direct", "diffuse-diffuse"), ("direct", "multi-bounce")):
-        simulate._check_unused_paths(names, 1e-6, None)
-    simulate._check_unused_paths(("direct",), 0.0, None)
-    simulate._check_unused_paths(("direct", "multi-bounce"), 0.0, 1e-3)
-    with pytest.raises(
-        ValueError, match="--tolerance has no effect without diffuse-diffuse or multi-bounce in --paths"
-    ):
-        simulate._check_unused_paths(("direct", "specular"), 1e-6, None)
-    with pytest.raises(ValueError, match="--patch-size has no effect without multi-bounce in --paths"):
-        simulate._check_unused_paths(("direct", "diffuse-diffuse"), 1e-6, 1e-3)
+    assert simulate._names(None) == simulating.DEFAULT_PATHS
+    assert simulate._names(None, is_planned=True) == PATHS
+    assert simulate._names("direct", is_planned=True) == ("direct",)
 
 
 def test_mask_by_name_or_file(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,7 +32,7 @@ def default_of(function: Callable[..., Any], name: str) -> Any:
     [
         (merge, "max_sigmas", merge_scans, "max_sigmas"),
         (merge, "max_sigmas", gv.merge_height_maps, "max_sigmas"),
-        (simulate, "tolerance", simulating.prepare_simulation, "tolerance"),
+        (simulate, "patch_size", simulating.prepare_simulation, "patch_size"),
         (select, "missing", gv.choose_features, "missing"),
         (select, "blur", Imaging, "blur_px"),
         (select, "width", Imaging, "width_px"),

@@ -28,10 +28,8 @@ from gpuvision.cli.main import application
         (("undistort", "a.npy", "--lens", "l.toml", "--out", "d", "--interpolation", "bicubic"), "--interpolation"),
         (("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--rule", "mean"), "--rule"),
         (("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--no-noise", "--seed", "3"), "--seed"),
-        (
-            ("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--paths", "direct", "--tolerance", "1e-6"),
-            "--tolerance",
-        ),
+        (("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--rate", "9"), "--rate"),
+        (("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--patch-size", "1e-3"), "--patch-size"),
         (
             ("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--materials", "m.toml", "--albedo", "0"),
             "--albedo",

@@ -40,6 +40,7 @@ SLOW = {
     "docs/guides/plan_location.md",
     "docs/guides/plan_placement.md",
     "docs/guides/plan_scan.md",
+    "docs/guides/plan_simulation.md",
 }
 
 

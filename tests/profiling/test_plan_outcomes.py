@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gpuvision.accuracy.plan import PlanError
-from gpuvision.profiling import location_plans, placement_plans, scan_plans
+from gpuvision.profiling import location_plans, placement_plans, scan_plans, simulation_plans
 from gpuvision.profiling.location_plans import Measured
 from gpuvision.profiling.plan_outcomes import Outcome, cost_of, summary
 
@@ -206,3 +206,58 @@ def test_a_setting_that_drops_a_part_is_no_accurate_one(monkeypatch: pytest.Monk
     assert found == (pytest.approx(math.sqrt(square)), 2.75)
     runs[1].released = False
     assert placement_plans.measure(job, trial, device, seed=1) == (math.inf, math.inf)
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "rate", "chosen", "keeps_up"),
+    [(4.5, 0.5, "fast", True), (2.2, 0.9, "middle", False), (1.0, 0.5, None, True)],
+)
+def test_outcome_of_a_simulation(
+    monkeypatch: pytest.MonkeyPatch, tolerance: float, rate: float, chosen: str | None, keeps_up: bool
+) -> None:
+    """The run of a chosen setting takes 1.5 times the planned time: 0.5 of the largest planned rate is kept."""
+    names = list(SETTINGS)
+
+    class Options:
+        def __init__(self, sample: Any, tolerance: float, progress: Any) -> None:
+            self.combinations = lambda: iter([[name] for name in names])
+            self.settings_of = lambda options: options[0]
+            self.seconds_of = lambda options: SETTINGS[options[0]][0]
+
+    def planned(task: Any, *, tolerance: float, device: Any, limits: Any) -> Any:
+        fits = [name for name, each in SETTINGS.items() if 1.1 * each[1] <= tolerance]
+        if not fits:
+            raise PlanError("none", (), ())
+        settings: Any = SimpleNamespace(paths=("direct",), name=fits[0])
+        return SimpleNamespace(chosen=SimpleNamespace(settings=_Name(fits[0], settings), seconds=SETTINGS[fits[0]][0]))
+
+    def light(settings: Any) -> Any:
+        return SimpleNamespace(seconds=1.5 * SETTINGS[settings][0], setup=9.0, exposures=settings)
+
+    truth = SimpleNamespace(sample=SimpleNamespace(light=light), error=lambda light, max_moved: SETTINGS[str(light)][2])
+    job: Any = SimpleNamespace(task=None, tolerance=tolerance, rate=rate)
+    monkeypatch.setattr(simulation_plans, "random_job", lambda rng: job)
+    monkeypatch.setattr(simulation_plans, "Truth", lambda job, device: truth)
+    monkeypatch.setattr(simulation_plans, "LightOptions", Options)
+    monkeypatch.setattr(simulation_plans, "light_of_options", lambda options: options[0])
+    monkeypatch.setattr(simulation_plans, "plan_task", planned)
+    device: Any = None
+    found = simulation_plans.judge(np.random.default_rng(1), device)
+    assert found.possible == (tolerance > 1.2)
+    if chosen is None:
+        assert found.plan is None
+        return
+    assert found.plan is not None
+    assert (found.plan.chosen.settings, found.error, found.keeps_up) == (chosen, SETTINGS[chosen][2], keeps_up)
+    assert found.cost == 1.0
+
+
+class _Name(str):
+    """Name that stands for settings: their light paths are those of the settings."""
+
+    def __new__(cls, name: str, settings: Any) -> _Name:
+        made = super().__new__(cls, name)
+        made.paths = settings.paths
+        return made
+
+    paths: tuple[str, ...]

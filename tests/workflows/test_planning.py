@@ -10,10 +10,11 @@ import pytest
 
 import gpuvision as gv
 from gpuvision.workflows import planning
-from gpuvision.workflows.planning import LocationJob, PlacementJob, ScanJob
+from gpuvision.workflows.planning import LocationJob, PlacementJob, ScanJob, SimulationJob
 from gpuvision.workflows.planning_location import plan_location
 from gpuvision.workflows.planning_placement import plan_placement_settings
 from gpuvision.workflows.planning_scan import plan_scan
+from gpuvision.workflows.planning_simulation import plan_simulation
 
 NAMES = ("recording", "sensor", "image", "artwork", "machine", "device")
 PIECES: Any = {name: object() for name in NAMES}
@@ -23,6 +24,7 @@ def test_a_job_goes_to_its_planner(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planning, "plan_scan", lambda **given: ("scan", given))
     monkeypatch.setattr(planning, "plan_location", lambda **given: ("location", given))
     monkeypatch.setattr(planning, "plan_placement_settings", lambda **given: ("placement", given))
+    monkeypatch.setattr(planning, "plan_simulation", lambda **given: ("simulation", given))
     asked = {"tolerance": 2e-6, "rate": 50.0, "latency": 0.1, "device": PIECES["device"]}
     scan: Any = gv.plan(gv.ScanJob(recording=PIECES["recording"], sensor=PIECES["sensor"]), **asked)
     assert scan == ("scan", {"recording": PIECES["recording"], "sensor": PIECES["sensor"], **asked})
@@ -36,11 +38,20 @@ def test_a_job_goes_to_its_planner(monkeypatch: pytest.MonkeyPatch) -> None:
     assert name == "placement"
     assert (given["target"], given["machine"], given["budget"]) == ((1.0, 2.0, 3.0), PIECES["machine"], 9)
     assert given["rate"] == 50.0
+    simulation = gv.SimulationJob(part=PIECES["image"], materials=(), sensor=PIECES["sensor"], paths=("direct",))
+    name, given = gv.plan(simulation, **asked)  # type: ignore[misc]
+    assert name == "simulation"
+    assert (given["part"], given["paths"], given["rate"]) == (PIECES["image"], ("direct",), 50.0)
 
 
 def test_the_fields_of_a_job_are_the_parameters_of_its_planner() -> None:
     common = {"tolerance", "rate", "latency", "device", "limits", "progress"}
-    pairs = ((ScanJob, plan_scan), (LocationJob, plan_location), (PlacementJob, plan_placement_settings))
+    pairs = (
+        (ScanJob, plan_scan),
+        (LocationJob, plan_location),
+        (PlacementJob, plan_placement_settings),
+        (SimulationJob, plan_simulation),
+    )
     for job, planner in pairs:
         parameters: Any = inspect.signature(planner).parameters
         assert {each.name for each in fields(job)} == set(parameters) - common
@@ -52,5 +63,6 @@ def test_the_fields_of_a_job_are_the_parameters_of_its_planner() -> None:
 
 def test_another_job_is_refused() -> None:
     other: Any = "recording.npy"
-    with pytest.raises(TypeError, match="job is a str, expected a ScanJob, a LocationJob or a PlacementJob"):
+    expected = "a ScanJob, a LocationJob, a PlacementJob or a SimulationJob"
+    with pytest.raises(TypeError, match=f"job is a str, expected {expected}"):
         gv.plan(other, tolerance=1e-6)

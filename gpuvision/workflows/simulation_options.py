@@ -1,0 +1,191 @@
+"""Light of a sample of profiles for each path and each of its discretisations: the settings that a plan combines."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpuvision.sensor.simulated import require_light
+from gpuvision.simulation.sensors.readings import PATHS
+from gpuvision.simulation.sensors.sensor_view import Exposure
+from gpuvision.workflows.simulation_errors import BOUNCES_BOUND, DIRECT, PAIRS_BOUND, ErrorPart, scene_paths
+from gpuvision.workflows.simulation_sample import ProfileSample, SampledLight, SimulationSettings
+
+Progress = Callable[[int, int | None], object]
+
+_PROVEN = 0.1  # share of the tolerance up to which a proven bound replaces multi-bounce light. Chosen
+_PAIRS = 0.25  # share of the tolerance that clustered and omitted pairs may take. Chosen
+_MIN_PAIRS = 65536  # pairs of a profile below which `ClusteredIrradiance` computes all of them
+
+
+class Option(NamedTuple):
+    """Discretisation of a light path, or the path left out.
+
+    Attributes
+    ----------
+    changes : dict
+        Fields of `SimulationSettings`; the paths add to those of other options.
+    exposures : dict of str to Exposure
+        The light.
+    seconds : float
+        Time of a profile beyond that of the direct light, or of the direct light [s].
+    pairs : float
+        Bound of the error by clustered pairs [m]. Default 0.0.
+    """
+
+    changes: dict[str, Any]
+    exposures: dict[str, Exposure]
+    seconds: float
+    pairs: float = 0.0
+
+
+class LightOptions:
+    """Options of all light paths of a task.
+
+    Parameters
+    ----------
+    sample : ProfileSample
+        The profiles.
+    tolerance : float
+        Asked error of the range [m].
+    progress : callable
+        Called with the number of options done and None.
+
+    Attributes
+    ----------
+    axes : list of list of Option
+        Options of the direct light, of mirrors, and of diffuse and multi-bounce light; the last of each is the finest.
+    setups : dict of float
+        Time of the preparation of multi-bounce light by size of the patches [s].
+    proven : dict of str to ErrorPart
+        Errors of paths that are left out by a proven bound.
+    checks : dict of str to Exposure
+        Light of the finest options by path, on the other profiles of the sample.
+    """
+
+    def __init__(self, sample: ProfileSample, tolerance: float, progress: Progress) -> None:
+        self.sample, self.settings = sample, SimulationSettings.of(sample.task)
+        self.setups: dict[float, float] = {}
+        self.proven: dict[str, ErrorPart] = {}
+        self.checks: dict[str, Exposure] = {}
+        self._paths = [each for each in scene_paths(sample.task) if each in sample.task.paths]
+        self._tolerance, self._progress, self._done = tolerance, progress, 0
+        self._bound_of_bounces = math.inf
+        direct = self._direct()
+        self._least = min(each.seconds for each in direct)
+        axes = [direct, self._mirrors(), self._diffuse(), self._bounces()]
+        self.axes = [each for each in axes if each]
+
+    def combinations(self) -> Iterator[list[Option]]:
+        """Yield all combinations of an option of each axis."""
+        yield from map(list, itertools.product(*self.axes))
+
+    def settings_of(self, options: Sequence[Option]) -> SimulationSettings:
+        """Return the settings of a combination of options."""
+        changes: dict[str, Any] = {}
+        for each in options:
+            changes |= each.changes
+        named = {name for each in options for name in each.changes.get("paths", ())}
+        return replace(self.settings, **changes | {"paths": tuple(each for each in PATHS if each in named)})
+
+    def seconds_of(self, options: Sequence[Option]) -> float:
+        """Return the time of a profile, with its share of the preparation of multi-bounce light [s]."""
+        settings = self.settings_of(options)
+        seconds = sum(each.seconds for each in options)
+        if "multi-bounce" not in settings.paths:
+            return seconds
+        # Multi-bounce light is measured with the nodes of the task; its time rises with the receivers at most.
+        nodes = math.prod(settings.nodes) / math.prod(self.settings.nodes)
+        bounces = next(each.seconds for each in options if "multi-bounce" in each.changes.get("paths", ()))
+        setup = self.setups[settings.patch_size] / len(self.sample.task.transports)
+        return seconds + setup + max(nodes - 1.0, 0.0) * bounces
+
+    def _direct(self) -> list[Option]:
+        """Return the direct light for numbers of slabs, ascending; specular highlights cost no time of their own."""
+        paths, given = tuple(each for each in DIRECT if each in self._paths), self.settings.sub_sheets
+        is_thick = require_light(self.sample.task.sensor).thickness > 0.0
+        options = []
+        counts = sorted({1, 3, given, 2 * given + 1}) if is_thick else [given]
+        for slabs in counts:
+            light = self._light(is_finest=slabs == counts[-1], paths=paths, sub_sheets=slabs)
+            options.append(Option({"paths": paths, "sub_sheets": slabs}, light.exposures, light.seconds))
+        return options
+
+    def _mirrors(self) -> list[Option]:
+        """Return no mirrored light, and mirrored light."""
+        name = "diffuse-specular"
+        if name not in self._paths:
+            return []
+        return [Option({}, {}, 0.0), self._option(name, self._light(is_finest=True, paths=("direct", name)))]
+
+    def _diffuse(self) -> list[Option]:
+        """Return no light of two diffuse reflections, and such light for rays per bin, also with clustered pairs."""
+        name = "diffuse-diffuse"
+        if name not in self._paths:
+            return []
+        options = [Option({}, {}, 0.0)]
+        u, v = self.settings.nodes
+        for factor in (1, 2):
+            given = {"paths": ("direct", name), "nodes": (factor * u, factor * v)}
+            light = self._light(is_finest=factor == 2, **given)
+            exact = self._option(name, light, nodes=given["nodes"])
+            self._bound_of_bounces = light.statistics.get(BOUNCES_BOUND, math.inf)
+            options += [*self._clustered(light, exact, given), exact]
+        return options
+
+    def _clustered(self, light: SampledLight, exact: Option, given: dict[str, Any]) -> list[Option]:
+        """Return the option with clustered pairs if that is faster. It has the light of all pairs, and a bound."""
+        if light.statistics.get("pairs", 0.0) <= _MIN_PAIRS:
+            return []
+        share = _PAIRS * self._tolerance
+        found = self._light(is_finest=False, tolerance=share, **given)
+        bound = found.statistics.get(PAIRS_BOUND, 0.0)
+        if not bound or found.seconds >= light.seconds:
+            return []
+        seconds = max(found.seconds - self._least, 0.0)
+        return [Option(exact.changes | {"tolerance": share}, exact.exposures, seconds, bound)]
+
+    def _bounces(self) -> list[Option]:
+        """Return no multi-bounce light, and such light for two sizes of patches; none if a bound is negligible."""
+        name = "multi-bounce"
+        if name not in self._paths:
+            return []
+        if self._bound_of_bounces <= _PROVEN * self._tolerance:
+            self.proven["without multi-bounce"] = ErrorPart(self._bound_of_bounces, math.nan, is_bound=True)
+            return []
+        options = [Option({}, {}, 0.0)]
+        for factor in (2.0, 1.0):
+            size = factor * self.settings.patch_size
+            light = self._light(is_finest=factor == 1.0, paths=("direct", name), patch_size=size)
+            options.append(self._option(name, light, patch_size=size))
+            self.setups[size] = light.setup
+        return options
+
+    def _option(self, name: str, light: SampledLight, **changes: Any) -> Option:
+        exposures = {name: light.exposures[name]} if name in light.exposures else {}
+        return Option({"paths": (name,), **changes}, exposures, max(light.seconds - self._least, 0.0))
+
+    def _light(self, *, is_finest: bool, **changes: Any) -> SampledLight:
+        """Return the light of the sample; of finest options keep that of the other profiles for the check."""
+        # The direct light that comes with other paths is only their reference: one slab suffices.
+        settings = replace(self.settings, **{"sub_sheets": 1, "tolerance": 0.0, **changes})
+        count = len(self.sample.places)
+        places = np.concatenate([self.sample.places, self.sample.others]) if is_finest else self.sample.places
+        light = self.sample.light(settings, places)
+        self._done += 1
+        self._progress(self._done, None)
+        if is_finest:
+            new = {name: each for name, each in light.exposures.items() if name not in self.checks}
+            self.checks |= {name: Exposure(each.power[count:], each.moment[count:]) for name, each in new.items()}
+        cut = {name: Exposure(each.power[:count], each.moment[:count]) for name, each in light.exposures.items()}
+        return light._replace(exposures=cut)
+
+
+def light_of_options(options: Sequence[Option]) -> dict[str, Exposure]:
+    """Return the light of options of different paths."""
+    return {name: each for option in options for name, each in option.exposures.items()}

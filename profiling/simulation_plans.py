@@ -1,0 +1,225 @@
+"""Plans of simulations against truth: random parts and sensors: ``python -m gpuvision.profiling.simulation_plans``.
+
+Each job is a part of boxes and a cylinder under a PSD or a camera, with a tolerance and a rate. Truth is an
+independent, finer computation of profiles at random positions: twice the slabs and rays of the finest setting of the
+plan, half its bins, patches, steps in mirrors and parts of lobes. A plan holds if the root mean square difference of
+the simulated heights is at most the tolerance, and if the time of a profile keeps up with the rate. Its cost is its
+time over the time of the fastest combination of options that truly meets the tolerance (exhaustive search).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from gpuvision.accuracy.plan import PlanError
+from gpuvision.host import Device
+from gpuvision.profiling.plan_outcomes import Outcome, run_jobs
+from gpuvision.ranging.line import LineReadout
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.sensor.simulated import require_light
+from gpuvision.simulation.scene.material import Material
+from gpuvision.simulation.scene.reflectance import Lambert, Phong
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.readings import PATHS
+from gpuvision.simulation.sensors.sensor_view import Exposure
+from gpuvision.simulation.transport.direct import DirectLimits
+from gpuvision.status import Status
+from gpuvision.workflows.light_cache import SimulationTask
+from gpuvision.workflows.planning_simulation import plan_task
+from gpuvision.workflows.simulating import prepare_simulation
+from gpuvision.workflows.simulation_options import LightOptions, light_of_options
+from gpuvision.workflows.simulation_plan import SimulationPlanLimits
+from gpuvision.workflows.simulation_sample import ProfileSample, SimulationSettings, divided_light
+
+Float64 = npt.NDArray[np.float64]
+
+_WIDTH = 6  # strips or columns of the sensor file that are joined to one: a sixth of the work
+_BINS = 48  # of a strip of a PSD
+_PROFILES = 48  # of a part
+_TRUE = 8  # profiles that are compared with truth
+_BOUNCES = 0.5  # share of the PSD's jobs with multi-bounce light, which takes most of the time
+
+
+class Job(NamedTuple):
+    """Part and sensor, and what is asked of the simulation.
+
+    Attributes
+    ----------
+    task : SimulationTask
+        The part under the sensor, with all light paths.
+    places : numpy.ndarray
+        (n,): transports at which the simulation is compared with truth [m].
+    tolerance : float
+        Largest error of the range [m].
+    rate : float
+        Rate, as a fraction of the largest rate that the planner would accept.
+    """
+
+    task: SimulationTask
+    places: Float64
+    tolerance: float
+    rate: float
+
+
+def random_job(rng: np.random.Generator) -> Job:
+    """Draw a part, materials, a sensor, a tolerance and a rate."""
+    scene, materials = random_part(rng)
+    is_psd = bool(rng.integers(2))
+    sensor = random_sensor(rng, "psd_line" if is_psd else "camera_line")
+    diagonal = float(np.linalg.norm(np.ptp(scene.corners.reshape(-1, 3), axis=0)))
+    size = diagonal / rng.uniform(4.0, 6.0)
+    paths = PATHS if is_psd and rng.random() < _BOUNCES else PATHS[:-1]
+    task = prepare_simulation(scene, materials, sensor, paths=paths, patch_size=size, profiles=_PROFILES)
+    low, high = (3e-6, 300e-6) if is_psd else (0.3e-6, 30e-6)
+    places = rng.uniform(task.transports.min(), task.transports.max(), _TRUE)
+    tolerance = math.exp(rng.uniform(math.log(low), math.log(high)))
+    return Job(task, places, tolerance, rng.uniform(0.3, 1.0))
+
+
+def random_part(rng: np.random.Generator) -> tuple[Scene, tuple[Material, ...]]:
+    """Return a plate with blocks, whose sides the sheet lights, and sometimes a rod; some are glossy or mirrors."""
+    plate = trimesh.creation.box((40e-3, 20e-3, 2e-3))
+    plate.apply_translation((0.0, 0.0, -1e-3))
+    meshes = [plate]
+    for _ in range(int(rng.integers(1, 4))):
+        size = rng.uniform((4e-3, 8e-3, 2e-3), (12e-3, 19e-3, 6e-3))
+        block = trimesh.creation.box(size)
+        block.apply_transform(_turn(rng.uniform(0.2, 1.2), (0.0, 1.0, 0.0)))
+        block.apply_translation((rng.uniform(-14e-3, 14e-3), rng.uniform(-3e-3, 3e-3), rng.uniform(0.0, 2e-3)))
+        meshes.append(block)
+    if rng.random() < 0.4:
+        radius = rng.uniform(2e-3, 4e-3)
+        rod = trimesh.creation.cylinder(radius, 18e-3, sections=24)
+        rod.apply_transform(_turn(0.5 * math.pi, (1.0, 0.0, 0.0)))
+        rod.apply_translation((rng.uniform(-15e-3, 15e-3), 0.0, radius))
+        meshes.append(rod)
+    scene = Scene.of(trimesh.Scene(meshes))
+    assert scene.material is not None  # set by Scene itself
+    return scene, tuple(_material(rng) for _ in range(int(scene.material.max()) + 1))
+
+
+def _turn(angle: float, axis: tuple[float, float, float]) -> Float64:
+    transformations: Any = trimesh.transformations
+    return np.asarray(transformations.rotation_matrix(angle, axis), np.float64)
+
+
+def _material(rng: np.random.Generator) -> Material:
+    kind, albedo = rng.random(), rng.uniform(0.1, 0.8)
+    if kind < 0.6:
+        return Material(diffuse=Lambert(albedo=albedo))
+    if kind < 0.85:
+        gloss = Phong(albedo=rng.uniform(0.02, 0.15), exponent=math.exp(rng.uniform(math.log(5.0), math.log(80.0))))
+        return Material(diffuse=Lambert(albedo=albedo), gloss=gloss)
+    return Material(diffuse=Lambert(albedo=albedo), mirror=rng.uniform(0.02, 0.15))
+
+
+def random_sensor(rng: np.random.Generator, name: str) -> Sensor:
+    """Return a sensor of the package with joined samples and fewer bins, and a sheet and a blur of another size."""
+    sensor = Sensor.load(name)
+    light, readout = require_light(sensor), sensor.readout
+    assert sensor.frame is not None  # the package's sensors have one
+    axes: Any = readout.axes  # type: ignore[union-attr]
+    wide = dataclasses.replace(
+        axes,
+        sample_origin=axes.sample_origin + 0.5 * (_WIDTH - 1) * axes.sample_pitch,
+        sample_pitch=_WIDTH * axes.sample_pitch,
+    )
+    first, second = sensor.frame
+    frame = (first, second // _WIDTH) if isinstance(readout, LineReadout) else (first // _WIDTH, second)
+    light = dataclasses.replace(
+        light,
+        thickness=0.0 if rng.random() < 0.2 else rng.uniform(0.5, 3.0) * light.thickness,
+        blur=rng.uniform(0.7, 2.0) * light.blur,
+        sub_sheets=int(rng.integers(5, 12)),
+        bins=_BINS,
+    )
+    return dataclasses.replace(sensor, light=light, frame=frame, readout=dataclasses.replace(readout, axes=wide))
+
+
+def judge(rng: np.random.Generator, device: Device, limits: SimulationPlanLimits = SimulationPlanLimits()) -> Outcome:
+    """Plan a random job and measure the plan against truth."""
+    job = random_job(rng)
+    truth = Truth(job, device)
+    options = LightOptions(truth.sample, job.tolerance, lambda done, of: None)
+    meeting = {}
+    for each in options.combinations():
+        if truth.error(light_of_options(each), limits.max_moved) <= job.tolerance:
+            meeting[options.settings_of(each)] = options.seconds_of(each)
+    try:
+        plan = plan_task(job.task, tolerance=job.tolerance, device=device, limits=limits)
+    except PlanError:
+        return Outcome(None, job.tolerance, possible=bool(meeting))
+    chosen = plan.chosen
+    light = truth.sample.light(chosen.settings)
+    error = truth.error(light.exposures, limits.max_moved)
+    seconds = light.seconds + (light.setup / _PROFILES if "multi-bounce" in chosen.settings.paths else 0.0)
+    rate = job.rate / (limits.rate_margin * chosen.seconds)
+    times = {options.settings_of(each): options.seconds_of(each) for each in options.combinations()}
+    cost = times.get(chosen.settings, chosen.seconds) / min(meeting.values(), default=math.nan)
+    return Outcome(plan, job.tolerance, error, bool(meeting), cost, seconds * rate <= 1.0)
+
+
+class Truth:
+    """Readings of a job's profiles by a finer computation.
+
+    Parameters
+    ----------
+    job : Job
+        The job.
+    device : Device
+        Device of the kernels.
+    """
+
+    def __init__(self, job: Job, device: Device) -> None:
+        task = dataclasses.replace(job.task, transports=job.places)
+        self.sample = ProfileSample.of(task, _TRUE, device)
+        settings = SimulationSettings.of(task)
+        u, v = settings.nodes
+        finer = dataclasses.replace(
+            settings,
+            paths=tuple(each for each in task.paths if each != "multi-bounce"),
+            sub_sheets=2 * (2 * settings.sub_sheets + 1),
+            nodes=(2 * u, 4 * v),  # in bins of half the size: four times as many rays along u
+        )
+        limits = {"direct_limits": DirectLimits(lobe_turn=0.5 * DirectLimits.lobe_turn), "mirror_steps": 4.0}
+        light = divided_light(finer.applied(task), self.sample.places, device, 2, **limits)
+        if "multi-bounce" in task.paths:
+            smaller = dataclasses.replace(
+                settings, paths=("direct", "multi-bounce"), patch_size=0.5 * settings.patch_size
+            )
+            light["multi-bounce"] = self.sample.light(smaller).exposures["multi-bounce"]
+        reading = self.sample.reader.read(light)
+        self.heights, self.is_clear = reading.h, (reading.status & Status.AMBIGUOUS) == 0
+
+    def error(self, light: Mapping[str, Exposure], max_moved: float) -> float:
+        """Return the root mean square error of heights read from light [m]; infinite if too many are of other lines."""
+        heights = self.sample.reader.read(light).h
+        is_read, is_true = (self.is_clear & np.isfinite(each) for each in (heights, self.heights))
+        away = np.abs(heights - self.heights)
+        same = is_read & is_true & ~(away > self._largest)
+        if np.mean(~same[is_read | is_true]) > 2.0 * max_moved or not same.any():
+            return math.inf
+        return math.sqrt(float(np.mean(away[same] ** 2)))
+
+    @property
+    def _largest(self) -> float:
+        """Height beyond which a camera reads another line [m]."""
+        readout = self.sample.task.sensor.readout
+        if not isinstance(readout, LineReadout):
+            return math.inf
+        view = self.sample.reader.simulator.view
+        u, v = 0.5 * (view.u_edges[0] + view.u_edges[-1]), view.v_centres[view.samples // 2]
+        move = abs(readout.axes.position_pitch) * readout.window
+        ends = [view.sheet_coordinates(view.points_in_sheet(u + each, v))[1] for each in (-0.5 * move, 0.5 * move)]
+        return abs(float(ends[1] - ends[0]))
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_jobs(judge, (__doc__ or "").partition("\n\n")[2]))

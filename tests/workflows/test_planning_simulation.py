@@ -1,0 +1,368 @@
+"""Plan of a simulation: the fastest light within a tolerance; refusals, bounds, errors against finer computations."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from gpuvision.accuracy.plan import PlanError
+from gpuvision.host import Device
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.sensor.simulated import require_light
+from gpuvision.simulation.scene.material import Material
+from gpuvision.simulation.scene.reflectance import Lambert, Phong
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.readings import PATHS, Reading
+from gpuvision.status import Status
+from gpuvision.workflows import planning_simulation
+from gpuvision.workflows.light_cache import SimulationTask, make_light_paths
+from gpuvision.workflows.planning_simulation import is_worth_planning, plan_simulation, plan_task
+from gpuvision.workflows.simulating import prepare_simulation, simulate
+from gpuvision.workflows.simulation_errors import ErrorPart, SimulationErrors, estimate_errors, total_error
+from gpuvision.workflows.simulation_options import LightOptions
+from gpuvision.workflows.simulation_plan import SettingsTrial, SimulationPlan, SimulationPlanLimits, usable_settings
+from gpuvision.workflows.simulation_sample import ProfileSample, SampledLight, SampleReader, SimulationSettings
+
+MM = 1e-3
+FEW = SimulationPlanLimits(profiles=3, checked=2)
+INDIRECT = ("direct", "diffuse-diffuse")
+
+
+def sensor_of(name: str = "psd_line", **light: Any) -> Sensor:
+    """Return a sensor of the package with a sixth of its samples, and a PSD with half of its bins."""
+    sensor = Sensor.load(name)
+    readout: Any = sensor.readout
+    axes = readout.axes
+    wide = dataclasses.replace(
+        axes, sample_origin=axes.sample_origin + 2.5 * axes.sample_pitch, sample_pitch=6.0 * axes.sample_pitch
+    )
+    frame = (16, 2) if name == "psd_line" else (64, 80)
+    return dataclasses.replace(
+        sensor,
+        frame=frame,
+        readout=dataclasses.replace(readout, axes=wide),
+        light=dataclasses.replace(require_light(sensor), **({"bins": 48} | light)),
+    )
+
+
+def groove() -> Scene:
+    """Return a V-groove of 90 degrees, whose walls light each other, cut off where a block ends."""
+    outline = np.array([(-24, 0), (-14, 0), (-4, -10), (6, 0), (24, 0)]) * MM
+    edge = np.repeat(outline, 2, axis=0)
+    corners = np.stack([edge[:, 0], np.tile([-20 * MM, 20 * MM], len(outline)), edge[:, 1]], axis=-1)
+    triangles = [each for n in range(0, len(edge) - 2, 2) for each in ((n, n + 2, n + 1), (n + 1, n + 2, n + 3))]
+    block = trimesh.creation.box((8 * MM, 10 * MM, 4 * MM))
+    block.apply_translation((14 * MM, 0.0, 1.9 * MM))
+    joined: Any = trimesh.util.concatenate([trimesh.Trimesh(corners, triangles), block])
+    return Scene.of(joined)
+
+
+def white(albedo: float = 0.7, **more: Any) -> tuple[Material, ...]:
+    return (Material(diffuse=Lambert(albedo=albedo), **more),)
+
+
+def task_of(sensor: Sensor | None = None, **more: Any) -> SimulationTask:
+    given: dict[str, Any] = {"paths": INDIRECT, "profiles": 40} | more
+    return prepare_simulation(groove(), white(), sensor_of() if sensor is None else sensor, **given)
+
+
+def heights_of(task: SimulationTask, device: Device, places: Any, **finer: Any) -> Any:
+    """Return the heights that a sensor reads at some transports, by one run of all light of a task."""
+    light = dataclasses.replace(require_light(task.sensor), **finer)
+    paths = make_light_paths(dataclasses.replace(task, sensor=dataclasses.replace(task.sensor, light=light)), device)
+    reader = SampleReader.of(task, 1, device)
+    return np.array([reader.read(each.exposures).h for each in paths.profiles(places)])
+
+
+# ---- choice, against a finer computation -----------------------------------------------------------------------------
+
+
+def set_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let light take 1 ms for a slab and 100 ms for a ray per bin, so that a busy machine does not change the order."""
+    real = ProfileSample.light
+
+    def light(self: ProfileSample, settings: SimulationSettings, *more: Any, **changes: Any) -> SampledLight:
+        rays = math.prod(settings.nodes) if "diffuse-diffuse" in settings.paths else 0
+        return real(self, settings, *more, **changes)._replace(seconds=1e-3 * settings.sub_sheets + 0.1 * rays)
+
+    monkeypatch.setattr(ProfileSample, "light", light)
+
+
+@pytest.fixture(scope="module")
+def free_plan() -> SimulationPlan:
+    """Return a plan that any setting meets."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        set_times(monkeypatch)
+        return plan_task(task_of(), tolerance=1.0, limits=FEW)
+
+
+def test_the_true_error_of_each_setting_is_at_most_the_predicted_one(free_plan: SimulationPlan) -> None:
+    """On profiles between those of the sample, against 43 slabs and 4 x 4 rays in bins of the sensor file."""
+    device = Device.best()
+    task = task_of()
+    places = task.transports[1::9] + 0.1 * MM
+    true = heights_of(task, device, places, sub_sheets=43, nodes=(4, 4))
+    assert len(free_plan.trials) > 2
+    for each in free_plan.trials:
+        found = heights_of(each.settings.applied(task), device, places)
+        error = math.sqrt(float(np.nanmean((found - true) ** 2)))
+        assert error <= each.error, each.name
+    # The light of the block's wall is needed for less than some micrometres, and no more than that is left out.
+    without = [each for each in free_plan.trials if "diffuse-diffuse" not in each.settings.paths]
+    assert all(each.change > 5e-6 for each in without)
+    assert without
+
+
+def test_the_fastest_setting_within_the_tolerance_is_chosen(
+    free_plan: SimulationPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_times(monkeypatch)
+    assert free_plan.chosen == free_plan.usable[0]
+    assert [each.seconds for each in free_plan.trials] == sorted(each.seconds for each in free_plan.trials)
+    tolerance = 1.15 * sorted(each.error for each in free_plan.usable)[1]
+    plan = plan_task(task_of(), tolerance=tolerance, limits=FEW)
+    assert plan.chosen.error * FEW.margin <= tolerance
+    fits = [each for each in plan.usable if each.error * FEW.margin <= tolerance]
+    assert plan.chosen.seconds == min(each.seconds for each in fits)
+    assert plan.checked <= tolerance
+    assert "error on other profiles" in str(plan)
+    assert SimulationSettings.of(plan.task) == plan.chosen.settings
+    report = plan.to_dict()
+    assert report["finest"]["nodes"]["is_bound"] is False
+    assert report["chosen"] in report["trials"]
+
+
+def test_a_refusal_names_the_nearest_tolerance_and_the_largest_part() -> None:
+    with pytest.raises(
+        PlanError, match=r"no setting meets an error of 0\.001 um; .*ask for .* um or more; the largest"
+    ):
+        plan_task(task_of(), tolerance=1e-9, limits=FEW)
+
+
+def test_a_rate_that_no_setting_reaches_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(PlanError, match=r"is too slow: .* a rate of 1e\+06 profiles/s allows 0\.8 us"):
+        plan_task(task_of(paths=("direct",)), tolerance=1e-3, rate=1e6, limits=FEW)
+    with pytest.raises(ValueError, match="a latency needs a rate; give the profiles per second as well"):
+        plan_task(task_of(), tolerance=1e-3, latency=1.0)
+    for tolerance in (0.0, -1.0, math.inf):
+        with pytest.raises(ValueError, match="tolerance"):
+            plan_task(task_of(), tolerance=tolerance)
+
+
+def test_a_setting_that_fails_the_check_is_not_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fastest one is off by 1 mm on the profiles that took no part in the choice."""
+    checked: list[Any] = []
+
+    def error(self: Any, trial: SettingsTrial) -> float:
+        checked.append(trial)
+        return 1e-3 if len(checked) == 1 else 1e-6
+
+    set_times(monkeypatch)
+    monkeypatch.setattr(planning_simulation.Combinations, "checked_error", error)
+    plan = plan_task(task_of(paths=("direct",)), tolerance=100e-6, limits=FEW)
+    assert [plan.chosen] == checked[1:]
+    assert plan.chosen != checked[0]
+    assert next(each for each in plan.trials if each.settings == checked[0].settings).error == 1e-3
+    assert plan.checked == 1e-6
+
+
+def test_the_plan_of_a_job_simulates(tmp_path: Any) -> None:
+    plan = plan_simulation(groove(), white(), sensor_of(), tolerance=1.0, paths=("direct",), profiles=6, limits=FEW)
+    done = simulate(plan.task, tmp_path, seed=None)
+    assert done.attribution.error.shape == (6, 16)
+
+
+def test_small_parts_are_not_worth_planning() -> None:
+    assert not is_worth_planning(task_of(profiles=12), FEW)
+    assert is_worth_planning(task_of(profiles=13), FEW)
+
+
+# ---- bounds and options ----------------------------------------------------------------------------------------------
+
+
+def sampled(seconds: float, setup: float = 0.0, **statistics: float) -> SampledLight:
+    names = {"bounces": "bound of multi-bounce left out [m]", "pairs": "pairs", "cut": "bound of pairs left out [m]"}
+    return SampledLight({}, {names[name]: each for name, each in statistics.items()}, seconds, setup)
+
+
+def options_of(monkeypatch: pytest.MonkeyPatch, tolerance: float, times: Any, **task: Any) -> LightOptions:
+    """Return options whose light is that of `times(settings)`."""
+    monkeypatch.setattr(ProfileSample, "light", lambda self, settings, places=None: times(settings))
+    sample = ProfileSample.of(task_of(**task), 3, Device.best(), others=2)
+    return LightOptions(sample, tolerance, lambda done, of: None)
+
+
+def test_a_proven_bound_replaces_multi_bounce_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = options_of(monkeypatch, 1e-4, lambda _: sampled(1.0, bounces=1e-5), paths=PATHS)
+    assert found.proven == {
+        "without multi-bounce": ErrorPart(1e-5, pytest.approx(math.nan, nan_ok=True), is_bound=True)
+    }
+    assert all("multi-bounce" not in found.settings_of(each).paths for each in found.combinations())
+    more = options_of(monkeypatch, 0.99e-4, lambda _: sampled(1.0, 9.0, bounces=1e-5), paths=PATHS)
+    assert more.proven == {}
+    size = SimulationSettings.of(more.sample.task).patch_size
+    assert more.setups == {2.0 * size: 9.0, size: 9.0}
+
+
+def test_clustered_pairs_count_with_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are an option where a profile has many pairs and clustering is faster."""
+
+    def times(settings: SimulationSettings) -> SampledLight:
+        if "diffuse-diffuse" not in settings.paths:
+            return sampled(0.5)
+        seconds = 2.0 if settings.tolerance else 3.0 if settings.nodes == (1, 1) else 1.5
+        return sampled(seconds, pairs=1e5, cut=2e-6 * bool(settings.tolerance))
+
+    found = options_of(monkeypatch, 40e-6, times)
+    diffuse = found.axes[1]
+    assert [(each.changes.get("nodes"), each.changes.get("tolerance"), each.pairs) for each in diffuse] == [
+        (None, None, 0.0),
+        ((1, 1), 10e-6, 2e-6),
+        ((1, 1), None, 0.0),
+        ((2, 2), None, 0.0),
+    ]
+    assert [each.seconds for each in diffuse] == [0.0, 1.5, 2.5, 1.0]
+
+
+def test_times_of_a_combination_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Direct light 1 s, diffuse light 2 s more, bounces 4 s more and 80 s of preparation for 40 profiles."""
+    seconds = {("direct",): 1.0, ("direct", "diffuse-diffuse"): 3.0, ("direct", "multi-bounce"): 5.0}
+    found = options_of(
+        monkeypatch, 1e-6, lambda each: sampled(seconds[each.paths], 80.0), paths=("direct", *PATHS[3:]), profiles=40
+    )
+    by_settings = {found.settings_of(each): found.seconds_of(each) for each in found.combinations()}
+    for settings, found_seconds in by_settings.items():
+        expected = 1.0 + 2.0 * ("diffuse-diffuse" in settings.paths)
+        if "multi-bounce" in settings.paths:
+            expected += 4.0 * math.prod(settings.nodes) + 2.0
+        assert found_seconds == pytest.approx(expected)
+    assert len(by_settings) == 4 * 3 * 3
+
+
+def test_a_thin_sheet_has_no_slabs_to_try(monkeypatch: pytest.MonkeyPatch) -> None:
+    thin = options_of(monkeypatch, 1e-6, lambda _: sampled(1.0), sensor=sensor_of(thickness=0.0), paths=("direct",))
+    assert len(thin.axes[0]) == 1
+    thick = options_of(monkeypatch, 1e-6, lambda _: sampled(1.0), paths=("direct",))
+    assert [each.changes["sub_sheets"] for each in thick.axes[0]] == [1, 3, 9, 19]
+
+
+def test_only_settings_that_read_the_same_lines_are_usable() -> None:
+    settings = SimulationSettings.of(task_of())
+    trials = [SettingsTrial(settings, 1.0, error, 0.0, 0.0, 0.0, 0.0, 0.0, moved)
+              for error, moved in ((1e-6, 0.005), (1e-6, 0.006), (math.nan, 0.0))]  # fmt: skip
+    assert usable_settings(trials, SimulationPlanLimits()) == trials[:1]
+
+
+# ---- errors of given settings ----------------------------------------------------------------------------------------
+
+
+def test_errors_of_a_task_cover_what_it_leaves_out() -> None:
+    """The estimates of the sensor file's settings are at least the changes by 4 x 4 rays and by the added path."""
+    device, task = Device.best(), task_of(patch_size=10 * MM)
+    found = estimate_errors(task, profiles=3, device=device)
+    assert list(found.parts) == ["without multi-bounce", "slabs", "nodes", "bins and blur", "rounding"]
+    assert found.total == pytest.approx(math.hypot(*(each.error for each in found.parts.values())))
+    assert not found.is_bound
+    places = task.transports[5::12]
+    given, finer = (heights_of(task, device, places, **change) for change in ({}, {"nodes": (4, 4)}))
+    assert np.sqrt(np.nanmean((given - finer) ** 2)) <= found.parts["nodes"].error
+    assert "nodes: " in str(found)
+    assert str(found).endswith("um (estimate)")
+    tree = found.to_dict()
+    assert (tree["total"], tree["parts"]["nodes"]["error"]) == (found.total, found.parts["nodes"].error)
+
+
+def test_parts_follow_the_scene() -> None:
+    """Gloss has lobes, mirrors have steps, a thin sheet has no slabs, black surfaces have no indirect light."""
+    glossy = prepare_simulation(
+        groove(),
+        white(0.0, gloss=Phong(albedo=0.2, exponent=20.0)),
+        sensor_of(thickness=0.0),
+        paths=("direct", "specular"),
+        profiles=4,
+    )
+    assert set(estimate_errors(glossy, profiles=2).parts) == {"bins and blur", "lobes", "rounding"}
+    mirror = dataclasses.replace(
+        task_of(paths=("direct", "diffuse-specular"), profiles=4), materials=white(0.3, mirror=0.2)
+    )
+    parts = estimate_errors(dataclasses.replace(mirror, patch_size=20 * MM), profiles=2).parts
+    assert {"mirrors", "slabs", "without specular", "without diffuse-diffuse"} <= set(parts)
+
+
+def test_a_total_is_a_bound_only_if_all_its_parts_are() -> None:
+    proven, guess = ErrorPart(2e-6, math.nan, is_bound=True), ErrorPart(1e-6, 0.1)
+    assert SimulationErrors(parts={"pairs": proven, "slabs": ErrorPart(0.0, 0.0)}, changed=0.0).is_bound
+    assert total_error([proven, proven, ErrorPart(3e-6, 0.0), ErrorPart(4e-6, 0.0)]) == pytest.approx(9e-6)
+    both = SimulationErrors(parts={"pairs": proven, "slabs": guess}, changed=0.0)
+    assert not both.is_bound
+    assert str(both) == "pairs: 2 um (bound)\nslabs: 1 um (estimate)\ntotal: 3 um (estimate)"
+
+
+# ---- differences of readings -----------------------------------------------------------------------------------------
+
+
+def reading_at(reader: SampleReader, u: Any, strength: Any = 1.0) -> Reading:
+    nothing = np.full(np.shape(u), np.nan)
+    return Reading(u, nothing, nothing, nothing, np.broadcast_to(strength, np.shape(u)), nothing, np.zeros(1, np.uint8))
+
+
+@pytest.mark.parametrize("name", ["psd_line", "camera_line"])
+def test_the_range_error_is_the_derivative_times_the_move(name: str) -> None:
+    task = task_of(sensor_of(name))
+    reader = SampleReader.of(task, 40, Device.best())
+    view = reader.simulator.view
+    u = np.broadcast_to(0.3 * view.u_edges[0] + 0.7 * view.u_edges[-1], (2, view.samples))
+    step = 1e-7 * (view.u_edges[-1] - view.u_edges[0])
+    ends = [view.sheet_coordinates(view.points_in_sheet(u[0] + each, view.v_centres))[..., 1] for each in (step, -step)]
+    slope = np.abs(ends[0] - ends[1]) / (2.0 * step)
+    move = 1e-3 * (view.u_edges[1] - view.u_edges[0])
+    found = reader.compare(reading_at(reader, u + move, 1.1), reading_at(reader, u))
+    assert found.error == pytest.approx(move * math.sqrt(float(np.mean(slope**2))), rel=1e-6)
+    assert found.worst == pytest.approx(move * slope.max(), rel=1e-6)
+    assert found.signal == pytest.approx(0.1)
+    assert found.changed == 0.0
+
+
+def test_readings_of_other_lines_are_counted_apart() -> None:
+    """The window of the camera's readout is 4 px: a move by more is another line; a PSD reads all light."""
+    for name, changed in (("camera_line", 0.25), ("psd_line", 0.0)):
+        reader = SampleReader.of(task_of(sensor_of(name)), 40, Device.best())
+        window: Any = getattr(reader.simulator, "readout", None)
+        pitch = abs(window.axes.position_pitch)
+        u = np.zeros((1, 80 if name == "camera_line" else 16))
+        moved = u + np.where(np.arange(u.shape[1]) % 4, 0.0, pitch * (getattr(window, "window", 1e-4) + 0.1))
+        assert reader.compare(reading_at(reader, moved), reading_at(reader, u)).changed == changed
+    # Ambiguous samples of the reference are not compared.
+    reader, u = SampleReader.of(task_of(), 40, Device.best()), np.zeros((1, 16))
+    flagged = reading_at(reader, u)._replace(status=np.where(np.arange(16) % 4, 0, Status.AMBIGUOUS)[None])
+    moved = u + np.where(np.arange(16) % 4, 0.0, 1e-3)
+    assert reader.compare(reading_at(reader, moved), flagged).worst == 0.0
+    assert reader.compare(flagged._replace(position=moved), reading_at(reader, u)).worst > 0.0
+    lost = np.where(np.arange(16) % 2, np.nan, 0.0)[None]
+    found = reader.compare(reading_at(reader, lost), reading_at(reader, np.zeros((1, 16))))
+    assert (found.changed, found.error) == (0.5, 0.0)
+
+
+def test_few_profiles_raise_the_error() -> None:
+    """Mean squares 1 and 3 of 2 profiles out of 8: mean 2, standard error 1 times the root of 6 / 8, counted twice."""
+    reader = dataclasses.replace(SampleReader.of(task_of(), 2, Device.best()), fraction=0.25)
+    error = np.sqrt(np.array([[1.0, 1.0], [3.0, 3.0]]))
+    found = reader._root_mean_square(error, np.ones((2, 2), bool))
+    assert found == pytest.approx(math.sqrt(2.0 + 2.0 * math.sqrt(0.75)))
+    assert dataclasses.replace(reader, fraction=1.0)._root_mean_square(error, np.ones((2, 2), bool)) == pytest.approx(
+        math.sqrt(2.0)
+    )
+
+
+def test_a_sample_is_spread_over_the_part() -> None:
+    task = dataclasses.replace(task_of(profiles=20), transports=np.arange(20.0))
+    sample = ProfileSample.of(task, 5, Device.best(), others=3)
+    np.testing.assert_array_equal(sample.places, [2.0, 6.0, 10.0, 14.0, 18.0])
+    np.testing.assert_array_equal(sample.others, [3.0, 9.0, 16.0])
+    few = ProfileSample.of(dataclasses.replace(task, transports=np.arange(3.0)), 5, Device.best(), others=3)
+    assert (len(few.places), len(few.others)) == (3, 0)

@@ -7,7 +7,7 @@ reference finds the edges along the rulers in float64, and repeats total least s
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from gpuvision.matching.pose.board_pose import BoardPoseEstimator
 from gpuvision.matching.pose.pose import SolvePose, line_rows
 from gpuvision.matching.robust import efficiency
 from gpuvision.profiling import board_pose as benchmark
-from gpuvision.profiling.contract.agreement import Case, Limit, equal
+from gpuvision.profiling.contract.agreement import Case, Limit, equal, roundings
 from gpuvision.profiling.contract.ruler import strongest_edge
 from gpuvision.profiling.pose import PLACEMENT
 from gpuvision.reference.robust import residuals, transform_of
@@ -25,10 +25,10 @@ from gpuvision.reference.robust import residuals, transform_of
 LIMITS = {
     "SolvePose": (
         equal("status", "inliers", "rank", reason="counts and comparisons, except within rounding of a threshold"),
-        Limit(
-            ("placement",), 3e-7, 6e-16, "(extent of the rows + 3 displacements) x condition [m]",
-            "error model of the docstring: 3e-7 of the extent and a millionth of the displacement; both grow with the "
-            "condition",
+        roundings(
+            8, "placement", of="sum over the rows of displacement and residual x influence on the placement, and an "
+            "eighth of the placement [m]",
+            reason="16 roundings of a residual, of displacements in it; rounding of the placement point",
         ),
     ),
     "BoardPoseEstimator": (
@@ -38,8 +38,9 @@ LIMITS = {
         ),
         Limit(("edges",), 1e-4, 1e-4, "1 px for contrasts above 10 times the threshold", "error of RulerEdges"),
         Limit(
-            ("placement",), 1e-4, 1e-4, "size of a pixel x (1 + condition) [m]",
-            "error of RulerEdges on each edge; the rounding of the lines and of the pose is a thousandth of it",
+            ("placement",), 1e-4, 1e-4, "size of a pixel x sum over the lines of their influence on the placement [m]",
+            "error of RulerEdges on each edge, in the worst combination of signs; the rounding of the lines and of the "
+            "pose is a thousandth of it",
         ),
     ),
 }  # fmt: skip
@@ -77,18 +78,15 @@ def _case(
         fixed_point(each[np.isfinite(each[:, 4])], start, operation)
         for each, start in zip(given.astype(np.float64), true, strict=True)
     ]
-    poses, inliers, conditions, margins = (np.array(each) for each in zip(*fits, strict=True))
-    places = poses[:, :2]
+    places, margins = np.array([each.placed[:2] for each in fits]), np.array([each.margin for each in fits])
     exact: dict[str, npt.NDArray[Any]] = {
         "placement": places,
-        "inliers": inliers,
+        "inliers": np.array([each.inliers for each in fits]),
         "rank": np.full(_BOARDS, freedoms),
         "status": np.zeros(_BOARDS, np.uint8),
     }
-    size = _EXTENT + 3.0 * np.linalg.norm(places - _PLACEMENT, axis=-1, keepdims=True) + np.abs(places)
-    return Case(
-        "SolvePose", name, operation, (given,), exact, {"placement": size * conditions[:, None]}, margins < 1e-2
-    )
+    size = np.array([each.influence[:2] @ each.displacements for each in fits]) + 0.125 * np.abs(places)
+    return Case("SolvePose", name, operation, (given,), exact, {"placement": size}, margins < 1e-2)
 
 
 def _rows(rng: np.random.Generator, parameters: Floats, bad: int) -> Floats:
@@ -102,13 +100,34 @@ def _rows(rng: np.random.Generator, parameters: Floats, bad: int) -> Floats:
     return np.asarray(line_rows(normal, point, (point + error * normal) @ matrix.T + shift, _SIGMA))
 
 
+class FixedPoint(NamedTuple):
+    """Solution of reweighted least squares.
+
+    Attributes
+    ----------
+    placed : (parameters,)
+        x and y of the placement point and the further parameters of the pose.
+    inliers : int
+        Number of rows with a weight above 0.
+    influence : (parameters, rows)
+        Absolute derivative of `placed` by the residual of each row.
+    displacements : (rows,)
+        Sum of the absolute terms of a residual: displacement of the row, of its place by the pose, and the residual.
+    margin : float
+        Least distance of a residual from the tuning constant, in sigmas.
+    """
+
+    placed: Floats
+    inliers: int
+    influence: Floats
+    displacements: Floats
+    margin: float
+
+
 def fixed_point(
     rows: Floats, start: Floats, operation: SolvePose, extent: float = _EXTENT, steps: int = _STEPS
-) -> tuple[Floats, int, float, float]:
-    """Return the pose, the number of inliers, the condition, and the least distance from the tuning constant.
-
-    The pose is x and y of the placement point and the further parameters. `extent` is that of the rows [m].
-    """
+) -> FixedPoint:
+    """Return the solution from a pose near it. `extent` is that of the rows [m]."""
     pose = start.copy()
     size = np.array([1.0, 1.0, *(1.0 / extent,) * (len(pose) - 2)])
     for _ in range(steps):
@@ -117,15 +136,28 @@ def fixed_point(
         design = np.stack([residuals(pose + each, rows).imag / 1e-30 for each in moves], axis=-1) * size
         root = np.sqrt(_weight(z, operation))[:, None] / rows[:, 6:]
         pose = pose - size * np.linalg.lstsq(root * design, root[:, 0] * z * rows[:, 6], rcond=None)[0]
-    # The condition of motions about the middle of the rows: turns and deformations do not move it.
-    middle = rows[:, 2:4].mean(axis=0)
-    moved = np.stack([transform_of(pose + each)[0].imag @ middle / 1e-30 for each in moves], axis=-1) * size
-    singular = np.linalg.svd(root * (design - design[:, :2] @ moved), compute_uv=False)
     matrix, shift = transform_of(pose)
     constant = np.inf if operation.loss == "least_squares" else operation.tuning_constant
     margin = float(np.abs(np.abs(z) - constant).min())
     placed = np.concatenate([matrix @ operation.placement + shift, pose[2:]])
-    return placed, int(np.sum(root > 0.0)), float(singular[0] / singular[-1]), margin
+    # The derivative of the sum of psi(z) by the pose has the slopes of psi in the place of the weights. An error of a
+    # residual changes psi by the slope; a relative rounding of the sum changes it by the weight.
+    slope = _slope(z, operation) / rows[:, 6] ** 2
+    ends = [transform_of(pose + each) for each in moves]
+    lever = np.eye(len(pose))
+    lever[:2] = np.stack([(turn @ operation.placement + move).imag / 1e-30 for turn, move in ends], axis=-1)
+    solved = np.linalg.solve(design.T @ (slope[:, None] * design), design.T)
+    influence = np.abs(lever @ (size[:, None] * solved)) * np.maximum(np.abs(slope), root[:, 0] ** 2)
+    middle = rows[:, 2:4].mean(axis=0)
+    by_pose = np.abs(matrix @ middle + shift - middle) + np.abs(rows[:, 2:4] - middle) @ np.abs(matrix - np.eye(2)).T
+    displacements = np.linalg.norm(np.abs(rows[:, 4:6]) + by_pose, axis=-1) + np.abs(z * rows[:, 6])
+    return FixedPoint(placed, int(np.sum(root > 0.0)), influence, displacements, margin)
+
+
+def _slope(z: Floats, operation: SolvePose) -> Floats:
+    """Return the derivative of psi(z), the residual times its weight."""
+    high, low = ((z + each) * _weight(z + each, operation) for each in (1e-4, -1e-4))
+    return np.asarray((high - low) / 2e-4)
 
 
 def _weight(z: Floats, operation: SolvePose) -> Floats:
@@ -145,22 +177,21 @@ def _frame_case(name: str, solver: SolvePose) -> Case:
     shape = rulers.shape[:2]
     found: Any = [strongest_edge(image, each[:4], ruler) for each in rulers.reshape(-1, rulers.shape[-1])]
     position = np.reshape([each["position"] for each in found], shape)
-    rows = np.concatenate(
-        [
-            _rows_of_line(line, *_places(edges, ruler, each, image.dtype), solver)
-            for line, each, edges in zip(lines.astype(np.float64), rulers, np.reshape(found, shape), strict=True)
-        ]
-    )
+    of_lines = [
+        _rows_of_line(line, *_places(edges, ruler, each, image.dtype), solver)
+        for line, each, edges in zip(lines.astype(np.float64), rulers, np.reshape(found, shape), strict=True)
+    ]
+    rows, amplified = (np.concatenate(each) for each in zip(*of_lines, strict=True))
     extent = float(np.max(np.ptp(rows[:, 2:4], axis=0)))
-    pose, inliers, condition, _ = fixed_point(rows, benchmark.TRUE_POSE, solver, extent, _MANY_STEPS)
+    fit = fixed_point(rows, benchmark.TRUE_POSE, solver, extent, _MANY_STEPS)
     exact: dict[str, npt.NDArray[Any]] = {
-        "placement": pose[:2],
-        "inliers": np.array(inliers),
+        "placement": fit.placed[:2],
+        "inliers": np.array(fit.inliers),
         "status": np.array(0),
         "edges": position,
         "edge_status": np.zeros(shape, np.uint8),
     }
-    quantities = {"placement": benchmark.PIXEL * (1.0 + condition), "edges": 1.0}
+    quantities = {"placement": benchmark.PIXEL * fit.influence[:2] @ amplified, "edges": 1.0}
     return Case("BoardPoseEstimator", name, operation, (image, rulers, lines), exact, quantities)
 
 
@@ -179,8 +210,11 @@ def _places(edges: Any, ruler: RulerEdges, rows: Floats, dtype: npt.DTypeLike) -
     return at, 1.0 / (np.abs(dv - at[:, 1] * projective) * per * edge_sigmas(edges, ruler, dtype))
 
 
-def _rows_of_line(line: Floats, points: Floats, certainty: Floats, solver: SolvePose) -> Floats:
-    """Return the two rows of a line through points, where its offset and its angle are independent."""
+def _rows_of_line(line: Floats, points: Floats, certainty: Floats, solver: SolvePose) -> tuple[Floats, Floats]:
+    """Return the two rows of a line through points, where its offset and its angle are independent.
+
+    Their displacements change by up to the second result (2,) times the largest error of the points across the line.
+    """
     middle, along = np.median(points, axis=0), np.array([1.0, 0.0])
     for _ in range(_MANY_STEPS):
         away = points - middle
@@ -199,4 +233,10 @@ def _rows_of_line(line: Floats, points: Floats, certainty: Floats, solver: Solve
     way = np.array([line[1], -line[0]])
     on = point + ends[:, :1] * way
     sigma = np.sqrt(2.0 * offset + line[4] ** 2)
-    return np.asarray(line_rows(np.repeat(normal, 2, axis=0), on, on + ends[:, 1:] * normal, sigma))
+    rows = np.asarray(line_rows(np.repeat(normal, 2, axis=0), on, on + ends[:, 1:] * normal, sigma))
+    # Offset and angle of the line change by the slopes of psi, as in `fixed_point`; here by the points across the line.
+    slope = certainty**2 * _slope(z, solver)
+    design = np.column_stack([np.ones_like(spread), spread])
+    by_point = np.linalg.solve(design.T @ (slope[:, None] * design), design.T * slope)
+    at = np.sqrt(offset / turn) * np.array([[-1.0], [1.0]])
+    return rows, np.abs(by_point[0] + at * by_point[1]).sum(axis=1)

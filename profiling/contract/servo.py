@@ -27,8 +27,9 @@ LIMITS = {
     "EstimateFeaturePose": (
         equal("status", "feature_status", "inliers", reason="comparisons only, except within rounding of a threshold"),
         Limit(
-            ("pose",), 1e-4, 1e-4, "size of a pixel x (1 + condition) [m]; divided by the extent of the rulers [rad]",
-            "error of RulerEdges on each edge; the rounding of the pose is a thousandth of it",
+            ("pose",), 1e-4, 1e-4, "size of a pixel x sum over the rulers of their influence on the pose [m], [rad]",
+            "error of RulerEdges on each edge, in the worst combination of signs; the rounding of the pose is a "
+            "thousandth of it",
         ),
     )
 }  # fmt: skip
@@ -74,8 +75,7 @@ def _case(
         solver=_SOLVER,
     )
     seen = kinds[:, 0] < 0.0
-    pose, condition, inliers = _pose(given, point[seen], normal[seen], mirrored)
-    extent = float(np.max(np.ptp(point, axis=0)))
+    pose, influence, inliers = _pose(given, point[seen], normal[seen], mirrored)
     exact: dict[str, npt.NDArray[Any]] = {
         "pose": pose,
         "status": np.array(0),
@@ -84,12 +84,11 @@ def _case(
     }
     # The frame lies around the middle of the full image.
     corner = np.array([(full[1] - _SIZE) / 2, (full[0] - _SIZE) / 2], np.float32)
-    size = PIXEL * (1.0 + condition) * np.array([1.0, 1.0, 1.0 / extent])
-    return Case("EstimateFeaturePose", name, operation, (given, PREDICTED, corner), exact, {"pose": size})
+    return Case("EstimateFeaturePose", name, operation, (given, PREDICTED, corner), exact, {"pose": PIXEL * influence})
 
 
-def _pose(frame: npt.NDArray[Any], point: Floats, normal: Floats, mirrored: bool) -> tuple[Floats, float, int]:
-    """Return the pose of the camera, the condition of its rows and their number of inliers.
+def _pose(frame: npt.NDArray[Any], point: Floats, normal: Floats, mirrored: bool) -> tuple[Floats, Floats, int]:
+    """Return the pose of the camera, the sum over its rows of their influence on it, and their number of inliers.
 
     The camera is expected above the placement point, with its columns along x.
     """
@@ -101,9 +100,13 @@ def _pose(frame: npt.NDArray[Any], point: Floats, normal: Floats, mirrored: bool
     turn = -MOTION[2]
     start = np.array([*(-_turned(MOTION[:2], turn)), turn])
     extent = float(np.max(np.ptp(point, axis=0)))
-    motion, inliers, condition, _ = fixed_point(np.asarray(rows, np.float64), start, _SOLVER, extent)
-    moved_camera = np.array([*(-_turned(motion[:2], -motion[2])), -motion[2]])
-    return np.asarray(PREDICTED + moved_camera), condition, inliers
+    fit = fixed_point(np.asarray(rows, np.float64), start, _SOLVER, extent)
+    x, y, turn = fit.placed
+    c, s = np.cos(turn), np.sin(turn)
+    moved_camera = np.array([*(-_turned(fit.placed[:2], -turn)), -turn])
+    # Derivative of the camera's pose by the motion (the signs do not matter).
+    by_motion = np.abs([[c, s, c * y - s * x], [-s, c, -c * x - s * y], [0.0, 0.0, 1.0]])
+    return np.asarray(PREDICTED + moved_camera), by_motion @ fit.influence.sum(axis=1), fit.inliers
 
 
 def _turned(point: Floats, angle: float) -> Floats:

@@ -26,10 +26,10 @@ from gpuvision.host import Device, to_numpy
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.board.view_features import find_features_in_view
 from gpuvision.matching.features.feature_set import FeatureSet
-from gpuvision.profiling.plan_outcomes import Outcome, cost_of, run_jobs
+from gpuvision.profiling.plan_outcomes import Outcome, cost_of, room_of, run_jobs
 from gpuvision.simulation.board_image.board_image import RenderBoard
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
-from gpuvision.workflows.location_plan import LocationPlan, LocationPlanLimits, usable_feature_sets
+from gpuvision.workflows.location_plan import LocationPlan, LocationPlanLimits
 from gpuvision.workflows.planning_location import choose_features, plan_location
 
 Float64 = npt.NDArray[np.float64]
@@ -58,9 +58,9 @@ class Job(NamedTuple):
     frames, poses : (n, rows, columns) uint8, (n, 3) float64
         Images of other boards, and the poses of the camera over them [m], [rad].
     tolerance : float
-        Largest error of the pose, as a multiple of the smallest predicted one.
+        Largest error of the pose, as a multiple of the smallest true one.
     rate : float
-        Frame rate, as a fraction of the rate of the fastest feature set.
+        Frame rate, as a fraction of the rate of the fastest feature set in the plan.
     """
 
     artwork: Artwork
@@ -165,27 +165,38 @@ def random_job(rng: np.random.Generator, device: Device) -> Job:
 def judge(rng: np.random.Generator, device: Device, limits: LocationPlanLimits = LocationPlanLimits()) -> Outcome:
     """Plan a random job and measure the plan against truth."""
     job = random_job(rng, device)
-    free = plan_location(job.image, job.artwork, tolerance=1.0, device=device, limits=limits, **job.options)
-    tolerance = job.tolerance * min(each.error for each in usable_feature_sets(free.trials, limits))
+    try:
+        free = plan_location(job.image, job.artwork, tolerance=1.0, device=device, limits=limits, **job.options)
+    except ValueError:  # the features in view do not determine a pose
+        return Outcome(None, math.nan)
     rate = job.rate / free.trials[0].seconds
-    true = {each.name: measure(job, free, each.features, device) for each in free.trials}
-    meeting = {name for name, each in true.items() if each.error <= tolerance and each.refused <= _MAX_REFUSED}
-    possible = any(true[each].seconds * rate <= 1.0 for each in meeting)
+    points = points_in_view(job, free)
+    true = {each.name: measure(job, free, each.features, points, device) for each in free.trials}
+    kept = {name: each for name, each in true.items() if each.refused <= _MAX_REFUSED}
+    tolerance = job.tolerance * min(each.error for each in kept.values())
+    meeting = {name for name, each in kept.items() if each.error <= tolerance}
+    room = room_of([each.error for each in kept.values()], [each.seconds for each in kept.values()], tolerance, rate)
     try:
         plan = choose_features(free.located, free.trials, tolerance=tolerance, rate=rate, limits=limits)
     except PlanError:
-        return Outcome(None, tolerance, possible=possible)
+        return Outcome(None, tolerance, possible=room >= 1.0, room=room)
     found = true[plan.chosen.name]
     error = found.error if found.refused <= _MAX_REFUSED else math.inf
     cost = cost_of(plan, [each for each in plan.trials if each.name in meeting])
-    return Outcome(plan, tolerance, error, possible, cost, found.seconds * rate <= 1.0)
+    return Outcome(plan, tolerance, error, room >= 1.0, cost, found.seconds * rate <= 1.0, room)
 
 
-def measure(job: Job, plan: LocationPlan, features: FeatureSet, device: Device) -> Measured:
+def points_in_view(job: Job, plan: LocationPlan) -> Float64:
+    """Return the features of the board in view of the image of a plan (n, 2) [m]: points at which errors count."""
+    of = plan.located
+    rulers, fiducials = find_features_in_view(job.artwork, of.view, of.features.imaging, of.features.placement)
+    return np.concatenate([rulers.point, fiducials.point])
+
+
+def measure(job: Job, plan: LocationPlan, features: FeatureSet, points: Float64, device: Device) -> Measured:
     """Measure a feature set on the images with known poses.
 
-    The points are the features of the board in view of the plan's image. An error is the distance between a point and
-    the point that the found pose has at its place in the image.
+    An error is the distance between a point (n, 2) [m] and the point that the found pose has at its place in the image.
     """
     located = plan.located
     bound = features.bind(
@@ -199,10 +210,6 @@ def measure(job: Job, plan: LocationPlan, features: FeatureSet, device: Device) 
         blur_px=job.options["blur_px"],
         etch_bias_sigma=job.options["etch_bias_sigma"],
     )
-    rulers, fiducials = find_features_in_view(
-        job.artwork, located.view, located.features.imaging, located.features.placement
-    )
-    points = np.concatenate([rulers.point, fiducials.point])
     squares, times = [], []
     for frame, pose in zip(job.frames, job.poses, strict=True):
         start = time.perf_counter()

@@ -13,6 +13,8 @@ import numpy as np
 from gpuvision.accuracy.plan import AccuracyPlan
 from gpuvision.host import Device
 
+_AMPLE = 1.25  # factor by which a setting is clearly accurate and fast enough. Chosen
+
 
 class Outcome(NamedTuple):
     """Plan of a job, measured against truth.
@@ -29,6 +31,9 @@ class Outcome(NamedTuple):
         Time of the chosen setting over the time of the fastest one that truly meets the tolerance; NaN if none does.
     keeps_up : bool
         Whether the chosen setting kept up with the asked rate.
+    room : float
+        Largest factor by which a setting is truly more accurate than the tolerance and faster than the rate; NaN if
+        unknown.
     """
 
     plan: AccuracyPlan[Any] | None
@@ -37,6 +42,23 @@ class Outcome(NamedTuple):
     possible: bool = False
     cost: float = math.nan
     keeps_up: bool = True
+    room: float = math.nan
+
+
+def room_of(errors: Sequence[float], times: Sequence[float], tolerance: float, rate: float) -> float:
+    """Return the largest factor by which a setting is more accurate than a tolerance and faster than a rate.
+
+    Parameters
+    ----------
+    errors, times : sequence of float
+        True error [m] and time [s] of each setting.
+    tolerance : float
+        Largest error [m].
+    rate : float
+        Units of work per second [1/s].
+    """
+    factors = (min(tolerance / error, 1.0 / (time * rate)) for error, time in zip(errors, times, strict=True))
+    return max(factors, default=0.0)
 
 
 def cost_of(plan: AccuracyPlan[Any], meeting: Sequence[Any]) -> float:
@@ -58,9 +80,17 @@ def summary(outcomes: Sequence[Outcome]) -> str:
             f"{ratios.max(initial=0.0):.2f} tolerances",
             f"kept up with the rate: {sum(each.keeps_up for each in made)} of {len(made)}",
             f"cost at most 1.5 times the best: {cheap} of {len(costs)}, largest {largest:.2f}",
-            f"refused although a setting is truly accurate and fast enough: {sum(each.possible for each in refused)}",
+            f"refused although a setting is truly accurate and fast enough: {_possible(refused)}",
         ]
     )
+
+
+def _possible(refused: Sequence[Outcome]) -> str:
+    """Return how many refused jobs were possible, and how many of them clearly, where that is known."""
+    count = f"{sum(each.possible for each in refused)}"
+    if all(math.isnan(each.room) for each in refused):
+        return count
+    return f"{count}, by a factor of {_AMPLE:g} or more: {sum(each.room >= _AMPLE for each in refused)}"
 
 
 def run_jobs(judge: Callable[[np.random.Generator, Device], Outcome], description: str) -> int:
@@ -75,13 +105,14 @@ def run_jobs(judge: Callable[[np.random.Generator, Device], Outcome], descriptio
     """
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--jobs", type=int, default=200, help="number of random jobs")
+    parser.add_argument("--first", type=int, default=0, help="number of the first job")
     parser.add_argument("--seed", type=int, default=1, help="of the jobs")
     parser.add_argument("--device", help="label of a device; default: the best one")
     given = parser.parse_args()
     device = Device.best() if given.device is None else Device.named(given.device)
     outcomes: list[Outcome] = []
     with contextlib.suppress(KeyboardInterrupt):  # the summary holds the jobs up to then
-        for number in range(given.jobs):
+        for number in range(given.first, given.first + given.jobs):
             outcomes.append(judge(np.random.default_rng((given.seed, number)), device))
             print(f"{number}: {_line(outcomes[-1])}", flush=True)
     print(summary(outcomes))
@@ -92,6 +123,7 @@ def _line(outcome: Outcome) -> str:
     """Return the outcome of a job in one line."""
     asked = f"{1e6 * outcome.tolerance:.3g} um"
     if outcome.plan is None:
-        return f"refused {asked}{', which is possible' if outcome.possible else ''}"
+        factor = "" if math.isnan(outcome.room) else f" by a factor of {outcome.room:.2f}"
+        return f"refused {asked}{f', which is possible{factor}' if outcome.possible else ''}"
     times = f"cost {outcome.cost:.2f}, {'kept up' if outcome.keeps_up else 'too slow'}"
     return f"{outcome.plan.chosen.name}, {1e6 * outcome.error:.3g} of {asked}, {times}"

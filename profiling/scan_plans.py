@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from gpuvision.accuracy.plan import PlanError
 from gpuvision.host import ArraySource, Device, PacedSource, Pipeline, plan_stream, to_numpy
-from gpuvision.profiling.plan_outcomes import Outcome, cost_of, run_jobs
+from gpuvision.profiling.plan_outcomes import Outcome, cost_of, room_of, run_jobs
 from gpuvision.ranging.line import LineReadout
 from gpuvision.reference.line import pixel_gaussian
 from gpuvision.sensor.sensor import Sensor
@@ -43,7 +43,7 @@ class Job(NamedTuple):
     true : (frames, columns) float64
         True positions of the line [px].
     tolerance : float
-        Largest error of the heights, as a multiple of the smallest predicted one.
+        Largest error of the heights, as a multiple of the smallest true one.
     rate : float
         Frame rate, as a fraction of the rate at which the kernel of the fastest readout runs.
     """
@@ -84,18 +84,18 @@ def judge(rng: np.random.Generator, device: Device, limits: ScanPlanLimits = Sca
     # A first plan that any readout meets gives the times and errors that the asked values are multiples of.
     free = plan_scan(job.frames, job.sensor, tolerance=1.0, device=device)
     usable = usable_trials(free.trials, limits)
-    tolerance = job.tolerance * min(each.error for each in usable)
     rate = job.rate / free.trials[0].seconds
     errors = {each.readout: true_error(job, each.readout, device) for each in usable}
+    tolerance = job.tolerance * min(errors.values())
     meeting = {readout for readout, error in errors.items() if error <= tolerance}
-    possible = any(each.seconds * rate <= 1.0 for each in usable if each.readout in meeting)
+    room = room_of([errors[each.readout] for each in usable], [each.seconds for each in usable], tolerance, rate)
     try:
         plan = plan_scan(job.frames, job.sensor, tolerance=tolerance, rate=rate, device=device, limits=limits)
     except PlanError:
-        return Outcome(None, tolerance, possible=possible)
+        return Outcome(None, tolerance, possible=room >= 1.0, room=room)
     error = true_error(job, plan.chosen.readout, device)
     cost = cost_of(plan, [each for each in plan.trials if each.readout in meeting])
-    return Outcome(plan, tolerance, error, possible, cost, not _lost(job, plan, rate))
+    return Outcome(plan, tolerance, error, room >= 1.0, cost, not _lost(job, plan, rate), room)
 
 
 def true_error(job: Job, readout: LineReadout, device: Device) -> float:

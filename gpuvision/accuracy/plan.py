@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, NamedTuple
 
-from gpuvision.accuracy.trial import AnyTrial, Trial, at_least, micrometres, millionths, parts_text, trial_table
+from gpuvision.accuracy.trial import (
+    AnyTrial,
+    Trial,
+    at_least,
+    micrometres,
+    millionths,
+    parts_text,
+    trial_table,
+)
 from gpuvision.host import GpuVisionError
 from gpuvision.validation import finite
 
@@ -205,6 +213,7 @@ def check_time(
     limit: TimeLimit | None,
     margin: float,
     kind: str,
+    time_of: Callable[[AnyTrial], float] = lambda each: each.seconds,
 ) -> None:
     """Check that the fastest setting that meets a tolerance keeps a time limit.
 
@@ -216,21 +225,23 @@ def check_time(
         As in `fastest_within`.
     limit : TimeLimit or None
         Longest time; None: any time.
+    time_of : callable
+        Time of a setting that must keep the limit [s]. Default: its median time.
 
     Raises
     ------
     PlanError
         It is too slow; the message names the most accurate setting that does.
     """
-    if limit is None or chosen.seconds <= limit.seconds:
+    if limit is None or time_of(chosen) <= limit.seconds:
         return
-    times = f"{millionths(chosen.seconds)} us, {limit.reason} allows {millionths(limit.seconds)} us"
+    times = f"{millionths(time_of(chosen))} us, {limit.reason} allows {millionths(limit.seconds)} us"
     refusal = f"{chosen.name} is the fastest {kind} that meets the tolerance and is too slow: {times}"
-    quick = [each for each in usable if each.seconds <= limit.seconds]
+    quick = [each for each in usable if time_of(each) <= limit.seconds]
     if not quick:
-        fastest = min(usable, key=lambda each: each.seconds)
+        fastest = min(usable, key=time_of)
         raise PlanError(
-            f"{refusal}; the fastest usable {kind}, {fastest.name}, takes {millionths(fastest.seconds)} us",
+            f"{refusal}; the fastest usable {kind}, {fastest.name}, takes {millionths(time_of(fastest))} us",
             trials,
             usable,
         )

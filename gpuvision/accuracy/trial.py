@@ -6,7 +6,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 _NAME_WIDTH, _NUMBER_WIDTH = 16, 9  # characters of a column
 
@@ -44,6 +44,19 @@ class Trial(Protocol):
 AnyTrial = TypeVar("AnyTrial", bound=Trial)
 
 
+class CallTime(NamedTuple):
+    """Time of a call.
+
+    Attributes
+    ----------
+    median, upper : float
+        Median and upper quartile [s].
+    """
+
+    median: float
+    upper: float
+
+
 def median_times(calls: Sequence[Callable[[], object]], rounds: int = 7) -> list[float]:
     """Return the median time of each call [s]; the calls take turns.
 
@@ -54,13 +67,36 @@ def median_times(calls: Sequence[Callable[[], object]], rounds: int = 7) -> list
     rounds : int
         Number of turns. Default 7: a pause of a shared machine hits one call or a few.
     """
+    return [statistics.median(each) for each in _turns(calls, rounds, repeats=False)]
+
+
+def loop_times(calls: Sequence[Callable[[], object]], rounds: int) -> list[CallTime]:
+    """Return the time of each call in a loop; the calls take turns.
+
+    An untimed call comes before each timed one: in a loop the caches hold the program.
+
+    Parameters
+    ----------
+    calls : sequence of callable
+        Calls to measure.
+    rounds : int
+        Number of turns, 2 or more.
+    """
+    quartiles = [statistics.quantiles(each, method="inclusive") for each in _turns(calls, rounds, repeats=True)]
+    return [CallTime(middle, upper) for _, middle, upper in quartiles]
+
+
+def _turns(calls: Sequence[Callable[[], object]], rounds: int, *, repeats: bool) -> list[list[float]]:
+    """Return the times of each call [s]: in each turn once, or after an untimed one."""
     times: list[list[float]] = [[] for _ in calls]
     for _ in range(rounds):
         for taken, call in zip(times, calls, strict=True):
+            if repeats:
+                call()
             start = time.perf_counter()
             call()
             taken.append(time.perf_counter() - start)
-    return [statistics.median(each) for each in times]
+    return times
 
 
 def trial_table(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from statistics import NormalDist
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -15,6 +15,9 @@ from gpuvision.normal_distribution import MAD_TO_SIGMA
 
 # Smallest width and height [px] in which rulers and blobs have room.
 _MIN_SIZE = 16
+_QUANTISATION = 1.0 / 12.0  # variance of rounding to integers
+_LEVELS = 16  # intervals of grey levels in which noise is estimated. Chosen: edges fall between the levels of surfaces
+_MIN_PIXELS = 256  # of an interval: they determine its variance to 15 %
 
 
 def grey_image(
@@ -101,6 +104,73 @@ def estimate_pixel_noise(image: npt.NDArray[Any]) -> float:
     """
     differences = _second_differences(image)
     return _deviation(np.abs(differences[np.isfinite(differences)]))
+
+
+class PixelNoise(NamedTuple):
+    """Noise of the pixels of a camera.
+
+    The variance of a pixel is ``read_noise**2 + gain * level``, plus 1/12 for integers (quantisation).
+
+    Attributes
+    ----------
+    read_noise : float
+        Standard deviation at level 0 [grey levels].
+    gain : float
+        Variance of the shot noise per grey level [grey levels].
+    """
+
+    read_noise: float
+    gain: float
+
+    def sigma(self, image: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+        """Return the standard deviation of each pixel without quantisation, in the shape of the image [grey levels]."""
+        levels = np.maximum(image.astype(np.float32), 0.0)
+        return np.asarray(np.sqrt(self.read_noise**2 + self.gain * levels), np.float32)
+
+
+def estimate_noise_model(image: npt.NDArray[Any]) -> PixelNoise:
+    """Estimate how the noise of the pixels depends on their grey level.
+
+    The noise is estimated as in `estimate_pixel_noise`, in 16 intervals of the mean of 3 x 3 pixels. A straight line is
+    fitted to the variances, each weighted by its expected scatter: edges in an interval of few pixels have a large
+    variance and little weight.
+
+    Parameters
+    ----------
+    image : numpy.ndarray
+        (height, width), any real pixel type, without NaN.
+
+    Returns
+    -------
+    PixelNoise
+        Without shot noise where the variance does not increase with the level, and without read noise where the line
+        has a negative variance at level 0.
+    """
+    differences = np.abs(_second_differences(image))
+    means = cv2.blur(image.astype(np.float32), (3, 3))[1:-1, 1:-1]
+    intervals = np.linspace(means.min(), means.max(), _LEVELS + 1)[1:-1]
+    number = np.digitize(means, intervals)
+    inside = [number == each for each in range(_LEVELS)]
+    counts = np.array([np.count_nonzero(each) for each in inside])
+    variances = np.array([_deviation(differences[each]) ** 2 for each in inside])
+    used = (counts >= _MIN_PIXELS) & (variances > 0.0)
+    if not np.any(used):
+        return PixelNoise(estimate_pixel_noise(image), 0.0)
+    levels = np.array([means[each].mean() for each, use in zip(inside, used, strict=True) if use])
+    # The standard deviation of a variance from n pixels is proportional to the variance over the root of n.
+    weights = np.sqrt(counts[used]) / variances[used]
+    rounding = _QUANTISATION if np.issubdtype(image.dtype, np.integer) else 0.0
+    return _line_of_noise(levels, np.maximum(variances[used] - rounding, 0.0), weights)
+
+
+def _line_of_noise(levels: npt.NDArray[Any], variances: npt.NDArray[Any], weights: npt.NDArray[Any]) -> PixelNoise:
+    """Fit a line to variances at levels; neither its slope nor its value at level 0 is negative."""
+    gain, offset = np.polyfit(levels, variances, 1, w=weights) if len(levels) > 1 else (0.0, float(variances[0]))
+    if gain < 0.0:
+        gain, offset = 0.0, np.average(variances, weights=weights**2)
+    if offset < 0.0:
+        gain, offset = np.average(variances / levels, weights=(weights * levels) ** 2), 0.0
+    return PixelNoise(math.sqrt(offset), float(gain))
 
 
 def _second_differences(image: npt.NDArray[Any]) -> npt.NDArray[np.float32]:

@@ -1,22 +1,23 @@
 """Planning of the localization of a board: try feature sets on an image, and choose the fastest accurate one.
 
-The error of the pose comes from its covariance and from repeated noise, the time from the device.
+The error of the pose comes from repeated noise and from unexplained residuals, the time from the device.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from gpuvision.accuracy.plan import PlanError, check_time, fastest_within, time_limit
-from gpuvision.accuracy.trial import median_times
+from gpuvision.accuracy.trial import loop_times
 from gpuvision.camera.camera import Camera
-from gpuvision.camera.image import grey_image
+from gpuvision.camera.image import PixelNoise, estimate_noise_model, grey_image
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.artwork.artwork import Artwork, Side
@@ -42,12 +43,13 @@ Progress = Callable[[int, int | None], object]
 _BUDGETS = (15, 30, 60, 120, 240, 480)
 _BEST, _DENSE = math.sqrt(5.0), 1.0
 _RULERS = ((3, _BEST), (5, _BEST), (9, _BEST), (5, _DENSE))
-_ROUNDS = 15  # of the timing, of which the median counts
-# Standard deviation of errors that all rulers share, such as errors by neighbouring edges [px]. Measured: the
-# unexplained part of the true errors in `gpuvision.profiling.location_plans` is up to 0.006 px.
-_COMMON_PX = 0.005
+_ROUNDS = 31  # of the timing, of which median and upper quartile count
+# Standard deviation of errors that all rulers share, such as errors by neighbouring edges [px]. Measured: the part of
+# the true errors of `gpuvision.profiling.location_plans` beyond the scatter is up to 0.003 px in both directions
+# together, where the poses are most accurate (jobs 0 to 8 of seed 11).
+_COMMON_PX = 0.002
 _UNKNOWNS = 4  # x, y, theta and the etch bias
-_CHANCE = 2.0  # standard deviations of a residual scale that is significantly above 1. Chosen
+_CHANCE = 2.0  # standard deviations of unexplained residuals that are significant. Chosen
 _MAX_SHIFT = 4.0  # standard deviations between the pose of a feature set and the located one. Chosen
 
 
@@ -113,13 +115,17 @@ def plan_location(
 
     Notes
     -----
-    The prediction is the covariance of the pose: noise of the pixels at the heights of the edges in the image, bilinear
-    sampling, and the etch bias. Residuals that are significantly larger raise it. Images with additional noise of the
-    same standard deviation, measured from expected poses anywhere in the search range, test it: a larger scatter takes
-    its place. An error of 0.005 px along x and along y, which all rulers share, is added. A feature set is not used if
-    one of these images has no pose, if its pose differs from the located one by more than 4 standard deviations, or if
-    it depends on a single feature (``LocationPlanLimits.max_leverage``). Not covered: a wrong scale, a wrong lens
-    model, and boards that differ from the artwork.
+    The prediction is the scatter of the poses in images with additional noise about the poses in the image, measured
+    from expected poses anywhere in the search range. The noise is that of the image and depends on the grey level
+    (`gpuvision.camera.image.estimate_noise_model`), unless ``noise`` is given. Residuals of the image that are
+    significantly larger than the noise explains raise the prediction, as far as they move the pose. An error of 0.002
+    px along x and along y, which all rulers share, is added. A feature set is not used if too many of these images have
+    no pose (``LocationPlanLimits.max_refused``), if its pose differs from the located one by more than 4 standard
+    deviations, or if it depends on a single feature (``LocationPlanLimits.max_leverage``). Not covered: a wrong scale,
+    a wrong lens model, and boards that differ from the artwork.
+
+    The time is measured with another image in each call, as from a camera: it includes the way of the frame to the
+    caches. A rate must be kept by the upper quartile of the times.
     """
     finite(tolerance, "tolerance", above=0.0)
     time_limit(rate, latency, limits.rate_margin, LocationPlan.unit)  # refuses wrong values before the work
@@ -141,7 +147,9 @@ def plan_location(
     )
     if located.reason:
         raise ValueError(f"no pose to plan from: {located.reason}")
-    tests = _Tests.of(grey, artwork, located, blur_px, etch_bias_sigma, device, limits.draws)
+    level_noise = estimate_noise_model(grey) if noise is None else PixelNoise(noise, 0.0)
+    noisy = _with_noise(grey, level_noise, limits.draws)
+    tests = _Tests.of(grey, noisy, artwork, located, blur_px, etch_bias_sigma, device)
     trials = _try_features(tests, artwork, progress)
     return choose_features(located, trials, tolerance=tolerance, rate=rate, latency=latency, limits=limits)
 
@@ -175,11 +183,35 @@ def choose_features(
     limit = time_limit(rate, latency, limits.rate_margin, LocationPlan.unit)
     usable = usable_feature_sets(trials, limits)
     if not usable:
-        message = "each feature set has no pose in some images with additional noise, or depends on a single feature"
+        message = "each feature set has no pose in too many of the noisy images, or depends on a single feature"
         raise PlanError(message, trials, usable)
     chosen = fastest_within(trials, usable, tolerance, limits.margin, LocationPlan.kind)
-    check_time(chosen, trials, usable, limit, limits.margin, LocationPlan.kind)
+    check_time(chosen, trials, usable, limit, limits.margin, LocationPlan.kind, lambda each: each.slow_seconds)
     return LocationPlan(chosen=chosen, trials=tuple(trials), tolerance=tolerance, located=located, limits=limits)
+
+
+class _Measured(NamedTuple):
+    """Poses of a feature set in images.
+
+    Attributes
+    ----------
+    poses : (n, 3)
+        x, y [m], theta [rad]; NaN without a pose.
+    scales : (n,)
+        Residual scales; NaN without a pose.
+    leverage : float
+        Largest leverage.
+    covariance : (3, 3)
+        Covariance of the first pose for a residual scale of 1; NaN without a pose.
+    degrees : int
+        Degrees of freedom of the residuals of the first pose.
+    """
+
+    poses: Float64
+    scales: Float64
+    leverage: float
+    covariance: Float64
+    degrees: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,10 +220,12 @@ class _Tests:
 
     Attributes
     ----------
-    images : numpy.ndarray
-        (draws + 1, rows, columns): the image, and images with additional noise.
+    image : numpy.ndarray
+        (rows, columns) image of the board.
+    noisy : numpy.ndarray
+        (draws, rows, columns) images with additional noise.
     expected : numpy.ndarray
-        (draws + 1, 3) expected poses [m], [rad]: the pose of the image, and poses within the search range about it.
+        (draws, 3) expected poses [m], [rad]: the pose of the image, and poses within the search range about it.
     located : LocatedBoard
         Pose of the image.
     points : numpy.ndarray
@@ -200,7 +234,8 @@ class _Tests:
         As in `plan_location`.
     """
 
-    images: npt.NDArray[Any]
+    image: npt.NDArray[Any]
+    noisy: npt.NDArray[Any]
     expected: Float64
     located: LocatedBoard
     points: Float64
@@ -211,20 +246,21 @@ class _Tests:
     @classmethod
     def of(
         cls,
-        grey: npt.NDArray[Any],
+        image: npt.NDArray[Any],
+        noisy: npt.NDArray[Any],
         artwork: Artwork,
         located: LocatedBoard,
         blur_px: float,
         etch_bias_sigma: float,
         device: Device,
-        draws: int,
     ) -> _Tests:
         imaging = located.features.imaging
         rulers, fiducials = find_features_in_view(artwork, located.view, imaging, np.array(located.view.pose[:2]))
         rng = np.random.default_rng(1)
-        away = rng.uniform(-1.0, 1.0, (draws, 3)) * (imaging.shift, imaging.shift, imaging.angle)
+        away = rng.uniform(-1.0, 1.0, (len(noisy) - 1, 3)) * (imaging.shift, imaging.shift, imaging.angle)
         return cls(
-            images=np.concatenate([grey[None], _with_noise(grey, located.noise, draws, rng)]),
+            image=image,
+            noisy=noisy,
             expected=located.view.pose + np.concatenate([np.zeros((1, 3)), away]),
             located=located,
             points=np.concatenate([rulers.point, fiducials.point]) - located.view.pose[:2],
@@ -235,11 +271,11 @@ class _Tests:
 
     def bind(self, features: FeatureSet) -> BoundFeatures:
         """Bind features to the image."""
-        located, (_, rows, columns) = self.located, self.images.shape
+        located, (rows, columns) = self.located, self.image.shape
         return features.bind(
             self.device,
             (rows, columns),
-            self.images.dtype,
+            self.image.dtype,
             copper="bright" if located.copper == "bright" else "dark",
             threshold=located.threshold,
             noise=located.noise,
@@ -251,31 +287,47 @@ class _Tests:
 
     def measure(self, features: FeatureSet, bound: BoundFeatures) -> FeaturesTrial:
         """Return the errors of a feature set, without its time."""
-        poses, leverage = np.full((len(self.images), 3), np.nan), 0.0
-        covariance = np.full((3, 3), np.nan)
-        for number, (image, expected) in enumerate(zip(self.images, self.expected, strict=True)):
+        own = self._measured(bound, [self.image] * len(self.expected))
+        noisy = self._measured(bound, self.noisy)
+        # At the same expected pose, so that only the additional noise differs: rulers elsewhere sample other pixels.
+        away = noisy.poses - own.poses
+        away = away[np.isfinite(away[:, 0])]
+        away[:, 2] = np.remainder(away[:, 2] + math.pi, 2.0 * math.pi) - math.pi
+        scatter = pose_error(np.cov(away.T), self.points) if len(away) > 1 else math.nan
+        unexplained = pose_error(own.covariance, self.points) * unexplained_scale(own.scales, noisy.scales, own.degrees)
+        common = math.sqrt(2.0) * _COMMON_PX * self.located.view.scale  # along x and along y
+        error = math.hypot(scatter, unexplained, common)
+        return FeaturesTrial(
+            features=features,
+            seconds=math.nan,
+            slow_seconds=math.nan,
+            error=math.nan if self._is_elsewhere(own.poses[0], error) else error,
+            scatter=scatter,
+            unexplained=unexplained,
+            leverage=max(own.leverage, noisy.leverage),
+            refused=float(np.mean(np.isnan(noisy.poses[:, 0]))),
+        )
+
+    def _measured(self, bound: BoundFeatures, images: Iterable[npt.NDArray[Any]]) -> _Measured:
+        """Return the poses of images, each from the expected pose of its number."""
+        poses, scales = np.full((len(self.expected), 3), np.nan), np.full(len(self.expected), np.nan)
+        leverage, covariance, degrees = 0.0, np.full((3, 3), np.nan), 0
+        for number, (image, expected) in enumerate(zip(images, self.expected, strict=True)):
             found = bound(image, expected)
             if int(to_numpy(found.status)) == Status.OK:
                 poses[number] = to_numpy(found.pose)
+                scales[number] = float(to_numpy(found.residual_scale))
                 leverage = max(leverage, float(to_numpy(found.leverage)))
                 if not number:
-                    covariance = _covariance(found)
-        predicted = pose_error(covariance, self.points)
-        if self._is_elsewhere(poses[0], predicted):
-            predicted = math.nan
-        known = poses[1:][np.isfinite(poses[1:, 0])]
-        scatter = pose_error(np.cov(known.T), self.points) if len(known) > 1 else math.nan
-        common = math.sqrt(2.0) * _COMMON_PX * self.located.view.scale  # along x and along y
-        error = math.hypot(np.fmax(predicted, scatter), common) if math.isfinite(predicted) else math.nan
-        refused = 1.0 - len(known) / (len(poses) - 1)
-        return FeaturesTrial(features, math.nan, error, predicted, scatter, leverage, refused)
+                    covariance, degrees = _covariance(found), int(to_numpy(found.inliers)) - _UNKNOWNS
+        return _Measured(poses, scales, leverage, covariance, degrees)
 
-    def _is_elsewhere(self, pose: Float64, predicted: float) -> bool:
+    def _is_elsewhere(self, pose: Float64, error: float) -> bool:
         """Return whether a pose differs from the located one by more than both errors allow."""
         away = pose - self.located.view.pose
         away[2] = math.remainder(away[2], 2.0 * math.pi) if math.isfinite(away[2]) else math.nan
         distance = pose_error(np.outer(away, away), self.points)
-        return distance > _MAX_SHIFT * math.hypot(predicted, pose_error(self.located.covariance, self.points))
+        return distance > _MAX_SHIFT * math.hypot(error, pose_error(self.located.covariance, self.points))
 
 
 def pose_error(covariance: Float64, points: Float64) -> float:
@@ -294,38 +346,65 @@ def pose_error(covariance: Float64, points: Float64) -> float:
     return math.sqrt(covariance[0, 0] + covariance[1, 1] + turned)
 
 
+def unexplained_scale(scales: Float64, noisy_scales: Float64, degrees: int) -> float:
+    """Return the residual scale of an image that its noise does not explain; 0 if it may be chance.
+
+    Parameters
+    ----------
+    scales, noisy_scales : (n,)
+        Residual scales of the image, and of images with as much additional noise; NaN where unknown.
+    degrees : int
+        Degrees of freedom of the residuals.
+
+    Notes
+    -----
+    Additional noise raises the square of the scale by the part that noise explains. By chance, the square of an image
+    without other residuals differs from this part by sqrt(2 / degrees) of it (standard deviation).
+    """
+    known = np.isfinite(scales) & np.isfinite(noisy_scales)
+    if degrees < 1 or not np.any(known):
+        return 0.0
+    square = float(np.mean(scales[known] ** 2))
+    explained = float(np.mean(noisy_scales[known] ** 2)) - square
+    rest = square - explained
+    return math.sqrt(rest) if rest > _CHANCE * explained * math.sqrt(2.0 / degrees) else 0.0
+
+
 def _covariance(found: FeaturePose) -> Float64:
-    """Return the covariance of a pose; a residual scale that few features may have by chance does not raise it."""
-    scale, degrees = float(to_numpy(found.residual_scale)), int(to_numpy(found.inliers)) - _UNKNOWNS
-    # The residual scale has a standard deviation of 1 / sqrt(2 degrees).
-    by_chance = 1.0 + _CHANCE / math.sqrt(2.0 * max(degrees, 1))
-    factor = max(scale, 1.0) if scale <= by_chance else 1.0
-    return np.asarray(to_numpy(found.covariance), np.float64) / factor**2
+    """Return the covariance of a pose for a residual scale of 1."""
+    scale = float(to_numpy(found.residual_scale))
+    return np.asarray(to_numpy(found.covariance) / np.fmax(scale, 1.0) ** 2, np.float64)
 
 
-def _with_noise(grey: npt.NDArray[Any], noise: float, draws: int, rng: np.random.Generator) -> npt.NDArray[Any]:
+def _with_noise(grey: npt.NDArray[Any], noise: PixelNoise, draws: int) -> npt.NDArray[Any]:
     """Return images (draws, rows, columns) with additional noise, of the dtype of the image."""
-    noisy = grey + rng.normal(0.0, noise, (draws, *grey.shape))
-    if grey.dtype.kind == "f":
-        return noisy.astype(grey.dtype)
-    return np.clip(np.rint(noisy), 0, np.iinfo(grey.dtype).max).astype(grey.dtype)
+    rng, sigma = np.random.default_rng(2), noise.sigma(grey)
+    images = np.empty((draws, *grey.shape), grey.dtype)
+    for each in images:
+        noisy = grey + sigma * rng.standard_normal(grey.shape, np.float32)
+        each[...] = noisy if grey.dtype.kind == "f" else np.clip(np.rint(noisy), 0, np.iinfo(grey.dtype).max)
+    return images
 
 
 def _try_features(tests: _Tests, artwork: Artwork, progress: Progress) -> tuple[FeaturesTrial, ...]:
     """Return the feature sets with their errors and times on the image, fastest first."""
     feature_sets = list(_feature_sets(artwork, tests.located))
     trials, calls = [], []
+    images = itertools.cycle(tests.noisy)  # of all calls in turn: a frame of a camera is in no cache
     for number, features in enumerate(feature_sets):
         bound = tests.bind(features)
         trials.append(tests.measure(features, bound))
-        calls.append(_call(bound, tests))
+        calls.append(_call(bound, images, tests.expected[0]))
         progress(number + 1, len(feature_sets))
-    timed = [each._replace(seconds=one) for each, one in zip(trials, median_times(calls, _ROUNDS), strict=True)]
+    times = loop_times(calls, _ROUNDS)
+    timed = [
+        each._replace(seconds=time.median, slow_seconds=time.upper) for each, time in zip(trials, times, strict=True)
+    ]
     return tuple(sorted(timed, key=lambda each: each.seconds))
 
 
-def _call(bound: BoundFeatures, tests: _Tests) -> Callable[[], object]:
-    return lambda: bound(tests.images[0], tests.expected[0])
+def _call(bound: BoundFeatures, images: Iterator[npt.NDArray[Any]], pose: Float64) -> Callable[[], object]:
+    return lambda: bound(next(images), pose)
 
 
 def _feature_sets(artwork: Artwork, located: LocatedBoard) -> Iterator[FeatureSet]:

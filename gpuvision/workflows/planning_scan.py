@@ -34,6 +34,7 @@ Progress = Callable[[int, int | None], object]
 _WINDOWS = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 180)
 _HALF_WIDTHS = (1.2, 2.0)  # of the windows, over half the width of the line: noise moves the peak within the line
 _UNKNOWN_LENGTH = 1 << 40  # frames of a recording that does not tell: its stream has no end
+_ROUNDS = 15  # of the timing, of which the median counts
 _QUIET = 1.5  # times the least noise of a readout, up to which its scatter shows the texture. Chosen
 _EDGE = 8.0  # robust standard deviations of the second differences of heights. Chosen: noise stays below
 
@@ -191,7 +192,7 @@ def _times(sensor: Sensor, readouts: Sequence[LineReadout], sample: _Sample, dev
     for readout in readouts:
         operation = range_readout(dataclasses.replace(sensor, readout=readout))
         calls.append(operation.bind(device, frames.shape, frames.dtype, inputs=(frames,)).run)
-    return [each / len(sample.frames) for each in median_times(calls)]
+    return [each / len(sample.frames) for each in median_times(calls, _ROUNDS)]
 
 
 def _half_width(sensor: Sensor, sample: _Sample, device: Device) -> float:

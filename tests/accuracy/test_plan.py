@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import pytest
 
 from gpuvision.accuracy.plan import AccuracyPlan, PlanError, check_time, fastest_within, time_limit
-from gpuvision.accuracy.trial import at_least, median_times, trial_table
+from gpuvision.accuracy.trial import CallTime, at_least, loop_times, median_times, trial_table
 
 
 class Setting(NamedTuple):
@@ -110,6 +110,9 @@ def test_a_setting_that_is_too_slow_is_refused_with_the_nearest_ones() -> None:
         check_time(chosen, TRIALS, usable, time_limit(rate, None, 1.25, "frame"), 1.25, "setting")
 
     check(FINE, 1000.0)  # 0.8 ms, as the limit
+    limit = time_limit(1000.0, None, 1.25, "frame")
+    with pytest.raises(PlanError, match=r"is too slow: 880 us, a rate of 1000 frames/s allows 800 us; middle keeps up"):
+        check_time(FINE, TRIALS, TRIALS, limit, 1.25, "setting", lambda each: 1.1 * each.seconds)
     check_time(FINE, TRIALS, TRIALS, None, 1.25, "setting")
     with pytest.raises(PlanError) as refusal:
         check(FINE, 1001.0)
@@ -159,17 +162,24 @@ def test_a_table_marks_the_chosen_and_the_unusable_settings() -> None:
     assert trial_table((lost,), ()).splitlines()[1].startswith("- a setting with a long name")
 
 
-def test_calls_take_turns_and_the_median_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("repeats", [False, True])
+def test_calls_take_turns(monkeypatch: pytest.MonkeyPatch, repeats: bool) -> None:
+    """Of five timed calls the middle one is the median, the second largest the upper quartile."""
     clock, order = [0.0], []
 
     def call(name: str, durations: list[float]) -> Any:
+        taken = iter([each for duration in durations for each in ((100.0, duration) if repeats else (duration,))])
+
         def run() -> None:
             order.append(name)
-            clock[0] += durations.pop(0)
+            clock[0] += next(taken)
 
         return run
 
     monkeypatch.setattr("gpuvision.accuracy.trial.time.perf_counter", lambda: clock[0])
-    found = median_times([call("a", [9.0, 1.0, 2.0]), call("b", [3.0, 3.5, 50.0])], rounds=3)
-    assert found == [2.0, 3.5]
-    assert "".join(order) == "ababab"
+    calls = [call("a", [9.0, 1.0, 2.0, 3.0, 4.0]), call("b", [3.0, 3.5, 50.0, 3.0, 3.0])]
+    if repeats:
+        assert loop_times(calls, 5) == [CallTime(3.0, 4.0), CallTime(3.0, 3.5)]
+    else:
+        assert median_times(calls, 5) == [3.0, 3.0]
+    assert "".join(order) == ("aabb" if repeats else "ab") * 5

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
-from gpuvision.camera.image import estimate_pixel_noise, grey_image
+from gpuvision.camera.image import PixelNoise, estimate_noise_model, estimate_pixel_noise, grey_image
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
@@ -82,3 +82,33 @@ def test_noise_of_rounded_pixels_without_noise() -> None:
     single = np.full((40, 40), 7, np.uint8)
     single[20, 20] = 8  # 9 of 1444 differences are not 0
     assert 0.0 < estimate_pixel_noise(single) < 0.05
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize(("read_noise", "gain"), [(1.5, 0.0), (0.8, 0.04), (0.0, 0.05), (2.0, 0.02)])
+def test_noise_that_depends_on_the_level(dtype: type, read_noise: float, gain: float, rng: np.random.Generator) -> None:
+    """Surfaces of three levels with slanted edges between them."""
+    rows, columns = np.mgrid[:300, :400]
+    surface = (rows + columns // 3) % 90 // 30
+    exact = np.array([30.3, 90.6, 200.2])[surface]
+    noisy = exact + rng.normal(size=exact.shape) * np.sqrt(read_noise**2 + gain * exact)
+    found = estimate_noise_model((noisy if dtype is np.float32 else np.rint(noisy)).astype(dtype))
+    for level in (60.0, 120.0, 200.0):
+        expected = math.sqrt(read_noise**2 + gain * level)
+        assert found.sigma(np.full((1, 1), level)) == pytest.approx(expected, rel=0.05)
+
+
+def test_noise_model_at_its_limits(rng: np.random.Generator) -> None:
+    assert estimate_noise_model(np.full((40, 40), 7, np.uint8)) == PixelNoise(0.0, 0.0)
+    # One level, and a variance that falls with the level: no shot noise.
+    flat = estimate_noise_model(rng.normal(50.0, 2.0, (300, 300)).astype(np.float32))
+    assert flat.sigma(np.full((1, 1), 50.0)) == pytest.approx(2.0, rel=0.05)
+    sides = np.where(np.arange(400) < 200, 40.0, 160.0)
+    falling = estimate_noise_model(sides + rng.normal(size=(300, 400)) * np.where(sides < 50, 3.0, 1.0))
+    assert falling.gain == 0.0
+    assert 1.0 < falling.read_noise < 3.0
+    # A variance that would be negative at level 0: no read noise.
+    steep = estimate_noise_model(sides + rng.normal(size=(300, 400)) * np.where(sides < 50, 0.5, 4.0))
+    assert steep.read_noise == 0.0
+    assert steep.gain > 0.0
+    assert np.all(PixelNoise(2.0, 0.5).sigma(np.array([[-3.0, 10.0]])) == np.float32([2.0, 3.0]))

@@ -49,7 +49,7 @@ def run(*words: str) -> str:
 def test_a_plan_is_printed_drawn_and_reported(folder: Path) -> None:
     text = run("--plan", "--tolerance", "1mm", "--rate", "1", "--out", "out", "--json", "plan.json")
     lines = text.splitlines()
-    assert lines[0].split() == ["features", "us/frame", "error", "model", "scatter", "leverage", "refused"]
+    assert lines[0].split() == ["features", "us/frame", "error", "scatter", "other", "leverage", "refused"]
     assert sum(line.startswith("* ") for line in lines) == 1
     assert "rulers of 5 px: predicted error" in lines[-3]
     assert lines[-2:] == [

@@ -12,7 +12,7 @@ import pytest
 from gpuvision.accuracy.plan import PlanError
 from gpuvision.profiling import location_plans, placement_plans, scan_plans, simulation_plans
 from gpuvision.profiling.location_plans import Measured
-from gpuvision.profiling.plan_outcomes import Outcome, cost_of, summary
+from gpuvision.profiling.plan_outcomes import Outcome, cost_of, room_of, summary
 
 
 def plan_of(seconds: float) -> Any:
@@ -25,22 +25,31 @@ def test_the_cost_is_relative_to_the_fastest_setting_that_meets_the_tolerance() 
     assert math.isnan(cost_of(plan_of(3.0), []))
 
 
+def test_the_room_is_the_smaller_factor_of_the_best_setting() -> None:
+    """Tolerance 2, rate 0.1: factors 2 and 1.25, 4 and 0.5, 0.5 and 10."""
+    assert room_of([1.0, 0.5, 4.0], [8.0, 20.0, 1.0], 2.0, 0.1) == 1.25
+    assert room_of([], [], 2.0, 0.1) == 0.0
+
+
 def test_shares_of_plans_that_hold() -> None:
     outcomes = [
         Outcome(plan_of(1.0), 2.0, 1.0, True, 1.0),
         Outcome(plan_of(1.0), 2.0, 2.0, True, 1.5),
         Outcome(plan_of(1.0), 2.0, 2.5, False, math.nan, keeps_up=False),
-        Outcome(plan_of(1.0), 2.0, 1.0, True, 1.6),
-        Outcome(None, 2.0, possible=True),
-        Outcome(None, 2.0),
+        Outcome(plan_of(1.0), 2.0, 1.0, True, 1.6, room=3.0),
+        Outcome(None, 2.0, possible=True, room=1.0),
+        Outcome(None, 2.0, possible=True, room=1.25),
+        Outcome(None, 2.0, room=0.99),
     ]
     assert summary(outcomes).splitlines() == [
-        "6 jobs: 4 plans, 2 refused",
+        "7 jobs: 4 plans, 3 refused",
         "error within the tolerance: 3 of 4, largest 1.25 tolerances",
         "kept up with the rate: 3 of 4",
         "cost at most 1.5 times the best: 2 of 3, largest 1.60",
-        "refused although a setting is truly accurate and fast enough: 1",
+        "refused although a setting is truly accurate and fast enough: 2, by a factor of 1.25 or more: 1",
     ]
+    unknown = [each._replace(room=math.nan) for each in outcomes]
+    assert summary(unknown).splitlines()[-1] == "refused although a setting is truly accurate and fast enough: 2"
     assert summary([]).splitlines()[0] == "0 jobs: 0 plans, 0 refused"
 
 
@@ -49,13 +58,13 @@ SETTINGS = {"fast": (1.0, 4.0, 3.0), "middle": (2.0, 2.0, 1.9), "slow": (4.0, 1.
 
 
 @pytest.mark.parametrize(
-    ("tolerance", "chosen", "error", "cost", "possible"),
-    [(4.5, "fast", 3.0, 1.0, True), (2.2, "middle", 1.9, 1.0, True), (1.95, "slow", 1.2, 2.0, True)],
+    ("tolerance", "chosen", "error", "cost", "room"),
+    [(4.5, "fast", 3.0, 1.0, 2.0), (2.2, "middle", 1.9, 1.0, 2.2 / 1.9), (1.95, "slow", 1.2, 2.0, 1.95 / 1.9)],
 )
 def test_outcome_of_a_scan(
-    monkeypatch: pytest.MonkeyPatch, tolerance: float, chosen: str, error: float, cost: float, possible: bool
+    monkeypatch: pytest.MonkeyPatch, tolerance: float, chosen: str, error: float, cost: float, room: float
 ) -> None:
-    """The least predicted error is 1, so that the tolerance of the job is a multiple of it."""
+    """The least true error is 1.2; the tolerance of the job is a multiple of it."""
     trials = [SimpleNamespace(readout=name, seconds=each[0], error=each[1]) for name, each in SETTINGS.items()]
     asked: list[Any] = []
 
@@ -64,7 +73,7 @@ def test_outcome_of_a_scan(
         fits = [each for each in trials if 1.1 * each.error <= options["tolerance"]]
         return SimpleNamespace(trials=trials, chosen=fits[0] if fits else trials[-1])
 
-    job: Any = SimpleNamespace(frames=None, sensor=None, tolerance=tolerance, rate=0.25)
+    job: Any = SimpleNamespace(frames=None, sensor=None, tolerance=tolerance / 1.2, rate=0.25)
     monkeypatch.setattr(scan_plans, "random_job", lambda rng: job)
     monkeypatch.setattr(scan_plans, "plan_scan", plan_scan)
     monkeypatch.setattr(scan_plans, "usable_trials", lambda trials, limits: trials)
@@ -74,9 +83,9 @@ def test_outcome_of_a_scan(
     found = scan_plans.judge(np.random.default_rng(1), device)
     assert found.plan is not None
     assert found.plan.chosen.readout == chosen
-    assert (found.tolerance, found.error, found.cost) == (tolerance, error, cost)
-    assert (found.possible, found.keeps_up) == (possible, False)
-    assert (asked[1]["tolerance"], asked[1]["rate"]) == (tolerance, 0.25)
+    assert (found.error, found.cost, found.keeps_up) == (error, cost, False)
+    assert (found.tolerance, found.room) == pytest.approx((tolerance, room))
+    assert (asked[1]["tolerance"], asked[1]["rate"]) == pytest.approx((tolerance, 0.25))
 
     def refuse(frames: Any, sensor: Any, **options: Any) -> Any:
         if options["tolerance"] == 1.0:  # the first plan
@@ -88,11 +97,16 @@ def test_outcome_of_a_scan(
 
 
 @pytest.mark.parametrize(
-    ("tolerance", "rate", "chosen", "possible"),
-    [(2.2, 0.25, "middle", True), (1.95, 0.2, "slow", True), (1.95, 0.3, None, True), (1.05, 0.1, None, False)],
+    ("tolerance", "rate", "chosen", "room"),
+    [
+        (2.2, 0.25, "middle", 2.2 / 1.9),
+        (1.95, 0.2, "slow", 1.25),
+        (1.95, 0.3, None, 1.95 / 1.9),
+        (1.05, 0.1, None, 1.05 / 1.2),
+    ],
 )
 def test_outcome_of_a_localization(
-    monkeypatch: pytest.MonkeyPatch, tolerance: float, rate: float, chosen: str | None, possible: bool
+    monkeypatch: pytest.MonkeyPatch, tolerance: float, rate: float, chosen: str | None, room: float
 ) -> None:
     """The middle setting truly meets 1.95, its prediction times 1.1 does not; 0.3 / s is too fast for the slow one."""
     trials = [
@@ -106,25 +120,39 @@ def test_outcome_of_a_localization(
             raise PlanError("none", (), ())
         return SimpleNamespace(chosen=fits[0], trials=trials)
 
-    job: Any = SimpleNamespace(image=None, artwork=None, options={}, tolerance=tolerance, rate=rate)
+    job: Any = SimpleNamespace(image=None, artwork=None, options={}, tolerance=tolerance / 1.2, rate=rate)
     free = SimpleNamespace(trials=trials, located=None)
     monkeypatch.setattr(location_plans, "random_job", lambda rng, device: job)
     monkeypatch.setattr(location_plans, "plan_location", lambda image, artwork, **_: free)
     monkeypatch.setattr(location_plans, "choose_features", choose)
-    monkeypatch.setattr(location_plans, "usable_feature_sets", lambda trials, limits: trials)
-    monkeypatch.setattr(location_plans, "measure", lambda job, plan, features, device: true[features])
+    monkeypatch.setattr(location_plans, "measure", lambda job, plan, features, points, device: true[features])
+    monkeypatch.setattr(location_plans, "points_in_view", lambda job, plan: None)
     device: Any = None
     found = location_plans.judge(np.random.default_rng(1), device)
-    assert found.possible == possible
+    assert found.room == pytest.approx(room)
     if chosen is None:
         assert found.plan is None
         return
     assert found.plan is not None
     assert (found.plan.chosen.name, found.error, found.keeps_up) == (chosen, SETTINGS[chosen][2], True)
     assert found.cost == SETTINGS[chosen][0] / 2.0
-    # More than 5 % of the images without a pose count as no accuracy.
+    # More than 5 % of the images without a pose count as no accuracy: the tolerance is a multiple of another error.
     true[chosen] = Measured(0.1, 1.0, 0.06)
-    assert location_plans.judge(np.random.default_rng(1), device).error == math.inf
+    worse = location_plans.judge(np.random.default_rng(1), device)
+    assert worse.plan is not None
+    assert (worse.error == math.inf) == (worse.plan.chosen.name == chosen) == (chosen == "middle")
+
+
+def test_a_board_without_a_pose_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(image: Any, artwork: Any, **_: Any) -> Any:
+        raise ValueError("these edges do not determine x, y and theta")
+
+    job: Any = SimpleNamespace(image=None, artwork=None, options={})
+    monkeypatch.setattr(location_plans, "random_job", lambda rng, device: job)
+    monkeypatch.setattr(location_plans, "plan_location", refuse)
+    device: Any = None
+    found = location_plans.judge(np.random.default_rng(1), device)
+    assert (found.plan, found.possible) == (None, False)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from gpuvision.matching.field.field_pose import FieldPoseRefinement, FieldPoseSe
 from gpuvision.profiling.contract.agreement import Case, Limit, equal, roundings
 from gpuvision.reference import field as reference
 
+_EPS = float(np.finfo(np.float32).eps)
 LIMITS = {
     "FieldPoseSearch": (
         equal("seen", reason="count of finite points within the range"),
@@ -25,10 +26,15 @@ LIMITS = {
     ),
     "FieldPoseRefinement": (
         equal("status", reason="counts and comparisons"),
-        Limit(("poses",), 3e-5, 3e-5, "1 m, 1 rad", "error model of the docstring: rounding in a field of 20 m"),
+        Limit(
+            ("poses",), 2.0 * _EPS, 2.0 * _EPS,
+            "pose + sum over the points of their coordinates x influence on the pose [m], [rad], at least 13",
+            "rounding of the pose, of the points at the pose and of the lines; the last step is below 3e-6",
+        ),
     ),
 }  # fmt: skip
 _HEADINGS = (0.3, -2.0, 1.1)
+_LAST_STEP = 3e-6  # of a refinement [m], [rad]
 _SIDE = 1e-3  # least distance of a point from the side of a cell [cells]
 
 
@@ -77,4 +83,19 @@ def _refinement(name: str, field_map: DistanceMap, number: int) -> Case:
         found = reference.refine_pose(field_map.field, found, points.astype(np.float64), field_map.scale)
     exact = {"poses": found[None], "status": np.zeros(1, np.uint8)}
     operation = FieldPoseRefinement(map=field_map)
-    return Case("FieldPoseRefinement", name, operation, (points, start[None]), exact, {"poses": 1.0})
+    size = np.abs(found) + _influence(field_map, found, points.astype(np.float64))
+    quantities = {"poses": np.maximum(size, _LAST_STEP / (2.0 * _EPS))[None]}
+    return Case("FieldPoseRefinement", name, operation, (points, start[None]), exact, quantities)
+
+
+def _influence(field_map: DistanceMap, pose: Any, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the sum over points of their coordinates times the absolute derivative of the pose by their distance."""
+    field, steps = field_map.field, 1e-6 * np.eye(3)
+    places = reference.to_field(pose, points)
+    away = reference.distance(field, places)
+    ends = [[reference.distance(field, reference.to_field(pose + s * each, points)) for s in (1, -1)] for each in steps]
+    rows = np.stack([(high - low) / 2e-6 for high, low in ends], axis=-1)
+    share = field_map.scale**2 / (field_map.scale**2 + away**2)
+    slope = share**2 * (4.0 * share - 3.0)  # of psi, in the place of the weight share^2
+    influence = np.abs(np.linalg.solve(rows.T @ (slope[:, None] * rows), rows.T)) * np.maximum(np.abs(slope), share**2)
+    return np.asarray(influence @ (np.abs(places).sum(axis=1) + np.abs(points).sum(axis=1)))

@@ -49,7 +49,8 @@ def test_a_plan_is_printed_drawn_and_reported(folder: Path) -> None:
     assert {path.name for path in (folder / "out").iterdir()} == {"plan.png", MANIFEST}
 
 
-def test_a_tolerance_simulates_with_the_chosen_light(folder: Path) -> None:
+def test_a_tolerance_simulates_with_the_chosen_light(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planning_simulation, "_WORTH", 24)
     text = run("--tolerance", "1mm", "--profiles", "25", "--rate", "0.001")
     assert text.startswith("plan: direct ")
     assert "predicted error" in text.splitlines()[0]

@@ -177,9 +177,12 @@ def test_the_plan_of_a_job_simulates(tmp_path: Any) -> None:
     assert done.attribution.error.shape == (6, 16)
 
 
-def test_small_parts_are_not_worth_planning() -> None:
-    assert not is_worth_planning(task_of(profiles=12), FEW)
-    assert is_worth_planning(task_of(profiles=13), FEW)
+@pytest.mark.parametrize(("paths", "albedo", "most"), [(PATHS, 0.7, 30), (PATHS, 0.0, 300), (INDIRECT, 0.7, 300)])
+def test_small_parts_are_not_worth_planning(paths: tuple[str, ...], albedo: float, most: int) -> None:
+    """Black surfaces have no multi-bounce light."""
+    task = dataclasses.replace(task_of(paths=paths), materials=white(albedo))
+    for count, expected in ((most, False), (most + 1, True)):
+        assert is_worth_planning(dataclasses.replace(task, transports=np.arange(float(count)))) == expected
 
 
 # ---- bounds and options ----------------------------------------------------------------------------------------------

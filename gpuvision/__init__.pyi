@@ -274,10 +274,10 @@ from .plots.simulation import (
     PictureScale as PictureScale,
 )
 from .ranging.line import (
-    LineReading as LineReading,
-)
-from .ranging.line import (
     LineReadout as LineReadout,
+)
+from .ranging.line_parameters import (
+    LineReading as LineReading,
 )
 from .ranging.merge_heights import (
     MergedHeights as MergedHeights,

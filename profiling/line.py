@@ -18,7 +18,8 @@ from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, host_view, to_numpy
 from gpuvision.profiling.harness import Case, Peer
 from gpuvision.profiling.line_peers import expert_forms, plain_form
-from gpuvision.ranging.line import LineReadout, Method
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.line_parameters import Method
 from gpuvision.ranging.triangulation import Triangulation
 
 ROWS, COLUMNS, THRESHOLD, SATURATION, WINDOW = 512, 1024, 25, 255, 8

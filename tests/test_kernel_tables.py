@@ -10,7 +10,7 @@ import pytest
 
 from gpuvision.matching.pose import board_pose, feature_pose, pose
 from gpuvision.operation import KERNEL_FOLDER
-from gpuvision.ranging.line import LineTable
+from gpuvision.ranging.line_launch import LineTable
 from gpuvision.ranging.psd import PsdTable
 from gpuvision.ranging.regrid import RegridCounts, RegridTable
 from gpuvision.ranging.sheet import SheetTable

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Literal, cast
 
-from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.line_parameters import METHODS, WIDEST_WINDOW, Method
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.ranging.triangulation import Triangulation

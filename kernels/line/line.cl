@@ -33,7 +33,7 @@
 #include "line/line_profiles.h"
 #include "common/sheet.h"
 
-// Parameters, in the order of LineTable in gpuvision/ranging/line.py.
+// Parameters, in the order of LineTable in gpuvision/ranging/line_launch.py.
 typedef struct {
     real min_width, max_width;  // limits on the number of samples above the threshold
     real ambiguous_ratio;       // fraction of the peak's light from which on a second peak counts
@@ -81,6 +81,8 @@ static inline void store_reading(const Outputs *to, ulong first, int sample, rea
     const ints overflown = not_finite_lanes(total) | (not_finite_lanes(position) & ~lost);
     flags |= flag_where(overflown, STATUS_NOT_FINITE);
     lost |= overflown;
+    // Other flags of such a profile would depend on the order in which its samples are read.
+    flags = choose_ints(~int_mask((flags & STATUS_NOT_FINITE) == 0), STATUS_NOT_FINITE, flags);
 #endif
     const ints not_finite = ~int_mask((flags & STATUS_NOT_FINITE) == 0);
     position = nan_where(to_masks(lost), position);

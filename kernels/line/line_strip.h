@@ -3,7 +3,7 @@
 #ifndef LINE_STRIP_H
 #define LINE_STRIP_H
 
-#define MAX_STRIP 1024  // columns whose sums fit the first-level cache (_STRIP in gpuvision/ranging/line.py)
+#define MAX_STRIP 1024  // columns whose sums fit the first-level cache (_STRIP in gpuvision/ranging/line_launch.py)
 #define MAX_GROUPS (MAX_STRIP / WIDE)
 
 // First column of a group of WIDE columns. The last group of a frame is moved back to end with the frame, and some

@@ -14,7 +14,8 @@ from gpuvision.camera.undistort_image import UndistortImage
 from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.inspection.deposits import MeasureDeposits
 from gpuvision.profiling.offline.builds import Example
-from gpuvision.ranging.line import LineReading, LineReadout
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.line_parameters import LineReading
 from gpuvision.ranging.merge_heights import MergeHeights
 from gpuvision.ranging.psd import PsdNoise, PsdReading, PsdReadout
 from gpuvision.ranging.range_image import RangeImage

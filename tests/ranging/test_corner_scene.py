@@ -11,7 +11,8 @@ import scipy.optimize
 
 from conftest import DATA
 from gpuvision import Status
-from gpuvision.ranging.line import LineReading, LineReadout
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.line_parameters import LineReading
 from gpuvision.ranging.range_image import RangeImage, RangePoints
 from gpuvision.ranging.regrid import Grid, Regrid
 from gpuvision.ranging.sheet_motion import RotatingSheet

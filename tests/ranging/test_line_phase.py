@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from gpuvision.host import Device
-from gpuvision.ranging.line import METHODS, LineReadout
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.line_parameters import METHODS
 from gpuvision.ranging.line_phase import LineShape, estimate_line_shape, phase_error
 from gpuvision.reference.line import read_lines
 

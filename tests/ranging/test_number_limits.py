@@ -12,7 +12,8 @@ import pytest
 
 import gpuvision as gv
 from gpuvision.ranging.focus import DepthFromFocus
-from gpuvision.ranging.line import LONGEST_PROFILE, WIDEST_WINDOW
+from gpuvision.ranging.line_launch import LONGEST_PROFILE
+from gpuvision.ranging.line_parameters import WIDEST_WINDOW
 from gpuvision.ranging.polygon import PolygonMirror, shear_profile
 from gpuvision.ranging.psd import clipping_bias
 from gpuvision.ranging.regrid import Grid

@@ -62,9 +62,7 @@ def read_profile(
 ) -> Reading:
     """Return position, peak, width, total and status of one profile."""
     if not np.all(np.isfinite(x)):
-        known = x[~np.isnan(x)]
-        bright = len(known) and known.max() >= saturation
-        return np.nan, np.nan, np.nan, np.nan, NOT_FINITE | (SATURATED if bright else 0)
+        return np.nan, np.nan, np.nan, np.nan, NOT_FINITE
     if method == "centroid":
         return read_centroid(x, threshold, saturation, **settings)
     return read_peak(x, method, threshold, window, saturation, previous, **settings)

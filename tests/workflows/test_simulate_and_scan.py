@@ -17,7 +17,7 @@ import trimesh
 import laser_sensor
 from conftest import Draws
 from gpuvision.formats.range_image import read_npz
-from gpuvision.ranging.line import METHODS
+from gpuvision.ranging.line_parameters import METHODS
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.simulated_recording import recording_sensor

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
-from gpuvision.ranging.line import PeakSelection
+from gpuvision.ranging.line_parameters import PeakSelection
 from gpuvision.simulation.errors.error_attribution import (
     ErrorAttribution,
     ReadingCategory,

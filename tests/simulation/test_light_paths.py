@@ -10,9 +10,10 @@ import trimesh
 from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.light_paths import LightPaths, _widened, distance_from_path
 from gpuvision.simulation.scene.material import Material
-from gpuvision.simulation.scene.reflectance import Lambert
+from gpuvision.simulation.scene.reflectance import Lambert, Phong
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.readings import BEYOND_ENDS
+from gpuvision.simulation.transport.direct import DirectLimits
 from gpuvision.simulation.transport.illumination import LightSheet
 from sensor_views import sensor_view
 
@@ -57,6 +58,19 @@ def glow(places, normal, length, power, x0):
         arrive = np.maximum(way @ normal, 0.0) * np.maximum(-way[:, 2], 0.0)
         got.append(np.sum(0.5 * power / math.pi * arrive / square**2) * 1e-6)
     return np.array(got)
+
+
+def test_limits_reach_the_direct_light_and_the_mirrors(device):
+    """Parts of a glossy lobe change the specular light a little, steps in mirrors are those of `Mirrors`."""
+    glossy = [Material(diffuse=Lambert(albedo=0.1), gloss=Phong(albedo=0.3, exponent=200.0))]
+    given = {"materials": glossy, "paths": ("direct", "specular")}
+    limits = (DirectLimits(), DirectLimits(lobe_turn=4.0, max_lobe_parts=1))
+    powers = [
+        paths(corner(), device, direct_limits=each, **given).profile(0.0).exposures["specular"].power for each in limits
+    ]
+    assert powers[0].any()
+    assert not np.array_equal(*powers)
+    assert paths(corner(), device, mirror_steps=5.0)._mirrors.steps_per_sample == 5.0
 
 
 def test_a_wall_glows_as_the_line_before_it_says(device):

@@ -266,10 +266,15 @@ static inline void ruler_find(private const reals *values, private const ruler_p
 #include "ruler/ruler_lanes.h"
 
 // Measure 16 rulers of a given layout with its flags, one in each lane; fills edges[MAX_EDGES].
-static inline void ruler_measure_placed(global const CODE *image, int columns, private const ruler_place *place, masks flags,
-                                 constant real *table, constant real *model, private ruler_edge *edges) {
+static inline void ruler_measure_placed(global const CODE *image, int rows, int columns,
+                                        private const ruler_place *place, masks flags, constant real *table,
+                                        constant real *model, private ruler_edge *edges) {
     reals profile[RULER_CAPACITY];
-    flags |= ruler_sums(image, place, columns, table, model, profile);
+#ifdef RULER_PATCHES_H
+    if (ruler_has_patches(place, rows, columns)) flags |= ruler_patch_sums(image, place, columns, table, profile);
+    else
+#endif
+        flags |= ruler_sums(image, place, columns, table, model, profile);
     ruler_find(profile, place, flags, table, edges);
 }
 
@@ -278,7 +283,7 @@ static inline void ruler_measure_lanes(global const CODE *image, int rows, int c
                                 reals sine, constant real *table, constant real *model, private ruler_edge *edges) {
     ruler_place place;
     const masks flags = ruler_layout(rows, columns, x, y, cosine, sine, table, &place);
-    ruler_measure_placed(image, columns, &place, flags, table, model, edges);
+    ruler_measure_placed(image, rows, columns, &place, flags, table, model, edges);
 }
 
 // Measure up to 16 rulers in memory, `stride` numbers apart; lanes beyond `count` repeat the last ruler.
@@ -293,7 +298,7 @@ static inline void ruler_measure(global const CODE *image, int rows, int columns
 #ifdef PER_RULER
     ruler_set_kind(vload16(0, given[4]), vload16(0, given[5]), vload16(0, given[6]), table, &place);
 #endif
-    ruler_measure_placed(image, columns, &place, flags, table, model, edges);
+    ruler_measure_placed(image, rows, columns, &place, flags, table, model, edges);
 }
 #else
 #include "ruler/ruler_group.h"

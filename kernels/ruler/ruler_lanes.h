@@ -105,6 +105,12 @@ static inline void ruler_start(ruler_walk *walk, const ruler_place *place, int s
 #endif
 }
 
+// Advance to the next line.
+static inline void ruler_step(ruler_walk *walk) {
+    walk->column += walk->across_x;
+    walk->row += walk->across_y;
+}
+
 // Store fractions and pixel of the sample on the current line and advance to the next line; return flags.
 static inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int pitch, int sample, int line,
                         constant real *model, private reals *x, private reals *y, private uint16 *pixel) {
@@ -123,8 +129,7 @@ static inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int p
     *y = ruler_fraction(walk->row);
     *pixel = as_uint16(place->pixel + (walk->column >> RULER_BITS) + (walk->row >> RULER_BITS) * pitch);
 #if !defined(LENS) && !defined(CAMERA)
-    walk->column += walk->across_x;
-    walk->row += walk->across_y;
+    ruler_step(walk);
 #endif
     return flags;
 }
@@ -132,7 +137,7 @@ static inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int p
 // Positions are computed RULER_AHEAD samples before their pixels are blended, so that no store is forwarded to a load of
 // another size: a load of elements of a vector, or of a vector of elements.
 #if defined(CODE_uchar) && defined(POCL_DEVICE_ADDRESS_BITS)
-// 8-bit pixels on PoCL: scalar code packs the 2 x 2 pixels of a sample in a word and stores it, one sample before words
+// 8-bit pixels on PoCL, where patches (ruler_patches.h) do not serve: scalar code packs the 2 x 2 pixels of a sample in a word and stores it, one sample before words
 // are blended as a vector. The vector units have no part in it, so that both work side by side: a third less time than
 // with vectors into which loads insert pixels. (On Intel's runtime the insertions take less time.)
 #define RULER_PACKED
@@ -215,4 +220,9 @@ static inline __attribute__((always_inline)) masks ruler_sums(global const CODE 
     }
     return flags;
 }
+
+// Samples of a single line share too few pixels.
+#if defined(CODE_uchar) && WIDTH > 1 && !defined(LENS) && !defined(CAMERA)
+#include "ruler/ruler_patches.h"
+#endif
 #endif

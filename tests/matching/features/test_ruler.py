@@ -393,6 +393,39 @@ def test_up_to_the_border(device: Device, variant: Any, dtype: Any) -> None:
 
 
 @VARIANTS
+@pytest.mark.parametrize(
+    ("width", "length", "step_px", "rows", "norm"),
+    [
+        *((5, 40, 1.0, 120, 1.0), (2, 33, 0.8, 50, 1.0), (2, 24, 1.0, 4, 1.0), (2, 24, 1.0, 3, 1.0)),
+        *((4, 30, 1.6, 120, 1.0), (3, 20, 1.0, 120, 1.7)),
+    ],
+)
+def test_eight_bits_are_read_like_floats(
+    device: Device, variant: Any, width: int, length: int, step_px: float, rows: int, norm: float,
+    rng: np.random.Generator,
+) -> None:  # fmt: skip
+    """Words of pixels hold all samples: of noise, to the borders, at distances and directions of any length."""
+    image = rng.integers(0, 256, (rows, 150)).astype(np.uint8)
+    operation = RulerEdges(
+        threshold=1.0, width=width, length=length, step_px=step_px, smoothing_px=1.2, saturation=250.0, variant=variant
+    )
+    angle = rng.uniform(0.0, 2.0 * math.pi, 100) if rows > 4 else np.tile([0.0, math.pi], 50)
+    angle[:20] = np.repeat([0.0, math.pi / 2, math.pi, -math.pi / 2], 5)
+    direction = norm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    along, across = 0.5 * (length - 1) * step_px, 0.5 * (width - 1)
+    reach = along * np.abs(direction) + across * np.abs(direction[:, ::-1])
+    last = np.array([149.0, rows - 1.0])
+    centres = reach + rng.uniform(0.0, 1.0, (100, 2)) * np.maximum(last - 2.0 * reach, 0.0)
+    centres[::3], centres[1::3] = reach[::3], (last - reach)[1::3]
+    rulers = np.concatenate([centres, direction], axis=1).astype(np.float32)
+    ours, floats = (operation(each, rulers, device=device) for each in (image, image.astype(np.float32)))
+    assert np.mean(np.isfinite(floats.position)) > 0.5
+    np.testing.assert_array_equal(ours.status, floats.status)
+    for name, tolerance in (("position", 1e-4), ("amplitude", 1e-2), ("width", 5e-4)):
+        np.testing.assert_allclose(getattr(ours, name), getattr(floats, name), rtol=0, atol=tolerance, err_msg=name)
+
+
+@VARIANTS
 def test_saturated_and_ambiguous_edges_come_with_a_value(device: Device, variant: Any) -> None:
     image = np.clip(np.rint(reference.step_image(SHAPE, 0.0, 75.0, 1.0, 50.0, 300.0)), 0, 255).astype(np.uint8)
     operation = replace(STRONGEST, saturation=255.0, ambiguity=0.8, variant=variant)

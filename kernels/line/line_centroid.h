@@ -11,10 +11,10 @@
 
 #include "line/line_profiles.h"
 
-// Samples of a profile in a block, summed in lanes of twice the sample's width. Bytes: s <= 16 * 255, and
-// m <= 255 * (16 * 17 / 2) = 34680 < 2^16 (22 steps would also fit, 23 would not). Measured: bytes are fastest with 16,
-// wider samples with 20.
-#if CODE_BITS == 8
+// Samples of a profile in a block, summed in lanes of twice the sample's width. Bytes: s <= 20 * 255, and
+// m <= 255 * (20 * 21 / 2) = 53550 < 2^16 (22 steps would also fit, 23 would not). Measured: bytes in a cache are fastest
+// with 16; bytes from memory (PREFETCH) and wider samples with 20.
+#if CODE_BITS == 8 && !defined(PREFETCH)
 #define STEPS 16
 #else
 #define STEPS 20

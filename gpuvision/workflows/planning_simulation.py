@@ -257,9 +257,15 @@ class Combinations:
     def _finest_errors(self) -> dict[str, ErrorPart]:
         """Return the errors of the finest options: of first order, the change by the last refinement at most."""
         found = dict(self._options.proven)
-        for axis in self._axes:
-            for name, part in (("sub_sheets", "slabs"), ("nodes", "nodes"), ("patch_size", "patches")):
-                exact = [each for each in axis if name in each.changes and not each.pairs]
-                if len(exact) > 1:
-                    found[part] = self._estimate.change(exact[-2].exposures, 1.0)
+        for name, part in (("sub_sheets", "slabs"), ("nodes", "nodes"), ("patch_size", "patches")):
+            coarser = [each for axis in self._axes for each in _last_coarser(axis, name)]
+            if coarser:
+                found[part] = self._estimate.change(light_of_options(coarser), 1.0)
         return found | self._estimate.others()
+
+
+def _last_coarser(axis: Sequence[Option], name: str) -> list[Option]:
+    """Return the last option of an axis that differs from the finest one only in the field `name`, if there is any."""
+    finest = axis[-1].changes
+    coarser = [each for each in axis if not each.pairs and each.changes.keys() == finest.keys()]
+    return [each for each in coarser if {key for key in finest if each.changes[key] != finest[key]} == {name}][-1:]

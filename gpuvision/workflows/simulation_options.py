@@ -76,14 +76,18 @@ class LightOptions:
         self._paths = [each for each in scene_paths(sample.task) if each in sample.task.paths]
         self._tolerance, self._progress, self._done = tolerance, progress, 0
         self._bound_of_bounces = math.inf
+        u, v = self.settings.nodes
+        self._nodes = ((u, v), (2 * u, 2 * v))
         direct = self._direct()
         self._least = min(each.seconds for each in direct)
         axes = [direct, self._mirrors(), self._diffuse(), self._bounces()]
         self.axes = [each for each in axes if each]
 
     def combinations(self) -> Iterator[list[Option]]:
-        """Yield all combinations of an option of each axis."""
-        yield from map(list, itertools.product(*self.axes))
+        """Yield the combinations of options in which diffuse and multi-bounce light have the same rays per bin."""
+        for options in itertools.product(*self.axes):
+            if len({each.changes["nodes"] for each in options if "nodes" in each.changes}) < 2:
+                yield list(options)
 
     def settings_of(self, options: Sequence[Option]) -> SimulationSettings:
         """Return the settings of a combination of options."""
@@ -97,13 +101,9 @@ class LightOptions:
         """Return the time of a profile, with its share of the preparation of multi-bounce light [s]."""
         settings = self.settings_of(options)
         seconds = sum(each.seconds for each in options)
-        if "multi-bounce" not in settings.paths:
-            return seconds
-        # Multi-bounce light is measured with the nodes of the task; its time rises with the receivers at most.
-        nodes = math.prod(settings.nodes) / math.prod(self.settings.nodes)
-        bounces = next(each.seconds for each in options if "multi-bounce" in each.changes.get("paths", ()))
-        setup = self.setups[settings.patch_size] / len(self.sample.task.transports)
-        return seconds + setup + max(nodes - 1.0, 0.0) * bounces
+        if "multi-bounce" in settings.paths:
+            seconds += self.setups[settings.patch_size] / len(self.sample.task.transports)
+        return seconds
 
     def _direct(self) -> list[Option]:
         """Return the direct light for numbers of slabs, ascending; specular highlights cost no time of their own."""
@@ -129,11 +129,10 @@ class LightOptions:
         if name not in self._paths:
             return []
         options = [Option({}, {}, 0.0)]
-        u, v = self.settings.nodes
-        for factor in (1, 2):
-            given = {"paths": ("direct", name), "nodes": (factor * u, factor * v)}
-            light = self._light(is_finest=factor == 2, **given)
-            exact = self._option(name, light, nodes=given["nodes"])
+        for nodes in self._nodes:
+            given = {"paths": ("direct", name), "nodes": nodes}
+            light = self._light(is_finest=nodes == self._nodes[-1], **given)
+            exact = self._option(name, light, nodes=nodes)
             self._bound_of_bounces = light.statistics.get(BOUNCES_BOUND, math.inf)
             options += [*self._clustered(light, exact, given), exact]
         return options
@@ -151,7 +150,10 @@ class LightOptions:
         return [Option(exact.changes | {"tolerance": share}, exact.exposures, seconds, bound)]
 
     def _bounces(self) -> list[Option]:
-        """Return no multi-bounce light, and such light for two sizes of patches; none if a bound is negligible."""
+        """Return no multi-bounce light, and such light for rays per bin and sizes of patches.
+
+        There are no options if a bound of such light is negligible.
+        """
         name = "multi-bounce"
         if name not in self._paths:
             return []
@@ -159,10 +161,11 @@ class LightOptions:
             self.proven["without multi-bounce"] = ErrorPart(self._bound_of_bounces, math.nan, is_bound=True)
             return []
         options = [Option({}, {}, 0.0)]
-        for factor in (2.0, 1.0):
-            size = factor * self.settings.patch_size
-            light = self._light(is_finest=factor == 1.0, paths=("direct", name), patch_size=size)
-            options.append(self._option(name, light, patch_size=size))
+        sizes = (2.0 * self.settings.patch_size, self.settings.patch_size)
+        finest = (self._nodes[-1], sizes[-1])
+        for nodes, size in itertools.product(self._nodes, sizes):
+            light = self._light(is_finest=(nodes, size) == finest, paths=("direct", name), nodes=nodes, patch_size=size)
+            options.append(self._option(name, light, nodes=nodes, patch_size=size))
             self.setups[size] = light.setup
         return options
 

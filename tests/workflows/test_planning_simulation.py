@@ -24,7 +24,7 @@ from gpuvision.workflows.light_cache import SimulationTask, make_light_paths
 from gpuvision.workflows.planning_simulation import is_worth_planning, plan_simulation, plan_task
 from gpuvision.workflows.simulating import prepare_simulation, simulate
 from gpuvision.workflows.simulation_errors import ErrorPart, SimulationErrors, estimate_errors, total_error
-from gpuvision.workflows.simulation_options import LightOptions
+from gpuvision.workflows.simulation_options import LightOptions, light_of_options
 from gpuvision.workflows.simulation_plan import SettingsTrial, SimulationPlan, SimulationPlanLimits, usable_settings
 from gpuvision.workflows.simulation_sample import ProfileSample, SampledLight, SampleReader, SimulationSettings
 
@@ -233,18 +233,38 @@ def test_clustered_pairs_count_with_their_bound(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_times_of_a_combination_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Direct light 1 s, diffuse light 2 s more, bounces 4 s more and 80 s of preparation for 40 profiles."""
-    seconds = {("direct",): 1.0, ("direct", "diffuse-diffuse"): 3.0, ("direct", "multi-bounce"): 5.0}
-    found = options_of(
-        monkeypatch, 1e-6, lambda each: sampled(seconds[each.paths], 80.0), paths=("direct", *PATHS[3:]), profiles=40
-    )
+    """Direct light 1 s, diffuse light 2 s more, bounces 4 s more by ray and 80 s of preparation for 40 profiles."""
+    seconds = {("direct",): 1.0, ("direct", "diffuse-diffuse"): 3.0}
+
+    def times(each: SimulationSettings) -> SampledLight:
+        return sampled(seconds.get(each.paths, 1.0 + 4.0 * math.prod(each.nodes)), 80.0)
+
+    found = options_of(monkeypatch, 1e-6, times, paths=("direct", *PATHS[3:]), profiles=40)
     by_settings = {found.settings_of(each): found.seconds_of(each) for each in found.combinations()}
     for settings, found_seconds in by_settings.items():
         expected = 1.0 + 2.0 * ("diffuse-diffuse" in settings.paths)
         if "multi-bounce" in settings.paths:
             expected += 4.0 * math.prod(settings.nodes) + 2.0
         assert found_seconds == pytest.approx(expected)
-    assert len(by_settings) == 4 * 3 * 3
+    # Numbers of slabs, times: nothing or one of two sizes of patches, without diffuse light for either number of rays.
+    assert len(by_settings) == 4 * (1 + 2 * 2 + 2 * 3)
+
+
+def test_multi_bounce_light_has_the_rays_of_the_diffuse_light() -> None:
+    """The light of the finest options is that of their settings, on the sample and on the other profiles."""
+    task = task_of(paths=("direct", *PATHS[3:]), patch_size=20 * MM)
+    sample = ProfileSample.of(task, 2, Device.best(), others=1)
+    options = LightOptions(sample, 1e-9, lambda done, of: None)
+    finest = [axis[-1] for axis in options.axes]
+    settings = options.settings_of(finest)
+    assert settings.nodes == (2, 2)
+    for places, light in ((sample.places, light_of_options(finest)), (sample.others, options.checks)):
+        expected = sample.light(settings, places).exposures
+        assert set(light) == set(expected) == {"direct", *PATHS[3:]}
+        for name, each in expected.items():
+            assert np.any(each.moment != 0.0)
+            np.testing.assert_allclose(light[name].power, each.power, rtol=1e-5, atol=1e-6 * each.power.max())
+            np.testing.assert_allclose(light[name].moment, each.moment, rtol=1e-4, atol=1e-5 * abs(each.moment).max())
 
 
 def test_a_thin_sheet_has_no_slabs_to_try(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -336,4 +336,5 @@ class ProfileSample:
 def _spaced(numbers: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
     """Return evenly spaced elements, each in the middle of its part; all if there are fewer."""
     count = min(count, len(numbers))
-    return numbers[((np.arange(count) + 0.5) * len(numbers) / max(count, 1)).astype(int)]
+    places: npt.NDArray[np.int64] = ((np.arange(count) + 0.5) * len(numbers) / max(count, 1)).astype(np.int64)
+    return np.take(numbers, places)

@@ -123,6 +123,18 @@ static inline int any_int_lane(ints mask) {
 static inline int any_int_lane(ints mask) { return mask != 0; }
 #endif
 
+// Smallest value of the lanes.
+static inline int lowest_lane(ints v) {
+#ifdef VECTOR_VARIANT
+    const int8 a = min(v.lo, v.hi);
+    const int4 b = min(a.lo, a.hi);
+    const int2 c = min(b.lo, b.hi);
+    return min(c.x, c.y);
+#else
+    return v;
+#endif
+}
+
 #ifdef PAST_CACHES
 // Stores that bypass the caches: a cache line that is written as a whole need not be read first. Only vectors at an
 // aligned address can bypass them.

@@ -127,7 +127,9 @@ AS_IT_IS kernel void distance_map(global const float *restrict at_x, global floa
             high = at_x[column + lane] > high ? at_x[column + lane] : high;
         }
         uchar of_tile[MAX_SHAPES];
-        const float half_width = 0.5f * (high - low), reach = sqrt(half_width * half_width + half_height * half_height);
+        const float half_width = 0.5f * (high - low);
+        // The last term is the rounding of the rows first_y + row * cell.
+        const float reach = sqrt(half_width * half_width + half_height * half_height) + ROUNDING * fabs(first_y);
         const int used = shapes_of_tile(shapes, count, 0.5f * (low + high), first_y + (float)first * cell + half_height,
                                         reach, cell, of_tile);
         for (uint row = first; row < end; row++) {

@@ -18,7 +18,7 @@
 #ifndef LINE_GROUP_H
 #define LINE_GROUP_H
 
-// Work-items and profiles of a group: LineReadout._groups in gpuvision/ranging/line.py has the same numbers.
+// Work-items and profiles of a group: LineLaunch._group in gpuvision/ranging/line_launch.py has the same numbers.
 #if defined(METHOD_ML) || defined(ITEM_PER_PROFILE)
 #define GROUP 64
 #define PROFILES 64

@@ -75,18 +75,6 @@ static inline codes sample_of(const Profiles *profiles, int k) {
 #endif
 }
 
-// Smallest value of the lanes.
-static inline int lowest_lane(ints v) {
-#ifdef VECTOR_VARIANT
-    const int8 a = min(v.lo, v.hi);
-    const int4 b = min(a.lo, a.hi);
-    const int2 c = min(b.lo, b.hi);
-    return min(c.x, c.y);
-#else
-    return v;
-#endif
-}
-
 // 32-bit mask of the lanes whose sample is infinite or NaN.
 static inline ints not_finite_codes(codes level) {
 #if CODE_BITS == 32

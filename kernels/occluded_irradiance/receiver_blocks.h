@@ -11,6 +11,10 @@
 #include "common/status.h"
 #include "occluded_irradiance/segment_view.h"
 
+#if LANES != SELECTION_BLOCK
+#error a list of segments serves the receivers of one vector
+#endif
+
 // Number of blocks of a batch. Receivers with their own lists of segments are processed block by block.
 #ifdef SELECTED
 #define BATCH 1
@@ -287,8 +291,8 @@ static inline void light_packed(const bvh_tree *tree, const chunk *lit, int line
     packed->count = 0;
 }
 
-// Add the light of a chunk of segments to blocks of receivers. A block in which most receivers face a line is processed
-// as it is.
+// Add the light of a chunk of segments to blocks of receivers. A block of which LEAST_UNPACKED receivers or more face a
+// line, and a single block, are processed as they are.
 static inline void light_chunk(const bvh_tree *tree, const chunk *lit, real clearance, uint samples, const block *blocks,
                                uint count, packet *packed, pieces *waiting, uchar *flag) {
     if (!lit->is_good) *flag |= STATUS_NOT_FINITE;

@@ -43,15 +43,15 @@ typedef struct {
 
 // Transpose LANES vectors: four times, interleave the first half of them with the second half. This moves the bits of an
 // element's place (row, lane) around by one, and four times swaps row and lane.
-#define INTERLEAVED(type, a, b)                                                                                     \
+#define INTERLEAVE_HALVES(type, a, b)                                                                               \
     ((type)(a.s0, b.s0, a.s1, b.s1, a.s2, b.s2, a.s3, b.s3, a.s4, b.s4, a.s5, b.s5, a.s6, b.s6, a.s7, b.s7))
 #define DEFINE_TRANSPOSE(name, type)                                                                                \
     INLINE void name(type *rows) {                                                                                  \
         for (int round = 0; round < 4; round++) {                                                                   \
             type next[LANES];                                                                                       \
             UNROLLED for (int n = 0; n < LANES / 2; n++) {                                                          \
-                next[2 * n] = INTERLEAVED(type, rows[n].lo, rows[n + LANES / 2].lo);                                \
-                next[2 * n + 1] = INTERLEAVED(type, rows[n].hi, rows[n + LANES / 2].hi);                            \
+                next[2 * n] = INTERLEAVE_HALVES(type, rows[n].lo, rows[n + LANES / 2].lo);                          \
+                next[2 * n + 1] = INTERLEAVE_HALVES(type, rows[n].hi, rows[n + LANES / 2].hi);                      \
             }                                                                                                       \
             UNROLLED for (int n = 0; n < LANES; n++) rows[n] = next[n];                                             \
         }                                                                                                           \
@@ -173,13 +173,6 @@ INLINE int prepare_cells(const line_outputs *out, const line_set *lines, int fro
         store_status((ints)STATUS_NO_DATA, out->status + i, lines);
     }
     return max(from, to);
-}
-
-INLINE int lowest_lane(ints values) {
-    const int8 half_of_it = min(values.lo, values.hi);
-    const int4 quarter = min(half_of_it.lo, half_of_it.hi);
-    const int2 both = min(quarter.lo, quarter.hi);
-    return min(both.x, both.y);
 }
 
 // First and last cell whose centre lies in [low, high]; no cell if first > last.

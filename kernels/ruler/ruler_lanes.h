@@ -137,9 +137,9 @@ static inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int p
 // Positions are computed RULER_AHEAD samples before their pixels are blended, so that no store is forwarded to a load of
 // another size: a load of elements of a vector, or of a vector of elements.
 #if defined(CODE_uchar) && defined(POCL_DEVICE_ADDRESS_BITS)
-// 8-bit pixels on PoCL, where patches (ruler_patches.h) do not serve: scalar code packs the 2 x 2 pixels of a sample in a word and stores it, one sample before words
-// are blended as a vector. The vector units have no part in it, so that both work side by side: a third less time than
-// with vectors into which loads insert pixels. (On Intel's runtime the insertions take less time.)
+// 8-bit pixels on PoCL, where patches (ruler_patches.h) do not serve: scalar code packs the 2 x 2 pixels of a sample in a
+// word and stores it, one sample before words are blended as a vector. Both work side by side: a third less time than with
+// vectors into which loads insert pixels. (On Intel's runtime the insertions take less time.)
 #define RULER_PACKED
 #define RULER_AHEAD 2
 typedef volatile ushort ruler_two __attribute__((aligned(1)));

@@ -96,7 +96,7 @@ def _condition_of_ggx(model: Ggx, half: npt.NDArray[np.float64]) -> npt.NDArray[
     The logarithm of the normals' distribution is 2 ln(z^2 + s^2) - 2 ln(s^2 + alpha^2 z^2), with the height z of h and
     its length s along the surface. Its derivatives are -g / s by s and g / z by z, with
     g = 4 (1 - alpha^2) s^2 z^2 / ((s^2 + alpha^2 z^2) (s^2 + z^2)). An error e of each direction changes s by 2 e; of
-    grazing, mirrored directions s and z are both small, and the value changes by up to 2 e / (alpha z). Heights have a
+    grazing, mirrored directions s and z are both small, and the value changes by up to 4 e / (alpha z). Heights have a
     relative error e: z and both heights in the shadowing change the value by (g + 2) e. The Fresnel term
     f0 + (1 - f0) a^5, with a = 1 - |h| / 2, changes by 5 (1 - f0) a^4 e. With e = 8 epsilon the sum is 32 epsilon times
     a quarter of the derivatives; 32 epsilon more are the roundings of the model.

@@ -267,8 +267,8 @@ class SolvePose(VisionOperation[BoardPose]):
     millionth of the displacement, and in the pose 3e-7 of the extent of the rows; at a placement point outside the rows
     the error grows with its distance.
     Both grow with the condition c. The normal equations square it: their least eigenvalue is 1 / c^2 of the largest
-    one, and the rounding of their sums changes it by up to 8 epsilon (1024 rows; the largest change that a directed
-    search found is 7.6). While c^2 < 1 / (32 epsilon), a step leaves at most a quarter of the distance to the solution,
+    one, and the rounding of their sums changes it by 8 epsilon or less (assumed: a directed search with 1024 rows found
+    7.6 at most). While c^2 < 1 / (32 epsilon), a step leaves at most a quarter of the distance to the solution,
     and the factorisation, which takes a pivot below 8 epsilon of its diagonal for 0, succeeds. This is the upper limit
     of ``max_condition``; beyond it, poses may be wrong without a flag.
 

@@ -188,9 +188,9 @@ class PairCounts(NamedTuple):
 def estimate_pairs(segments: npt.NDArray[Any], receivers: npt.NDArray[Any], weights: npt.NDArray[Any]) -> PairCounts:
     """Estimate how many pairs of a receiver with weight and a segment face each other, and how many there are.
 
-    A segment is represented by its midpoint. The pairs are counted in a sample at equal steps: about 61 receivers and
-    31 to 61 segments, all of them where there are fewer. The step of the receivers and the length of a strip have no
-    common divisor, so that the sample has receivers from all parts of a strip.
+    A segment is represented by its midpoint. The pairs are counted in a sample at equal steps: 61 to 121 receivers, or
+    fewer with a longer step, and 31 to 61 segments; all of them where there are fewer. The step of the receivers and
+    the length of a strip have no common divisor, so that the sample has receivers from all parts of a strip.
 
     Parameters
     ----------
@@ -201,6 +201,8 @@ def estimate_pairs(segments: npt.NDArray[Any], receivers: npt.NDArray[Any], weig
     weights
         (strips, n, 2); receivers whose weights are both 0 are not counted.
     """
+    if not receivers.size:
+        return PairCounts(0, 0)
     count, each = receivers.size // 6, receivers.shape[1]
     step, skip = max(count // _SAMPLED_RECEIVERS, 1), max(len(segments) // _SAMPLED_SEGMENTS, 1)
     while math.gcd(step, each) > 1:
@@ -214,6 +216,6 @@ def estimate_pairs(segments: npt.NDArray[Any], receivers: npt.NDArray[Any], weig
     has_weight = got_weights.any(axis=1)
     per_sample = count * len(segments) / max(arrives.size, 1)
     return PairCounts(
-        int(np.count_nonzero((arrives & leaves)[has_weight]) * per_sample),
-        int(np.count_nonzero(has_weight) * len(lit) * per_sample),
+        round(np.count_nonzero((arrives & leaves)[has_weight]) * per_sample),
+        round(np.count_nonzero(has_weight) * len(lit) * per_sample),
     )

@@ -426,6 +426,27 @@ def test_eight_bits_are_read_like_floats(
 
 
 @VARIANTS
+@pytest.mark.parametrize(("width", "length"), [(5, 40), (2, 151)])
+def test_neighbours_of_other_lengths_change_no_result(
+    device: Device, variant: Any, width: int, length: int, rng: np.random.Generator
+) -> None:
+    """Rulers of 8-bit images give the same bits where a neighbour's step is too long for patches of 4 x 4 pixels."""
+    image = rng.integers(0, 256, (160, 190)).astype(np.uint8)
+    operation = RulerEdges(threshold=1.0, width=width, length=length, smoothing_px=1.2, variant=variant)
+    angle = rng.uniform(-0.2, 0.2, 37)
+    rulers = np.stack(
+        [rng.uniform(85.0, 105.0, 37), rng.uniform(60.0, 100.0, 37), np.cos(angle), np.sin(angle)], axis=1
+    )
+    mixed = rulers.copy()
+    mixed[[3, 20, 36], 2:] *= 2.5
+    alone, beside = (operation(image, each.astype(np.float32), device=device) for each in (rulers, mixed))
+    same = np.delete(np.arange(37), [3, 20, 36])
+    assert np.mean(np.isfinite(alone.position[same])) > 0.5
+    for name in ("position", "amplitude", "width", "sigma", "status"):
+        np.testing.assert_array_equal(getattr(beside, name)[same], getattr(alone, name)[same], err_msg=name)
+
+
+@VARIANTS
 def test_saturated_and_ambiguous_edges_come_with_a_value(device: Device, variant: Any) -> None:
     image = np.clip(np.rint(reference.step_image(SHAPE, 0.0, 75.0, 1.0, 50.0, 300.0)), 0, 255).astype(np.uint8)
     operation = replace(STRONGEST, saturation=255.0, ambiguity=0.8, variant=variant)

@@ -1,8 +1,9 @@
 """Plans of simulations against truth: random parts and sensors: ``python -m gpuvision.profiling.simulation_plans``.
 
 Each job is a part of boxes and a cylinder under a PSD or a camera, with a tolerance and a rate. Truth is an
-independent, finer computation of profiles at random positions: twice the slabs and rays of the finest setting of the
-plan, half its bins, patches, steps in mirrors and parts of lobes. A plan holds if the root mean square difference of
+independent, finer computation of profiles at random positions: eight times the rays of the finest setting of the plan
+along each axis, because they converge slowly (multi-bounce light: twice as many), twice its slabs, half its bins,
+patches, steps in mirrors and parts of lobes. A plan holds if the root mean square difference of
 the simulated heights is at most the tolerance, and if the time of a profile keeps up with the rate. Its cost is its
 time over the time of the fastest combination of options that truly meets the tolerance (exhaustive search).
 """
@@ -186,13 +187,16 @@ class Truth:
             settings,
             paths=tuple(each for each in task.paths if each != "multi-bounce"),
             sub_sheets=2 * (2 * settings.sub_sheets + 1),
-            nodes=(2 * u, 4 * v),  # in bins of half the size: four times as many rays along u
+            nodes=(8 * u, 16 * v),  # in bins of half the size: 16 times as many rays along u
         )
         limits = {"direct_limits": DirectLimits(lobe_turn=0.5 * DirectLimits.lobe_turn), "mirror_steps": 4.0}
         light = divided_light(finer.applied(task), self.sample.places, device, 2, **limits)
         if "multi-bounce" in task.paths:
             smaller = dataclasses.replace(
-                settings, paths=("direct", "multi-bounce"), patch_size=0.5 * settings.patch_size
+                settings,
+                paths=("direct", "multi-bounce"),
+                nodes=(4 * u, 4 * v),  # in the same bins
+                patch_size=0.5 * settings.patch_size,
             )
             light["multi-bounce"] = self.sample.light(smaller).exposures["multi-bounce"]
         reading = self.sample.reader.read(light)

@@ -52,12 +52,15 @@ def make_simulation_plan(
 def planned_task(
     task: SimulationTask, description: str, tolerance: str, rate: float | None, device: Device | None
 ) -> tuple[SimulationTask, str]:
-    """Return a task with the settings that a plan chooses, and a line about them; the task itself if it is small."""
+    """Return a task with the settings of a plan, and a line about them; a small task itself if there is no rate."""
     from gpuvision.workflows.planning_simulation import is_worth_planning
 
-    if not is_worth_planning(task):
+    if rate is None and not is_worth_planning(task):
         count = len(task.transports)
-        return task, f"plan: {count} profiles are computed in full; planning would take longer, the error is unknown"
+        return task, (
+            f"plan: {count} profiles are computed in full, because planning would take longer; their error is unknown: "
+            "--plan predicts it"
+        )
     plan = make_simulation_plan(task, description, tolerance, rate, device)
     return plan.task, f"plan: {plan}"
 

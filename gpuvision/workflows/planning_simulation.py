@@ -98,14 +98,15 @@ def plan_simulation(
     Notes
     -----
     The noiseless readings of each setting are compared with those of the finest one: the range error is the distance of
-    the readings on the sensor times the derivative dH/du of the height. The error of the finest setting is estimated
-    from the change by its last refinement, as in `gpuvision.workflows.simulation_errors.estimate_errors`, and is part
-    of the error of every setting. Estimates add up as squares, proven bounds linearly: that of clustered pairs, and
-    that of multi-bounce light, which is left out if its bound is a tenth of the tolerance or less. The mean square
-    error over the profiles is raised by twice its standard error. The chosen setting is compared with the finest one on
-    other profiles, with all light computed as the simulation does; a setting whose error there exceeds the tolerance is
-    not chosen. Not covered: samples that are flagged as ambiguous, light paths that are not in ``paths`` or not
-    modelled, and edges that no sampled profile meets.
+    the readings on the sensor times the derivative dH/du of the height. The error of the finest setting is part of the
+    error of every setting. It is estimated from the change by its last refinement, see
+    `gpuvision.workflows.simulation_errors.estimate_errors`. Estimates add up as squares, proven bounds linearly: that
+    of clustered pairs, and that of multi-bounce light, which is left out for a PSD if its bound in the sample is a
+    tenth of the tolerance or less. The mean square error over the profiles is raised by twice its standard error. The
+    chosen setting is compared with the finest one on other profiles, with all light computed as the simulation does; a
+    setting whose error there exceeds the tolerance, or that reads other lines there, is not chosen. Not covered:
+    samples that are flagged as ambiguous, light paths that are not in ``paths`` or not modelled, and edges that no
+    sampled profile meets.
     """
     task = prepare_simulation(
         part, materials, sensor, paths=paths, patch_size=patch_size, profiles=profiles, transports=transports
@@ -151,7 +152,8 @@ def plan_task(
     while True:
         usable = usable_settings(trials, limits)
         if not usable:
-            raise PlanError("each setting reads other lines than the finest one", trials, usable)
+            message = "each setting reads other lines than the finest one; raise SimulationPlanLimits.max_moved"
+            raise PlanError(message, trials, usable)
         try:
             chosen = fastest_within(trials, usable, tolerance, limits.margin, SimulationPlan.kind)
         except PlanError as refusal:
@@ -159,10 +161,13 @@ def plan_task(
             reason = f"the largest part is {largest_part(best, tried.finest)}"
             raise PlanError(f"{refusal}; {reason}", trials, usable) from None
         check_time(chosen, trials, usable, limit, limits.margin, SimulationPlan.kind)
-        checked = tried.checked_error(chosen)
-        if not checked > tolerance:
+        checked, moved = tried.check(chosen)
+        if not checked > tolerance and moved <= limits.max_moved:
             break
-        trials = [each._replace(error=max(each.error, checked)) if each == chosen else each for each in trials]
+        trials = [
+            each._replace(error=max(each.error, checked), moved=max(each.moved, moved)) if each == chosen else each
+            for each in trials
+        ]
     return SimulationPlan(
         chosen=chosen,
         trials=tuple(trials),
@@ -237,14 +242,18 @@ class Combinations:
             moved=difference.changed,
         )
 
-    def checked_error(self, trial: SettingsTrial) -> float:
-        """Return the error of settings on the other profiles [m], as the simulation computes them; NaN without any."""
+    def check(self, trial: SettingsTrial) -> tuple[float, float]:
+        """Return error [m] and moved fraction of settings on the other profiles, as the simulation computes them.
+
+        The error is NaN where nothing is read.
+        """
         if self._checked is None:
-            return math.nan
+            return math.nan, 0.0
         reader = self._sample.reader
         found = reader.read(self._sample.light(trial.settings, self._sample.others).exposures)
         difference = reader.compare(found, self._checked)
-        return total_error([*self.finest.values(), ErrorPart(difference.error, difference.signal)])
+        error = total_error([*self.finest.values(), ErrorPart(difference.error, difference.signal)])
+        return error, difference.changed
 
     def _errors_of(self, axis: Sequence[Option]) -> Iterator[tuple[Option, Difference]]:
         """Yield the change of the reading by each option of an axis, with the finest options of the others."""

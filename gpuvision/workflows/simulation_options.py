@@ -76,6 +76,7 @@ class LightOptions:
         self._paths = [each for each in scene_paths(sample.task) if each in sample.task.paths]
         self._tolerance, self._progress, self._done = tolerance, progress, 0
         self._bound_of_bounces = math.inf
+        self._has_bounds = sample.task.sensor.kind == "psd"
         u, v = self.settings.nodes
         self._nodes = ((u, v), (2 * u, 2 * v))
         direct = self._direct()
@@ -139,15 +140,15 @@ class LightOptions:
 
     def _clustered(self, light: SampledLight, exact: Option, given: dict[str, Any]) -> list[Option]:
         """Return the option with clustered pairs if that is faster. It has the light of all pairs, and a bound."""
-        if light.statistics.get("pairs", 0.0) <= _MIN_PAIRS:
+        if not self._has_bounds or light.statistics.get("pairs", 0.0) <= _MIN_PAIRS:
             return []
         share = _PAIRS * self._tolerance
         found = self._light(is_finest=False, tolerance=share, **given)
-        bound = found.statistics.get(PAIRS_BOUND, 0.0)
-        if not bound or found.seconds >= light.seconds:
+        if not found.statistics.get(PAIRS_BOUND, 0.0) or found.seconds >= light.seconds:
             return []
         seconds = max(found.seconds - self._least, 0.0)
-        return [Option(exact.changes | {"tolerance": share}, exact.exposures, seconds, bound)]
+        # Profiles beside the sample may use the whole share.
+        return [Option(exact.changes | {"tolerance": share}, exact.exposures, seconds, share)]
 
     def _bounces(self) -> list[Option]:
         """Return no multi-bounce light, and such light for rays per bin and sizes of patches.
@@ -157,7 +158,7 @@ class LightOptions:
         name = "multi-bounce"
         if name not in self._paths:
             return []
-        if self._bound_of_bounces <= _PROVEN * self._tolerance:
+        if self._has_bounds and self._bound_of_bounces <= _PROVEN * self._tolerance:
             self.proven["without multi-bounce"] = ErrorPart(self._bound_of_bounces, math.nan, is_bound=True)
             return []
         options = [Option({}, {}, 0.0)]

@@ -68,7 +68,7 @@ class SettingsTrial(NamedTuple):
     change : float
         Root mean square difference of the readings from those of the finest setting, with all pairs [m].
     pairs : float
-        Proven bound of the error by clustered and omitted pairs, for PSDs and centroids in a fixed window [m].
+        Proven bound of the error by clustered and omitted pairs [m]; only PSDs have such pairs.
     finest : float
         Estimated error of the finest setting [m].
     worst : float

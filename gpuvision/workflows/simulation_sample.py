@@ -14,7 +14,6 @@ import numpy.typing as npt
 from gpuvision.host import Device
 from gpuvision.ranging.line import LineReadout
 from gpuvision.sensor.simulated import make_sensor_view, make_simulator, require_light
-from gpuvision.simulation.light_paths import LightPaths
 from gpuvision.simulation.sensors.readings import PATHS, Reading, Simulator, height_secant, stack_profiles
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
@@ -133,11 +132,7 @@ def sample_light(task: SimulationTask, places: Float64, device: Device, **change
     start = time.perf_counter()
     paths = replace(make_light_paths(task, device), **changes)
     paths.profile(float(places[0]))
-    return _light_of(paths, places, time.perf_counter() - start)
-
-
-def _light_of(paths: LightPaths, places: Float64, first: float) -> SampledLight:
-    """Compute the light at some transports; ``first`` is the time of the first profile with its preparation [s]."""
+    first = time.perf_counter() - start  # with the preparation
     taken: list[float] = []
     while not taken or (len(taken) < _RUNS and sum(taken) < _LEAST_TIME):
         start = time.perf_counter()
@@ -165,14 +160,14 @@ def divided_light(
     fine = replace(
         paths, view=replace(view, u_edges=edges, axis=view.axis), end_bins=factor * paths.end_bins, **changes
     )
-    light = _light_of(fine, places, 0.0).exposures
+    light = stack_profiles([each.exposures for each in fine.profiles(places)])
     offset = fine.view.u_centres.reshape(-1, factor) - view.u_centres[:, None]
 
     def joined(each: Exposure) -> Exposure:
         power, moment = (part.reshape(*part.shape[:-1], view.bins, factor) for part in each)
         return Exposure(power.sum(axis=-1), np.sum(moment + power * offset, axis=-1))
 
-    return {name: joined(each) for name, each in light.items()}
+    return {name: joined(each) for name, each in light.items() if name in PATHS}
 
 
 class Difference(NamedTuple):
@@ -249,7 +244,7 @@ class SampleReader:
         u = np.where(expected, reference.position, 0.0)
         slope = np.abs(height_secant(view.triangulation, u, u, view.v_centres))
         error = np.where(same, slope * moved, 0.0)
-        counted = max(int((read | expected).sum()), 1)
+        counted = int((read | expected).sum())
         strength = np.where(same, reference.strength, 0.0)
         change = np.where(same, found.strength - reference.strength, 0.0)
         total = float(np.sum(strength**2))
@@ -257,7 +252,7 @@ class SampleReader:
             error=self._root_mean_square(error, same),
             worst=float(error.max(initial=0.0)),
             signal=math.sqrt(float(np.sum(change**2)) / total) if total > 0.0 else 0.0,
-            changed=1.0 - float(same.sum()) / counted,
+            changed=(counted - int(same.sum())) / max(counted, 1),
         )
 
     def _root_mean_square(self, error: Float64, same: npt.NDArray[np.bool_]) -> float:

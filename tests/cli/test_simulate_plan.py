@@ -62,7 +62,10 @@ def test_a_small_part_is_computed_in_full(folder: Path, monkeypatch: pytest.Monk
     """Also of a second sensor, without a plan."""
     monkeypatch.setattr(planning_simulation, "plan_task", lambda *_, **__: pytest.fail("planned"))
     text = run("--tolerance", "1mm", "--profiles", "3", "--second", "s.toml")
-    line = "plan: 3 profiles are computed in full; planning would take longer, the error is unknown"
+    line = (
+        "plan: 3 profiles are computed in full, because planning would take longer; their error is unknown: "
+        "--plan predicts it"
+    )
     assert text.splitlines()[:2] == [line, line]
 
 

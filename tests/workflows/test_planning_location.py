@@ -181,6 +181,23 @@ def test_a_rate_that_no_accurate_features_keep_up_with_is_refused(
         choose_features(*found, tolerance=tolerance, rate=0.1 * rate, latency=best.slow_seconds)
 
 
+@pytest.mark.usefixtures("few_features")
+def test_features_whose_usual_times_keep_a_rate_are_chosen_before_faster_ones(
+    artwork: Artwork, picture: BoardPicture, device: Device, rng: np.random.Generator
+) -> None:
+    """The set with the smallest median time has an upper quartile beyond the limit."""
+    free = plan_of(camera_image(picture, POSE, rng), artwork, device)
+    first, second, *others = sorted(free.usable, key=lambda each: each.error)
+    trials = [
+        first._replace(seconds=20.0e-6, slow_seconds=30.0e-6),
+        second._replace(seconds=20.6e-6, slow_seconds=21.0e-6),
+        *(each._replace(seconds=1e-3, slow_seconds=1e-3) for each in others),
+    ]
+    tolerance = 1.2 * second.error
+    assert choose_features(free.located, trials, tolerance=tolerance).chosen == trials[0]
+    assert choose_features(free.located, trials, tolerance=tolerance, rate=1.0 / 25e-6).chosen == trials[1]
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_features")
 def test_predicted_errors_are_those_of_images_with_known_poses(
@@ -283,7 +300,7 @@ def test_a_pose_elsewhere_is_no_pose(
     found = locate_board(image, artwork, scale=PIXEL, initial_pose=EXPECTED, device=device)
     view = dataclasses.replace(found.view, pose=(found.pose[0] + 0.5 * PIXEL, *found.pose[1:]))
     monkeypatch.setattr(planning_location, "locate_board", lambda *_, **__: dataclasses.replace(found, view=view))
-    with pytest.raises(PlanError, match="each feature set has no pose in too many of the noisy") as refusal:
+    with pytest.raises(PlanError, match="each has no pose in too many images with additional noise") as refusal:
         plan_of(image, artwork, device)
     assert all(math.isnan(each.error) for each in refusal.value.trials)
 

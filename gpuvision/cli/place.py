@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from gpuvision.workflows.placing import PlacementResult
 
 _BUDGET = 60  # number of rulers
+_COUNT = 20  # number of placements
 _LARGEST_BOARD = 1.0  # largest coordinate on a board [m] (chosen: panels are smaller)
 _FILES = ("report.json", "placements.png", "features.png", "repeatability.png")
 
@@ -99,9 +100,13 @@ def place(
     at: Target,
     out: Results,
     frame_rate: FrameRate = None,
-    count: Annotated[int, typer.Option(min=1, max=10_000, help="Number of placements.")] = 20,
+    count: Annotated[
+        int | None, typer.Option(min=1, max=10_000, help=f"Number of placements. Default: {_COUNT}.")
+    ] = None,
     budget: Annotated[int, typer.Option(min=3, max=1000, help="Number of calipers (rulers).")] = _BUDGET,
-    seed: Annotated[int, typer.Option(min=0, max=(1 << 32) - 1, help="Seed of all random numbers.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=(1 << 32) - 1, help="Seed of all random numbers. Default: 0.")
+    ] = None,
     side: Annotated[Side, typer.Option(help="Side of the board on which parts are placed.")] = Side.top,
     layers: LayerNames = None,
     tolerance: Tolerance = None,
@@ -137,6 +142,7 @@ def place(
         reject_unused("without --tolerance", rate=rate, part_radius=part_radius, time_vision=time_vision)
     inputs: list[str | Path] = [gerbers, machine, *named_files(machine)]
     if only_plan:
+        reject_unused("with --plan", count=count, seed=seed)
         outputs = claim_placement_plan(tolerance, inputs, out, as_json, overwrite=overwrite)
     else:
         outputs = Outputs("place", inputs=inputs, overwrite=overwrite)
@@ -156,6 +162,7 @@ def place(
             return
         echo(f"plan: {plan}", err=prints_report(as_json))
         described, budget = plan.chosen.machine, plan.chosen.budget
+    count, seed = _COUNT if count is None else count, 0 if seed is None else seed
     with progress_bar("placing") as progress:
         result = simulate_placements(
             artwork,

@@ -84,6 +84,10 @@ def test_options_without_effect_are_refused(folder: Path) -> None:
         run("--time-vision")
     with pytest.raises(ValueError, match="--part-radius has no effect without --tolerance"):
         run("--part-radius", "1mm")
+    with pytest.raises(ValueError, match="--count has no effect with --plan"):
+        run("--plan", "--tolerance", "5um", "--count", "2")
+    with pytest.raises(ValueError, match="--seed has no effect with --plan"):
+        run("--plan", "--tolerance", "5um", "--seed", "0")
     assert {path.name for path in folder.iterdir()} == {"gerbers", "machine.toml"}
 
 

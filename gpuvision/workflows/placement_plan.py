@@ -75,10 +75,10 @@ class PlacementTrial(NamedTuple):
         Features of the placement.
     seconds : float
         Mean time from the exposure of the first frame to the contact of the part [s]: the larger one of the runs
-        without images and of the rendered ones. NaN if no part is released.
+        without images and of the rendered ones. NaN if no run without images releases the part.
     error : float
         Error of the placement [m], root mean square: ``fixed`` with the largest one of ``vision``, ``loop`` and
-        ``images``. NaN if no part is released.
+        ``images``. NaN if no run without images releases the part.
     fixed : float
         Error by calibration, drift and etch bias [m].
     vision : float
@@ -211,7 +211,7 @@ class PlacementSettingsPlan(AccuracyPlan[PlacementTrial]):
             constraints.append("the tolerance keeps it from a shorter time")
         finer = self.finer
         if finer is not None and self.limit is not None and finer.seconds > self.limit.seconds:
-            constraints.append(f"{self.limit.reason} from a smaller error")
+            constraints.append(f"{self.limit.reason} keeps it from a smaller error")
         name, largest = max(self.chosen.error_parts.items(), key=lambda each: each[1])
         constraints.append(f"the largest part of the error is {name}, {micrometres(largest)}")
         return ", ".join(constraints)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -127,7 +127,7 @@ class PlacementSettings:
     def _with_window(self, window: tuple[int, int]) -> Machine:
         """Return the machine with a window, at the highest frame rate of camera, stages and drives."""
         camera = replace(self._machine.camera, window=window)
-        return replace(self._machine, camera=camera, rate=self._rate(camera, self._machine.stages))
+        return _changed(self._machine, camera=camera, rate=self._rate(camera, self._machine.stages))
 
     def _rate(self, camera: PlacementCamera, stages: Mapping[str, float]) -> float:
         """Return the highest frame rate of camera, stages and drives.
@@ -163,7 +163,7 @@ class PlacementSettings:
             return machine
         seconds = PlacementCell(self._artwork, machine, plan, self._device, seed=0).vision_seconds()
         stages = {**machine.stages, "vision": seconds}
-        return replace(machine, stages=stages, rate=self._rate(machine.camera, stages))
+        return _changed(machine, stages=stages, rate=self._rate(machine.camera, stages))
 
     def _controlled(self, machine: Machine, budget: int, plan: PlacementPlan) -> Iterator[Setting]:
         """Yield the settings of a machine with rulers: controls, and tolerances of the release."""
@@ -282,6 +282,14 @@ def _is_equal(one: Setting, other: Setting) -> bool:
 
 def _side(size: float, most: int) -> int:
     return min(max(_STEP * round(size / _STEP), _MIN_WINDOW), most)
+
+
+def _changed(machine: Machine, **changes: Any) -> Machine:
+    """Return the machine with changes, and with the default control where they make its own unstable."""
+    try:
+        return replace(machine, **changes)
+    except ValueError:
+        return replace(machine, **changes, control=Control(watchdog=machine.control.watchdog))
 
 
 def _released(machine: Machine, factor: float) -> Machine:

@@ -33,6 +33,10 @@ Progress = Callable[[int, int | None], object]
 Check = Callable[[PlacementTrial], PlacementTrial]
 
 _TRIED = 24  # settings that run without images: the best by theory (chosen: a few seconds)
+_NO_RELEASE = (
+    "no setting releases the part in each run; raise tolerance.max_time, or give a more precise camera or axes that "
+    "swing less"
+)
 _RUNS_SEED, _IMAGES_SEED = 1, 2  # of the runs without images, and of the rendered ones
 
 
@@ -124,9 +128,10 @@ def plan_placement_settings(
     Theory (`predict_budget`, `predicted_frames`) orders all settings; loops that are unstable with a small error of
     their model are left out. The best 24 or more run without images: on the simulated axes, with poses of the predicted
     covariance (`rehearse_placements`). A setting that does not release each part is not used. The fastest setting that
-    meets the tolerance then runs with rendered images and other seeds (`simulate_placements`); if its true error there
-    is above the tolerance, the next one is taken. The time counts from the exposure of the first frame to the contact.
-    Not covered: boards that differ from the artwork other than by etch bias, and jitter of the delay.
+    meets the tolerance then runs with rendered images and other seeds (`simulate_placements`). If its true error there
+    is above the tolerance, or its time is longer than that of another one, the next setting is taken. The time counts
+    from the exposure of the first frame to the contact. Not covered: boards that differ from the artwork
+    other than by etch bias, and jitter of the delay.
     """
     finite(tolerance, "tolerance", above=0.0)
     time_limit(rate, latency, limits.rate_margin, PlacementSettingsPlan.unit)  # refuses wrong values before the work
@@ -195,7 +200,7 @@ def try_placements(
 
     chosen = {id(each) for each in tried}
     left_out = tuple(each for each in settings if id(each) not in chosen)
-    return TriedPlacements(tuple(sorted(trials, key=lambda each: (each.seconds, each.error))), left_out, check)
+    return TriedPlacements(tuple(sorted(trials, key=_by_time)), left_out, check)
 
 
 def choose_placement(
@@ -229,19 +234,31 @@ def choose_placement(
     while True:
         usable = usable_settings(left)
         if not usable:
-            raise PlanError("no setting releases the part in each run", left, usable)
-        chosen = fastest_within(left, usable, tolerance, limits.margin, PlacementSettingsPlan.kind)
+            raise PlanError(_NO_RELEASE, left, usable)
+        chosen = _fastest(left, usable, tolerance, limits.margin)
         if not math.isnan(chosen.images):
             break
-        checked = check(chosen)
+        checked = check(chosen)  # a larger error takes the setting out of the choice, a longer time may
         left = [checked if each is chosen else each for each in left]
-        # The images measure the error and need no margin. A larger error takes the setting out of the choice.
-        if checked.error <= tolerance and not checked.aborted:
-            chosen = checked
-            break
-    left.sort(key=lambda each: (each.seconds, each.error))
+    left.sort(key=_by_time)
     check_time(chosen, left, usable_settings(left), limit, limits.margin, PlacementSettingsPlan.kind)
     return PlacementSettingsPlan(chosen=chosen, trials=tuple(left), tolerance=tolerance, limit=limit, limits=limits)
+
+
+def _fastest(
+    trials: Sequence[PlacementTrial], usable: Sequence[PlacementTrial], tolerance: float, margin: float
+) -> PlacementTrial:
+    """Return the fastest usable setting that meets a tolerance: an error measured in images needs no margin."""
+    measured = [each for each in usable if not math.isnan(each.images) and each.error <= tolerance]
+    predicted = [each for each in usable if margin * each.error <= tolerance]
+    if measured or predicted:
+        return min(measured + predicted, key=_by_time)
+    return fastest_within(trials, usable, tolerance, margin, PlacementSettingsPlan.kind)  # raises the refusal
+
+
+def _by_time(trial: PlacementTrial) -> tuple[bool, float, float]:
+    """Return the key that sorts settings by time, then by error; those that released no part are last."""
+    return math.isnan(trial.seconds), trial.seconds, trial.error
 
 
 def rehearse(setting: Setting, part_radius: float, runs: int) -> PlacementTrial:
@@ -254,7 +271,7 @@ def rehearse(setting: Setting, part_radius: float, runs: int) -> PlacementTrial:
         return PlacementTrial(machine, setting.budget, plan, math.nan, math.nan, fixed, vision, math.nan, math.nan, 1.0)
     found = rehearse_placements(machine, plan, count=runs, seed=_RUNS_SEED)
     loop, seconds, aborted = _runs(found.error, found.seconds, part_radius)
-    error = math.hypot(fixed, max(vision, loop))
+    error = math.nan if math.isnan(loop) else math.hypot(fixed, max(vision, loop))
     return PlacementTrial(machine, setting.budget, plan, seconds, error, fixed, vision, loop, math.nan, aborted)
 
 

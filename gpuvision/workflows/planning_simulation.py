@@ -21,7 +21,7 @@ from gpuvision.simulation.sensors.readings import PATHS
 from gpuvision.validation import finite
 from gpuvision.workflows.light_cache import SimulationTask
 from gpuvision.workflows.simulating import prepare_simulation
-from gpuvision.workflows.simulation_errors import ErrorPart, PartEstimate, scene_paths, total_error
+from gpuvision.workflows.simulation_errors import SLOW_ORDER, ErrorPart, PartEstimate, scene_paths, total_error
 from gpuvision.workflows.simulation_options import LightOptions, Option, light_of_options
 from gpuvision.workflows.simulation_plan import (
     SettingsTrial,
@@ -99,7 +99,8 @@ def plan_simulation(
     -----
     The noiseless readings of each setting are compared with those of the finest one: the range error is the distance of
     the readings on the sensor times the derivative dH/du of the height. The error of the finest setting is part of the
-    error of every setting. It is estimated from the change by its last refinement, see
+    error of every setting. It is estimated from the change by its last refinement; that of the rays per bin of diffuse
+    light, which is often the largest, from a further one, as in
     `gpuvision.workflows.simulation_errors.estimate_errors`. Estimates add up as squares, proven bounds linearly: that
     of clustered pairs, and that of multi-bounce light, which is left out for a PSD if its bound in the sample is a
     tenth of the tolerance or less. The mean square error over the profiles is raised by twice its standard error. The
@@ -266,10 +267,18 @@ class Combinations:
     def _finest_errors(self) -> dict[str, ErrorPart]:
         """Return the errors of the finest options: of first order, the change by the last refinement at most."""
         found = dict(self._options.proven)
-        for name, part in (("sub_sheets", "slabs"), ("nodes", "nodes"), ("patch_size", "patches")):
-            coarser = [each for axis in self._axes for each in _last_coarser(axis, name)]
-            if coarser:
-                found[part] = self._estimate.change(light_of_options(coarser), 1.0)
+        for name, part in (
+            ("sub_sheets", "slabs"),
+            ("nodes", "nodes of multi-bounce light"),
+            ("patch_size", "patches"),
+        ):
+            light = light_of_options([each for axis in self._axes for each in _last_coarser(axis, name)])
+            light.pop("diffuse-diffuse", None)
+            if light:
+                found[part] = self._estimate.change(light, 1.0)
+        if "diffuse-diffuse" in self._estimate.exposures:
+            u, v = self._estimate.settings.nodes
+            found["nodes"] = self._estimate.refined(("diffuse-diffuse",), factor=SLOW_ORDER, nodes=(2 * u, 2 * v))
         return found | self._estimate.others()
 
 

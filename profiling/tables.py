@@ -104,7 +104,7 @@ def comparison_table(folder: Path) -> str:
 
 def _rows(folder: Path) -> dict[tuple[str, ...], Mapping[str, Any]]:
     """Return the rows of all runs against peers by operation, case, peer and device."""
-    runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
+    runs = [json.loads(path.read_text()) for path in sorted(folder.glob("[!.]*.json"))]
     rows = [row for run in runs for row in run["rows"] if "peer" in row]
     return {(row["operation"], row["case"], row["peer"], row["device"]): row for row in rows}
 

@@ -166,7 +166,7 @@ def offline_page(name: str, report: Mapping[str, Any]) -> str:
 
 def results_pages(source: Path = SOURCE) -> dict[str, str]:
     """Return all pages by file name."""
-    files = {path.stem: json.loads(path.read_text()) for path in sorted(source.glob("*.json"))}
+    files = {path.stem: json.loads(path.read_text()) for path in sorted(source.glob("[!.]*.json"))}
     runs = {name: run for name, run in files.items() if not name.startswith("offline-")}
     offline = {name: report for name, report in files.items() if name not in runs}
     pages = {f"{name}.rst": run_page(name, run) for name, run in runs.items()}

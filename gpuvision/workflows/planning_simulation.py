@@ -30,7 +30,7 @@ from gpuvision.workflows.simulation_plan import (
     largest_part,
     usable_settings,
 )
-from gpuvision.workflows.simulation_sample import Difference, ProfileSample
+from gpuvision.workflows.simulation_sample import Difference, ProfileSample, SimulationSettings
 
 Progress = Callable[[int, int | None], object]
 
@@ -229,12 +229,12 @@ class Combinations:
         """Read a combination of options."""
         reader = self._sample.reader
         difference = reader.compare(reader.read(light_of_options(options)), self._estimate.reading)
-        pairs = sum(each.pairs for each in options)
-        parts = [ErrorPart(difference.error, difference.signal), ErrorPart(pairs, math.nan, is_bound=True)]
+        pairs, settings = sum(each.pairs for each in options), self._options.settings_of(options)
+        bound = ErrorPart(pairs, math.nan, is_bound=True)
         return SettingsTrial(
-            settings=self._options.settings_of(options),
+            settings=settings,
             seconds=self._options.seconds_of(options),
-            error=total_error([*self.finest.values(), *parts]),
+            error=total_error([*self._with_finest(difference, settings), bound]),
             change=difference.error,
             pairs=pairs,
             finest=total_error(self.finest.values()),
@@ -253,8 +253,18 @@ class Combinations:
         reader = self._sample.reader
         found = reader.read(self._sample.light(trial.settings, self._sample.others).exposures)
         difference = reader.compare(found, self._checked)
-        error = total_error([*self.finest.values(), ErrorPart(difference.error, difference.signal)])
-        return error, difference.changed
+        return total_error(self._with_finest(difference, trial.settings)), difference.changed
+
+    def _with_finest(self, difference: Difference, settings: SimulationSettings) -> list[ErrorPart]:
+        """Return the errors of settings: the difference from the finest ones, and the errors of the finest ones.
+
+        Fewer rays per bin, or no diffuse light, have errors of the same sign as the finest rays: these add up linearly.
+        """
+        finest, error = dict(self.finest), difference.error
+        has_finest_rays = "diffuse-diffuse" in settings.paths and settings.nodes == self._estimate.settings.nodes
+        if "nodes" in finest and not has_finest_rays:
+            error += finest.pop("nodes").error
+        return [*finest.values(), ErrorPart(error, difference.signal)]
 
     def _errors_of(self, axis: Sequence[Option]) -> Iterator[tuple[Option, Difference]]:
         """Yield the change of the reading by each option of an axis, with the finest options of the others."""

@@ -23,6 +23,7 @@ from gpuvision.accuracy.plan import PlanError
 from gpuvision.host import Device
 from gpuvision.profiling.plan_outcomes import Outcome, run_jobs
 from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.simulated import require_light
 from gpuvision.simulation.scene.material import Material
@@ -125,8 +126,9 @@ def random_sensor(rng: np.random.Generator, name: str) -> Sensor:
     """Return a sensor of the package with joined samples and fewer bins, and a sheet and a blur of another size."""
     sensor = Sensor.load(name)
     light, readout = require_light(sensor), sensor.readout
-    assert sensor.frame is not None  # the package's sensors have one
-    axes: Any = readout.axes  # type: ignore[union-attr]
+    assert sensor.frame is not None  # the package's sensors have one, and one of these readouts
+    assert isinstance(readout, PsdReadout | LineReadout)
+    axes: Any = readout.axes
     wide = dataclasses.replace(
         axes,
         sample_origin=axes.sample_origin + 0.5 * (_WIDTH - 1) * axes.sample_pitch,

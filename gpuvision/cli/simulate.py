@@ -285,7 +285,7 @@ def _check_recordings(tasks: Sequence[SimulationTask], sensor_files: Sequence[st
 
 
 def _names(paths: str | None, *, is_planned: bool = False) -> tuple[str, ...]:
-    """Return the light paths that ``--paths`` names; by default those of a simulation, or all for a plan."""
+    """Return the light paths of ``--paths``; without it the default ones, or for a plan all."""
     from gpuvision.simulation.sensors.readings import PATHS
     from gpuvision.workflows.simulating import DEFAULT_PATHS
 

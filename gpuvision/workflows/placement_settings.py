@@ -132,7 +132,7 @@ class PlacementSettings:
     def _rate(self, camera: PlacementCamera, stages: Mapping[str, float]) -> float:
         """Return the highest frame rate of camera, stages and drives.
 
-        The stages work at the same time, each on another frame. The machine's own rate is possible with its own stages.
+        Each stage works on another frame. With the stages of the machine file, its frame rate is possible.
         """
         timing = camera.sensor.timing(camera.window, exposure=camera.exposure)
         longest = max([self._machine.transfer, *stages.values()])
@@ -190,7 +190,7 @@ class PlacementSettings:
         return tolerance.plant_gain >= self._limits.plant_gain and tolerance.longer_delay >= longer
 
     def _planned(self, machine: Machine, budget: int, wide: PlacementPlan | None = None) -> PlacementPlan | None:
-        """Return the features for a machine, None where they are refused; `wide` are those of a looser release."""
+        """Return the features for a machine, None if they are refused; `wide`: those of a larger release tolerance."""
         if wide is not None and wide.landing is None and _is_precise(wide, machine):
             return wide
         imaging = tracking_imaging(machine)
@@ -285,7 +285,7 @@ def _side(size: float, most: int) -> int:
 
 
 def _changed(machine: Machine, **changes: Any) -> Machine:
-    """Return the machine with changes, and with the default control where they make its own unstable."""
+    """Return the machine with changes; with the default control if the changes make its control unstable."""
     try:
         return replace(machine, **changes)
     except ValueError:
@@ -293,7 +293,7 @@ def _changed(machine: Machine, **changes: Any) -> Machine:
 
 
 def _released(machine: Machine, factor: float) -> Machine:
-    """Return the machine with another tolerance of the release, relative to its own."""
+    """Return the machine with its release tolerance multiplied by a factor."""
     tolerance = machine.tolerance
     looser = replace(tolerance, position=factor * tolerance.position, angle=factor * tolerance.angle)
     return replace(machine, tolerance=looser)

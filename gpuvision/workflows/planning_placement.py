@@ -88,8 +88,8 @@ def plan_placement_settings(
     machine : Machine
         Machine with the release rule "response". `Machine.for_side` turns it to the side of the artwork.
     tolerance : float
-        Largest error of the placement [m], above 0: distance by which it moves the points of the part at the distance
-        ``part_radius`` from the nozzle, root mean square over the points and over placements.
+        Largest error of the placement [m], above 0: distance of a point of the part from its place, root mean square
+        over placements and over points at ``part_radius`` from the nozzle.
     rate : float, optional
         Placements per second under the camera [1/s], without the long move: the mean time must keep up with it.
     latency : float, optional

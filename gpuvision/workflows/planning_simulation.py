@@ -101,9 +101,10 @@ def plan_simulation(
     the readings on the sensor times the derivative dH/du of the height. The error of the finest setting is part of the
     error of every setting. It is estimated from the change by its last refinement; that of the rays per bin of diffuse
     light, which is often the largest, from a further one, as in
-    `gpuvision.workflows.simulation_errors.estimate_errors`. Estimates add up as squares, proven bounds linearly: that
-    of clustered pairs, and that of multi-bounce light, which is left out for a PSD if its bound in the sample is a
-    tenth of the tolerance or less. The mean square error over the profiles is raised by twice its standard error. The
+    `gpuvision.workflows.simulation_errors.estimate_errors`. Estimates add up as squares, except the change by fewer
+    rays and the error of the finest rays, which have the same sign. Proven bounds add up linearly: that of clustered
+    pairs, and that of multi-bounce light, which is left out for a PSD if its bound in the sample is a tenth of the
+    tolerance or less. The mean square error over the profiles is raised by twice its standard error. The
     chosen setting is compared with the finest one on other profiles, with all light computed as the simulation does; a
     setting whose error there exceeds the tolerance, or that reads other lines there, is not chosen. Not covered:
     samples that are flagged as ambiguous, light paths that are not in ``paths`` or not modelled, and edges that no

@@ -28,6 +28,7 @@ _FIRST_ORDER, _SECOND_ORDER = 2.0, 4.0 / 3.0
 # Light beside the line where two surfaces meet converges slowly with the rays per bin: with order 0.6 to 0.9 in a
 # groove with a block (1 to 16 rays per side). Order 0.4 is assumed: 1 / (1 - 2^-0.4).
 SLOW_ORDER = 4.13
+"""Error by the rays per bin over its change by twice the rays along both axes."""
 
 
 class ErrorPart(NamedTuple):

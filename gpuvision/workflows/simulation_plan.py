@@ -64,7 +64,8 @@ class SettingsTrial(NamedTuple):
         Time of a profile, with its share of the preparation [s].
     error : float
         Error of the range [m] by ``change``, ``pairs`` and ``finest``: the sum of bounds, and the root of the sum of
-        squares of estimates.
+        squares of estimates. Without the finest rays per bin, ``change`` and the part of the rays in ``finest`` add up
+        before they are squared.
     change : float
         Root mean square difference of the readings from those of the finest setting, with all pairs [m].
     pairs : float

@@ -29,17 +29,20 @@ def test_a_job_goes_to_its_planner(monkeypatch: pytest.MonkeyPatch) -> None:
     scan: Any = gv.plan(gv.ScanJob(recording=PIECES["recording"], sensor=PIECES["sensor"]), **asked)
     assert scan == ("scan", {"recording": PIECES["recording"], "sensor": PIECES["sensor"], **asked})
     job = gv.LocationJob(image=PIECES["image"], artwork=PIECES["artwork"], scale=2e-5, initial_pose=(1.0, 2.0, 3.0))
-    name, given = gv.plan(job, tolerance=3e-6)  # type: ignore[misc]
+    found: Any = gv.plan(job, tolerance=3e-6)
+    name, given = found
     assert name == "location"
     assert given["initial_pose"] == (1.0, 2.0, 3.0)
     assert (given["tolerance"], given["rate"], given["latency"], given["device"]) == (3e-6, None, None, None)
     placement = gv.PlacementJob(artwork=PIECES["artwork"], target=(1.0, 2.0, 3.0), machine=PIECES["machine"], budget=9)
-    name, given = gv.plan(placement, **asked)  # type: ignore[misc]
+    found = gv.plan(placement, **asked)
+    name, given = found
     assert name == "placement"
     assert (given["target"], given["machine"], given["budget"]) == ((1.0, 2.0, 3.0), PIECES["machine"], 9)
     assert given["rate"] == 50.0
     simulation = gv.SimulationJob(part=PIECES["image"], materials=(), sensor=PIECES["sensor"], paths=("direct",))
-    name, given = gv.plan(simulation, **asked)  # type: ignore[misc]
+    found = gv.plan(simulation, **asked)
+    name, given = found
     assert name == "simulation"
     assert (given["part"], given["paths"], given["rate"]) == (PIECES["image"], ("direct",), 50.0)
 

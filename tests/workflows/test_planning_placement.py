@@ -102,9 +102,9 @@ def test_the_error_of_a_placement_is_that_of_points_of_the_part(rng: np.random.G
         ({"placements": 3}, r"PlacementPlanLimits\.placements is 3, expected"),
     ],
 )
-def test_limits_are_checked(limits: dict[str, float], message: str) -> None:
+def test_limits_are_checked(limits: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        PlacementPlanLimits(**limits)  # type: ignore[arg-type]
+        PlacementPlanLimits(**limits)
 
 
 @pytest.mark.parametrize(
@@ -258,7 +258,7 @@ def test_loops_that_a_small_error_of_the_model_makes_unstable_are_left_out(
     """The Smith predictor of gain 1 tolerates about 0.8 ms more delay at 1 kHz, with gain 0.5 more than 1 ms."""
     monkeypatch.setattr(placement_settings, "_RELEASES", (1.0,))
 
-    def smith_gains(**limits: float) -> list[float]:
+    def smith_gains(**limits: Any) -> list[float]:
         choices = PlacementSettings(
             artwork,
             TARGET,
@@ -268,7 +268,7 @@ def test_loops_that_a_small_error_of_the_model_makes_unstable_are_left_out(
             budget=30,
             times_vision=False,
             device=device,
-            limits=PlacementPlanLimits(**limits),  # type: ignore[arg-type]
+            limits=PlacementPlanLimits(**limits),
         )
         found = list(choices.settings(machine))
         return [each.machine.loop_gain for each in found if each.machine.control.observer == "smith"]

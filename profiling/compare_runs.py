@@ -4,12 +4,14 @@
 reason, the rows that do not agree, and the share of the rows that do. The exit code is 1 if fewer than 90 % agree, or
 if a run is invalid because the machine changed its speed, and 2 if a file is not a run.
 
-Two medians with 95 % confidence intervals of rounds within a run agree if the intervals overlap. The intervals hold the
-spread within a run; the spread between runs (place of the arrays in memory, frequency) comes on top.
+Two ratios agree if their logarithms differ by at most the half-widths of their 95 % confidence intervals, added as
+squares. The intervals hold the spread within a run and the spread between runs, `rounds.BETWEEN_RUNS`. About 95 % of
+the rows of two runs of the same code agree.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -31,7 +33,7 @@ class Change(NamedTuple):
     first, second
         Ratios in the two runs.
     agree
-        Whether the confidence intervals overlap.
+        Whether the ratios differ by no more than their intervals explain.
     """
 
     row: str
@@ -47,8 +49,9 @@ def compare(first: Run, second: Run) -> list[Change]:
     for name in one.keys() & other.keys():
         mine, theirs = one[name].interval, other[name].interval
         if mine is not None and theirs is not None and one[name].form == other[name].form:
-            agree = mine[0] <= theirs[1] and theirs[0] <= mine[1]
-            changes.append(Change(name, one[name].ratio, other[name].ratio, agree))
+            before, after = one[name].ratio, other[name].ratio
+            limit = 0.5 * math.hypot(*(math.log(high / low) for low, high in (mine, theirs)))
+            changes.append(Change(name, before, after, abs(math.log(after / before)) <= limit))
     return sorted(changes)
 
 

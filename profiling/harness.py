@@ -180,7 +180,7 @@ class Row:
     form
         Fastest form of the peer; empty if the peer has one form.
     ratio_low, ratio_high
-        Confidence interval of the ratio, from the spread over the rounds: see `rounds.median_interval`.
+        Confidence interval of the ratio within the run, from the spread over the rounds: see `rounds.median_interval`.
     confidence
         Confidence of the interval: at least 0.95, less for a peer so slow that it took part in fewer than 6 rounds.
         See `interval`.
@@ -228,7 +228,7 @@ class Row:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """Confidence interval of the ratio; None if its confidence is below 95 %."""
+        """Confidence interval of the ratio, with the spread between runs; None if its confidence is below 95 %."""
         return stated_interval(vars(self))
 
     def to_dict(self) -> dict[str, Any]:

@@ -74,7 +74,7 @@ def test_what_was_asked_for_is_measured_and_shown(asked: dict[str, Any], tmp_pat
         "(11.7 ms)",
         "numpy",
         "45.6 µs",
-        "3.14 ±5%",
+        "3.14 ±10%",
         "(words)",
         "1.5e-09",
         "50 %",

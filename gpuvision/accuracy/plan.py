@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Generic, NamedTuple
 
 from gpuvision.accuracy.trial import (
@@ -45,6 +45,26 @@ class PlanError(GpuVisionError):
 
 
 @dataclass(frozen=True, kw_only=True)
+class AccuracyLimits:
+    """Limits of a plan of a job by speed and accuracy.
+
+    Attributes
+    ----------
+    margin : float
+        Least ratio of the tolerance to the predicted error, at least 1. Default 1.1.
+    rate_margin : float
+        Least ratio of the time that rate and latency allow to the time of a unit of work, at least 1. Default 1.25.
+    """
+
+    margin: float = 1.1
+    rate_margin: float = 1.25
+
+    def __post_init__(self) -> None:
+        for name in ("margin", "rate_margin"):
+            finite(getattr(self, name), f"{type(self).__name__}.{name}", minimum=1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class AccuracyPlan(abc.ABC, Generic[AnyTrial]):
     """Plan of a job by speed and accuracy. ``str(plan)`` states it in one line.
 
@@ -56,6 +76,8 @@ class AccuracyPlan(abc.ABC, Generic[AnyTrial]):
         All settings that were tried, fastest first.
     tolerance : float
         Asked error [m].
+    limits : AccuracyLimits
+        Limits of the plan.
     """
 
     kind: ClassVar[str]
@@ -64,11 +86,7 @@ class AccuracyPlan(abc.ABC, Generic[AnyTrial]):
     chosen: AnyTrial
     trials: tuple[AnyTrial, ...]
     tolerance: float
-
-    @property
-    @abc.abstractmethod
-    def margin(self) -> float:
-        """Least ratio of the tolerance to the predicted error."""
+    limits: AccuracyLimits
 
     @property
     @abc.abstractmethod
@@ -105,10 +123,10 @@ class AccuracyPlan(abc.ABC, Generic[AnyTrial]):
         if self.faster is None:
             parts.append(f"no usable {self.kind} is faster")
         else:
-            wanted = at_least(self.margin * self.faster.error)
+            wanted = at_least(self.limits.margin * self.faster.error)
             parts.append(f"a tolerance of {wanted} would allow {self._relative(self.faster)}")
         if self.finer is not None:
-            parts.append(f"{at_least(self.margin * self.finer.error)} takes {self._relative(self.finer)}")
+            parts.append(f"{at_least(self.limits.margin * self.finer.error)} takes {self._relative(self.finer)}")
         return parts
 
     def _relative(self, other: AnyTrial) -> str:
@@ -125,6 +143,7 @@ class AccuracyPlan(abc.ABC, Generic[AnyTrial]):
             "faster": None if self.faster is None else self.faster.to_dict(),
             "finer": None if self.finer is None else self.finer.to_dict(),
             "trials": [each.to_dict() for each in self.trials],
+            "limits": asdict(self.limits),
         }
 
 

@@ -21,14 +21,16 @@ from gpuvision.cli.arguments import (
     quantities,
     reject_unused,
 )
-from gpuvision.cli.locate_plan import claim_location_plan, make_location_plan, write_location_plan
+from gpuvision.cli.plan_output import claim_plan, planned_tolerance, planning, report_plan
 from gpuvision.cli.pose_output import PoseFolder, check_image, claim_outputs, initial_pose_of, report_pose
 from gpuvision.cli.select import Side
 
 if TYPE_CHECKING:
+    from gpuvision.host.outputs import Outputs
     from gpuvision.matching.artwork.artwork import Artwork
     from gpuvision.matching.board.located_board import LocatedBoard
     from gpuvision.matching.features.feature_set import FeatureSet
+    from gpuvision.workflows.location_plan import LocationPlan
 
 _BUDGET, _BLUR_PX, _ETCH_BIAS = 60, 1.0, "10um"
 _IN_COMMENTS = str.maketrans("()\n\r", "[]  ")  # characters that would end a comment of G-code
@@ -196,15 +198,19 @@ def locate(
     from gpuvision.host.image_files import read_image
     from gpuvision.plots.board import draw_located_board
     from gpuvision.workflows.locating_board import locate_board
+    from gpuvision.workflows.location_plan import FEATURES_FILE
+    from gpuvision.workflows.planning_location import plan_location
 
     check_image(image)
-    if tolerance is None:
+    largest = planned_tolerance(tolerance, "the pose, such as 2um", only_plan=only_plan)
+    if largest is None:
         reject_unused("without --tolerance", rate=rate)
     else:
         reject_unused("with --tolerance, which chooses the features", features=features, budget=budget)
     if only_plan:
         reject_unused("with --plan", gcode=gcode)
-        outputs = claim_location_plan(tolerance, (image, board, camera), out, as_json, overwrite=overwrite)
+        inputs = [each for each in (image, board, camera) if each is not None]
+        outputs = claim_plan(out, as_json, inputs, overwrite=overwrite, more=(FEATURES_FILE,))
     else:
         outputs = claim_outputs("locate", (image, board, camera, features), out, as_json, overwrite)
         outputs.claim(gcode)
@@ -230,10 +236,11 @@ def locate(
         "copper": copper.value,
         "device": None if device is None else Device.named(device),
     }
-    if tolerance is not None:
-        plan = make_location_plan(image, picture, artwork, tolerance, rate, options)
+    if largest is not None:
+        with planning(image.name) as progress:
+            plan = plan_location(picture, artwork, tolerance=largest, rate=rate, progress=progress, **options)
         if only_plan:
-            write_location_plan(plan, image, out, as_json, outputs, overwrite=overwrite)
+            _write_plan(plan, image.name, out, as_json, outputs, overwrite=overwrite)
             return
         echo(f"plan: {plan}", err=prints_report(as_json))
         chosen = plan.chosen.features
@@ -245,6 +252,19 @@ def locate(
     if gcode is not None and machine is not None:
         comment = f"gpuvision locate {image.name}".translate(_IN_COMMENTS)
         outputs.write_text(gcode, _gcode(located, machine, gcode_dialect, comment))
+
+
+def _write_plan(
+    plan: LocationPlan, title: str, out: Path | None, as_json: Path | None, outputs: Outputs, *, overwrite: bool
+) -> None:
+    """Print a plan, and write its picture, its features and its report."""
+    from gpuvision.workflows.location_plan import FEATURES_FILE
+
+    if out is not None:
+        plan.write(out, title=title, overwrite=overwrite)
+    report_plan(plan, out, as_json, outputs)
+    if out is not None:
+        echo(f"next: give --features {out / FEATURES_FILE} instead of --tolerance", err=prints_report(as_json))
 
 
 def _features(file: Path, budget: int | None, side: Side | None) -> FeatureSet:

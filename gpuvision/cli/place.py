@@ -21,18 +21,21 @@ from gpuvision.cli.arguments import (
     reject_unused,
     write_report,
 )
-from gpuvision.cli.place_plan import claim_placement_plan, make_placement_plan, write_placement_plan
+from gpuvision.cli.plan_output import claim_plan, planned_tolerance, planning, report_plan
 from gpuvision.cli.select import Side
 
 if TYPE_CHECKING:
+    from gpuvision.host.outputs import Outputs
     from gpuvision.matching.artwork.artwork import Artwork
     from gpuvision.workflows.placement_cell import Repeatability
+    from gpuvision.workflows.placement_plan import PlacementSettingsPlan
     from gpuvision.workflows.placing import PlacementResult
 
 _BUDGET = 60  # number of rulers
 _COUNT = 20  # number of placements
 _LARGEST_BOARD = 1.0  # largest coordinate on a board [m] (chosen: panels are smaller)
 _FILES = ("report.json", "placements.png", "features.png", "repeatability.png")
+_MACHINE_FILE = "machine.toml"
 
 Gerbers = Annotated[
     Path,
@@ -134,16 +137,18 @@ def place(
     from gpuvision.servoing.placement.plan import placement_imaging
     from gpuvision.workflows.placement_cell import measure_repeatability
     from gpuvision.workflows.placing import simulate_placements
+    from gpuvision.workflows.planning_placement import plan_placement_settings
 
     target = quantities(at, "--at", "m,m,rad")
     if max(abs(target[0]), abs(target[1])) > _LARGEST_BOARD:
         raise ValueError(f"--at is {at!r}, expected at most {_LARGEST_BOARD:g} m; numbers need units: 9mm,9mm,90deg")
-    if tolerance is None:
+    largest = planned_tolerance(tolerance, "the placement, such as 5um", only_plan=only_plan)
+    if largest is None:
         reject_unused("without --tolerance", rate=rate, part_radius=part_radius, time_vision=time_vision)
     inputs: list[str | Path] = [gerbers, machine, *named_files(machine)]
     if only_plan:
         reject_unused("with --plan", count=count, seed=seed)
-        outputs = claim_placement_plan(tolerance, inputs, out, as_json, overwrite=overwrite)
+        outputs = claim_plan(out, as_json, inputs, overwrite=overwrite, more=(_MACHINE_FILE,))
     else:
         outputs = Outputs("place", inputs=inputs, overwrite=overwrite)
         outputs.claim(as_json)
@@ -154,11 +159,22 @@ def place(
     for each in artwork.warnings:
         echo(f"warning: {each}", err=True)
     chosen = None if device is None else Device.named(device)
-    if tolerance is not None:
-        options = {"rate": rate, "budget": budget, "times_vision": time_vision, "device": chosen}
-        plan = make_placement_plan(artwork, target, described, tolerance, part_radius, options)
+    if largest is not None:
+        with planning(f"placements at {at}") as progress:
+            plan = plan_placement_settings(
+                artwork,
+                target,
+                described,
+                tolerance=largest,
+                rate=rate,
+                part_radius=None if part_radius is None else quantities(part_radius, "--part-radius", "m")[0],
+                budget=budget,
+                times_vision=time_vision,
+                device=chosen,
+                progress=progress,
+            )
         if only_plan:
-            write_placement_plan(plan, machine, out, as_json, outputs, overwrite=overwrite)
+            _write_plan(plan, machine, out, as_json, outputs, overwrite=overwrite)
             return
         echo(f"plan: {plan}", err=prints_report(as_json))
         described, budget = plan.chosen.machine, plan.chosen.budget
@@ -181,6 +197,20 @@ def place(
         write_text_atomic(inside / "report.json", report_text(json_tree(report)))
         _draw(inside, artwork, result, resting)
     echo(f"{result.summary()}\nlook at {out / 'placements.png'} and {out / 'report.json'}", err=prints_report(as_json))
+
+
+def _write_plan(
+    plan: PlacementSettingsPlan, machine: str, out: Path, as_json: Path | None, outputs: Outputs, *, overwrite: bool
+) -> None:
+    """Print a plan, and write its picture, the machine file with its settings, and its report."""
+    from gpuvision.formats.machine_file import write_settings
+
+    chosen = plan.chosen
+    more = {_MACHINE_FILE: lambda path: write_settings(machine, chosen.machine, path)}
+    plan.write(out, title=f"{Path(machine).stem}, {chosen.rulers} rulers", overwrite=overwrite, more=more)
+    report_plan(plan, out, as_json, outputs)
+    given = f"--machine {out / _MACHINE_FILE} --budget {chosen.budget}"
+    echo(f"next: give {given} instead of --machine and --tolerance", err=prints_report(as_json))
 
 
 def _draw(folder: Path, artwork: Artwork, result: PlacementResult, resting: Repeatability) -> None:

@@ -1,17 +1,44 @@
-"""Output of ``--plan``: the table of the settings that were tried, the picture of the plan, and its report."""
+"""Options and output of plans: ``--tolerance``, ``--plan``, the table of the tried settings, picture and report."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpuvision.cli.arguments import echo, prints_report, write_report
+from gpuvision.cli.arguments import echo, prints_report, progress_bar, quantities, write_report
 
 if TYPE_CHECKING:
     from gpuvision.accuracy.plan import AccuracyPlan
     from gpuvision.host.outputs import Outputs
+
+
+def planned_tolerance(text: str | None, error_of: str, *, only_plan: bool) -> float | None:
+    """Return the length of ``--tolerance`` [m]; None without the option.
+
+    Parameters
+    ----------
+    text : str or None
+        Value of the option.
+    error_of : str
+        Result whose error it limits, with an example, for the message: "the pose, such as 2um".
+    only_plan : bool
+        Whether ``--plan`` is given, which needs a tolerance.
+
+    Raises
+    ------
+    ValueError
+        ``--plan`` has no tolerance, or the tolerance is no length above 0.
+    """
+    if text is None:
+        if only_plan:
+            raise ValueError(f"--plan needs --tolerance, the largest error of {error_of}")
+        return None
+    (found,) = quantities(text, "--tolerance", "m")
+    if found <= 0.0:
+        raise ValueError(f"--tolerance is {text!r}, expected a length above 0")
+    return found
 
 
 def claim_plan(
@@ -43,12 +70,13 @@ def claim_plan(
 
 
 @contextmanager
-def show_refused() -> Iterator[None]:
-    """Print the settings that were tried if a plan is refused."""
+def planning(description: str) -> Iterator[Callable[[int, int | None], object]]:
+    """Show a progress bar of a plan, as `progress_bar`; print the settings that were tried if the plan is refused."""
     from gpuvision.accuracy.plan import PlanError
 
     try:
-        yield
+        with progress_bar(f"planning {description}") as progress:
+            yield progress
     except PlanError as refusal:
         echo(refusal.table(), err=True)
         raise

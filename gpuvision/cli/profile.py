@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -28,88 +28,107 @@ if TYPE_CHECKING:
 _SECONDS, _QUICK_SECONDS = 2.0, 0.3  # longest time to measure a case [s]
 _MINUTES, _QUICK_MINUTES = 20.0, 3.0
 _MEMORY_MIB = 256.0
+# Options that have an effect with an option that measures something else, or nothing; --overwrite always has.
+_TAKEN = {
+    "offline": ("json", "one_build"),
+    "from": ("plots", "html"),
+    "contract": ("device", "json"),
+    "growth": ("device", "json", "plots", "memory_mib"),
+}
 _NO_PLOTS = (
     "no plots: no series over size or tolerance, no declared operations; try light_clustering, reflections or psd"
 )
 
 
+Operations = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="OPERATION", help="Operations to measure, such as psd or line. Default: all."),
+]
+Seconds = Annotated[
+    float | None,
+    typer.Option(help="Longest time to measure each case [s]. Default: 2, with --quick 0.3.", min=0.01),
+]
+Minutes = Annotated[
+    float | None,
+    typer.Option(
+        help="Approximate time of the whole run [min]; cases are measured for a shorter time if the run would take "
+        "longer. Default: 20, with --quick 3.",
+        min=0.01,
+    ),
+]
+Quick = Annotated[bool, typer.Option("--quick", help="Measure only one case of each operation, on the default device.")]
+PlotFolder = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        parser=named_path,
+        help="Folder for plots: a roofline, time and error over the amount of work and over the tolerance.",
+    ),
+]
+PageFolder = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        parser=named_path,
+        help="Folder for profile.html: a page with machine, peers, figures and all rows, which needs no network.",
+    ),
+]
+StoredRun = Annotated[
+    Path | None,
+    typer.Option(
+        "--from",
+        metavar="FILE",
+        parser=named_path,
+        help="Make the page or the plots from a file of --json instead of measuring.",
+    ),
+]
+Targets = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="TARGET",
+        help="Compile the kernels for this GPU (sm_70, sm_90, gfx90a, gfx1100), which need not be present, instead "
+        "of measuring; repeat the option for several. OPERATION then names kernel files, such as line or pose.",
+    ),
+]
+OneBuild = Annotated[
+    bool, typer.Option("--one-build", help="With --offline: compile only the first build of each kernel file.")
+]
+Growth = Annotated[
+    bool,
+    typer.Option(
+        "--growth",
+        help="Measure the time against the size instead of against peers, from one item to --memory-mib.",
+    ),
+]
+MemoryMib = Annotated[
+    float | None,
+    typer.Option(help="With --growth: largest memory of inputs and outputs [MiB]. Default: 256.", min=0.001),
+]
+Contract = Annotated[
+    bool,
+    typer.Option(
+        "--contract",
+        help="Compare the results of all devices with float64 and with each other, by the stated limits, instead "
+        "of measuring times.",
+    ),
+]
+
+
 def profile(
-    operations: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="OPERATION", help="Operations to measure, such as psd or line. Default: all."),
-    ] = None,
+    operations: Operations = None,
     device: DeviceLabels = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(help="Longest time to measure each case [s]. Default: 2, with --quick 0.3.", min=0.01),
-    ] = None,
-    minutes: Annotated[
-        float | None,
-        typer.Option(
-            help="Approximate time of the whole run [min]; cases are measured for a shorter time if the run would take "
-            "longer. Default: 20, with --quick 3.",
-            min=0.01,
-        ),
-    ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Measure only one case of each operation, on the default device.")
-    ] = False,
+    seconds: Seconds = None,
+    minutes: Minutes = None,
+    quick: Quick = False,
     as_json: ReportFile = None,
-    plots: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            parser=named_path,
-            help="Folder for plots: a roofline, time and error over the amount of work and over the tolerance.",
-        ),
-    ] = None,
-    html: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            parser=named_path,
-            help="Folder for profile.html: a page with machine, peers, figures and all rows, which needs no network.",
-        ),
-    ] = None,
-    stored: Annotated[
-        Path | None,
-        typer.Option(
-            "--from",
-            metavar="FILE",
-            parser=named_path,
-            help="Make the page or the plots from a file of --json instead of measuring.",
-        ),
-    ] = None,
-    offline: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="TARGET",
-            help="Compile the kernels for this GPU (sm_70, sm_90, gfx90a, gfx1100), which need not be present, instead "
-            "of measuring; repeat the option for several. OPERATION then names kernel files, such as line or pose.",
-        ),
-    ] = None,
-    one_build: Annotated[
-        bool, typer.Option("--one-build", help="With --offline: compile only the first build of each kernel file.")
-    ] = False,
-    growth: Annotated[
-        bool,
-        typer.Option(
-            "--growth",
-            help="Measure the time against the size instead of against peers, from one item to --memory-mib.",
-        ),
-    ] = False,
-    memory_mib: Annotated[
-        float | None,
-        typer.Option(help="With --growth: largest memory of inputs and outputs [MiB]. Default: 256.", min=0.001),
-    ] = None,
-    contract: Annotated[
-        bool,
-        typer.Option(
-            "--contract",
-            help="Compare the results of all devices with float64 and with each other, by the stated limits, instead "
-            "of measuring times.",
-        ),
-    ] = False,
+    plots: PlotFolder = None,
+    html: PageFolder = None,
+    stored: StoredRun = None,
+    offline: Targets = None,
+    one_build: OneBuild = False,
+    growth: Growth = False,
+    memory_mib: MemoryMib = None,
+    contract: Contract = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure operations against their peers: NumPy, Numba, OpenCV.
@@ -136,54 +155,63 @@ def profile(
     compile, calls a function without a body, spills more registers than the limit, or takes more than 5 KiB of stack
     or 32 KiB of local memory.
     """
+    given = {"device": device or None, "seconds": seconds, "minutes": minutes, "quick": quick, "json": as_json}
+    given |= {"plots": plots, "html": html, "one_build": one_build, "memory_mib": memory_mib}
+    modes = {"offline": offline or None, "from": stored, "contract": contract, "growth": growth}
+    _reject_unused(modes, given)
+    names, labels, pictures = operations or (), device or (), _Pictures(plots, html, overwrite)
     if offline:
         from gpuvision.cli.profile_offline import profile_offline
 
-        measures = {"device": device or None, "seconds": seconds, "minutes": minutes, "quick": quick, "plots": plots}
-        measures |= {"html": html, "growth": growth, "memory_mib": memory_mib, "contract": contract, "from": stored}
-        reject_unused("with --offline", **measures)
-        profile_offline(offline, operations or (), as_json, one_build=one_build, overwrite=overwrite)
-        return
-    reject_unused("without --offline", one_build=one_build)
-    pictures = _Pictures(plots, html, overwrite)
-    if stored is not None:
-        settings = {"device": device or None, "seconds": seconds, "minutes": minutes, "quick": quick, "json": as_json}
-        reject_unused("with --from", **settings, growth=growth, memory_mib=memory_mib, contract=contract)
-        if operations:
+        profile_offline(offline, names, as_json, one_build=one_build, overwrite=overwrite)
+    elif stored is not None:
+        if names:
             raise ValueError("OPERATION has no effect with --from; leave it out")
         pictures.write_stored(stored)
-        return
-    if importlib.util.find_spec("numba") is None:
+    elif importlib.util.find_spec("numba") is None:
         raise GpuVisionError("the peer numba is missing; install it: pip install 'gpuvision[profile]'")
-    if contract:
+    elif contract:
         from gpuvision.cli.profile_contract import profile_contract
 
-        measures = {"seconds": seconds, "minutes": minutes, "quick": quick, "plots": plots, "html": html}
-        reject_unused("with --contract", **measures, growth=growth, memory_mib=memory_mib)
-        profile_contract(operations or (), device or (), as_json, overwrite=overwrite)
-        return
-    if growth:
+        profile_contract(names, labels, as_json, overwrite=overwrite)
+    elif growth:
         from gpuvision.cli.profile_growth import profile_growth
 
-        reject_unused("with --growth", seconds=seconds, minutes=minutes, quick=quick, html=html)
-        profile_growth(operations or (), device or (), memory_mib or _MEMORY_MIB, as_json, plots, overwrite=overwrite)
+        profile_growth(names, labels, memory_mib or _MEMORY_MIB, as_json, plots, overwrite=overwrite)
+    else:
+        seconds = seconds or (_QUICK_SECONDS if quick else _SECONDS)
+        minutes = minutes or (_QUICK_MINUTES if quick else _MINUTES)
+        _measure(names, labels, pictures, as_json, seconds=seconds, minutes=minutes, quick=quick)
+
+
+def _reject_unused(modes: Mapping[str, object], given: Mapping[str, object]) -> None:
+    """Refuse the options that the mode of the command does not take.
+
+    Parameters
+    ----------
+    modes : mapping of str to object
+        Values of the options that choose a mode, by name; the first one that is given counts.
+    given : mapping of str to object
+        Values of the other options.
+
+    Raises
+    ------
+    ValueError
+        An option has no effect.
+    """
+    mode = next((name for name, value in modes.items() if value not in (None, False)), None)
+    if mode != "offline":
+        reject_unused("without --offline", one_build=given["one_build"])
+    if mode is None:
+        reject_unused("without --growth", memory_mib=given["memory_mib"])
         return
-    reject_unused("without --growth", memory_mib=memory_mib)
-    default_seconds, default_minutes = (_QUICK_SECONDS, _QUICK_MINUTES) if quick else (_SECONDS, _MINUTES)
-    _measure(
-        operations or (),
-        device,
-        pictures,
-        as_json,
-        seconds=seconds or default_seconds,
-        minutes=minutes or default_minutes,
-        quick=quick,
-    )
+    unused = {name: value for name, value in {**given, **modes}.items() if name not in (mode, *_TAKEN[mode])}
+    reject_unused(f"with --{mode}", **unused)
 
 
 def _measure(
     operations: Sequence[str],
-    labels: Sequence[str] | None,
+    labels: Sequence[str],
     pictures: _Pictures,
     as_json: Path | None,
     *,

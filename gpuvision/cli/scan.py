@@ -21,7 +21,7 @@ from gpuvision.cli.arguments import (
     reject_unused,
     write_report,
 )
-from gpuvision.cli.scan_plan import make_plan, write_plan
+from gpuvision.cli.plan_output import claim_plan, planned_tolerance, planning, report_plan
 
 if TYPE_CHECKING:
     from gpuvision.host.outputs import Outputs
@@ -166,6 +166,7 @@ def scan(
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
+    from gpuvision.workflows.planning_scan import plan_scan
     from gpuvision.workflows.scanning import scan as run
 
     described = Sensor.load(sensor, encoder=encoder)
@@ -184,6 +185,8 @@ def scan(
         )
         _write_preview(recording, described, out, inputs, device, overwrite)
         return
+    largest = planned_tolerance(tolerance, "the heights, such as 20um", only_plan=only_plan)
+    chosen_formats = [each.value for each in formats or ()]
     if only_plan:
         reject_unused(
             "with --plan",
@@ -192,17 +195,21 @@ def scan(
             format=formats,
             ply=None if ply is PlyPoints.organised else ply,
         )
-        write_plan(recording, described, tolerance, rate, device, out, as_json, inputs, overwrite=overwrite)
-        return
-    chosen_formats = [each.value for each in formats or ()]
-    outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
-    _claim(outputs, out, chosen_formats, as_json)
+        outputs = claim_plan(out, as_json, inputs, overwrite=overwrite)
+    else:
+        outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
+        _claim(outputs, out, chosen_formats, as_json)
     chosen = None if device is None else Device.named(device)
     plan = None
     asked: Literal["single", "double"] | None = None if precision is None else precision.value
-    if tolerance is not None:
+    if largest is not None:
         reject_unused("with --tolerance, which chooses it", precision=precision)
-        plan = make_plan(recording, described, tolerance, rate, chosen)
+        with planning(recording.name) as progress:
+            plan = plan_scan(recording, described, tolerance=largest, rate=rate, device=chosen, progress=progress)
+        if only_plan:
+            plan.write(out, overwrite=overwrite)
+            report_plan(plan, out, as_json, outputs)
+            return
         described = plan.sensor
     with progress_bar(f"scanning {recording.name}") as progress:
         done = run(

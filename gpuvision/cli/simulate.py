@@ -20,7 +20,8 @@ from gpuvision.cli.arguments import (
     reject_unused,
     write_report,
 )
-from gpuvision.cli.simulate_plan import check_plan_options, planned_task, write_simulation_plan
+from gpuvision.cli.plan_output import claim_plan, planned_tolerance
+from gpuvision.cli.simulate_plan import WHICH, planned_tasks, write_simulation_plan
 
 if TYPE_CHECKING:
     from gpuvision.sensor.sensor import Sensor
@@ -185,51 +186,38 @@ def simulate(
     from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
 
+    largest = planned_tolerance(tolerance, "the simulated range, such as 5um", only_plan=only_plan)
+    names = _names(paths, is_planned=largest is not None)
     reject_unused("with --materials", albedo=None if materials is None else albedo)
     reject_unused("without --second", rule=rule if second is None else None)
     reject_unused("with --no-noise", seed=None if noise else seed)
-    check_plan_options(
-        tolerance,
-        rate,
-        only_plan=only_plan,
-        mask=None if mask == "none" else mask,
-        second=second,
-        limit=limit,
-        seed=seed,
-        no_noise=not noise,
-        recording=recording,
-        scheduler=scheduler,
-    )
-    names = _names(paths, is_planned=tolerance is not None)
-    if "multi-bounce" not in names:
-        reject_unused("without multi-bounce in --paths", patch_size=patch_size)
-    described = Sensor.load(sensor)
-    second_sensor = None if second is None else Sensor.load(second)
-    read = [each for each in (part, sensor, second, materials, mask) if each is not None]
-    read += [*described.files, *(() if second_sensor is None else second_sensor.files)]
-    chosen = None if device is None else Device.named(device)
-    light = {"paths": names, "patch_size": patch_size}
+    reject_unused("without --tolerance", rate=rate if largest is None else None)
+    reject_unused("without multi-bounce in --paths", patch_size=None if "multi-bounce" in names else patch_size)
     if only_plan:
-        assert tolerance is not None  # checked above
-        task, _ = _prepare(*_load_part(part, unit, materials, albedo, described), described, None, light, profiles)
-        write_simulation_plan(task, part.name, tolerance, rate, chosen, out, as_json, read, overwrite=overwrite)
-        return
-    outputs = Outputs("simulate", inputs=read, overwrite=overwrite)
+        more = {"limit": limit, "seed": seed, "no_noise": not noise, "recording": recording, "scheduler": scheduler}
+        reject_unused("with --plan", mask=None if mask == "none" else mask, second=second, **more)
     described_by = [sensor] if second is None else [sensor, second]
-    outputs.claim_folder(out, _files(len(described_by), has_mask=mask == "best", has_recording=recording))
-    outputs.claim(as_json)
+    sensors = [Sensor.load(each) for each in described_by]
+    read = [part, *described_by, *(each for each in (materials, mask) if each is not None)]
+    read += [file for each in sensors for file in each.files]
+    chosen = None if device is None else Device.named(device)
+    if only_plan:
+        outputs = claim_plan(out, as_json, read, overwrite=overwrite)
+    else:
+        outputs = Outputs("simulate", inputs=read, overwrite=overwrite)
+        outputs.claim_folder(out, _files(len(sensors), has_mask=mask == "best", has_recording=recording))
+        outputs.claim(as_json)
     before = _mask(mask)
-    loaded = _load_part(part, unit, materials, albedo, described)
-    task, other = _prepare(*loaded, described, second_sensor, light, profiles)
+    loaded = _load_part(part, unit, materials, albedo, sensors[0])
+    tasks = _prepare(*loaded, sensors, profiles, paths=names, patch_size=patch_size)
     if recording:
-        _check_recordings([task] if other is None else [task, other], described_by)
-    lines = []
-    if tolerance is not None:
-        task, line = planned_task(task, part.name, tolerance, rate, chosen)
-        lines.append(line)
-        if other is not None:
-            other, line = planned_task(other, f"{part.name}, second sensor", tolerance, rate, chosen)
-            lines.append(line)
+        _check_recordings(tasks, described_by)
+    lines: list[str] = []
+    if largest is not None:
+        if only_plan:
+            write_simulation_plan(tasks[0], part.name, largest, rate, chosen, out, as_json, outputs, overwrite)
+            return
+        tasks, lines = planned_tasks(tasks, part.name, largest, rate, chosen)
     made: dict[str, Any] = {
         "mask": before,
         "seed": (1 if seed is None else seed) if noise else None,
@@ -237,15 +225,13 @@ def simulate(
         "device": chosen,
         "scheduler": scheduler,
     }
-    found, summary = _run(task, other, rule or Rule.stronger, out, made, f"simulating {part.name}", read, overwrite)
-    if recording:
-        summary += f"\n{_write_recordings(found, described_by, out, made, read, overwrite)}"
-    write_report(as_json, found[0].report(), outputs)
+    found, summary = _run(tasks, rule or Rule.stronger, out, made, f"simulating {part.name}", read, overwrite)
     lines.append(summary)
-    echo(
-        "\n".join(lines) + f"\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}",
-        err=prints_report(as_json),
-    )
+    if recording:
+        lines += _write_recordings(found, described_by, out, made, read, overwrite)
+    write_report(as_json, found[0].report(), outputs)
+    lines.append(f"look at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}")
+    echo("\n".join(lines), err=prints_report(as_json))
 
 
 def _files(sensors: int, *, has_mask: bool, has_recording: bool) -> tuple[str, ...]:
@@ -262,18 +248,16 @@ def _files(sensors: int, *, has_mask: bool, has_recording: bool) -> tuple[str, .
 def _prepare(
     scene: Scene,
     materials: tuple[Material, ...],
-    sensor: Sensor,
-    second: Sensor | None,
-    light: dict[str, Any],
+    sensors: Sequence[Sensor],
     profiles: int | None,
-) -> tuple[SimulationTask, SimulationTask | None]:
+    **light: Any,
+) -> list[SimulationTask]:
     """Prepare the simulation of a sensor, and of a second one with the same transports."""
     from gpuvision.workflows.simulating import prepare_simulation
 
-    task = prepare_simulation(scene, materials, sensor, profiles=profiles, **light)
-    if second is None:
-        return task, None
-    return task, prepare_simulation(scene, materials, second, transports=task.transports, **light)
+    first = prepare_simulation(scene, materials, sensors[0], profiles=profiles, **light)
+    others = [prepare_simulation(scene, materials, each, transports=first.transports, **light) for each in sensors[1:]]
+    return [first, *others]
 
 
 def _check_recordings(tasks: Sequence[SimulationTask], sensor_files: Sequence[str]) -> None:
@@ -323,8 +307,7 @@ def _mask(choice: str) -> Mask | str | None:
 
 
 def _run(
-    task: SimulationTask,
-    other: SimulationTask | None,
+    tasks: Sequence[SimulationTask],
     rule: Rule,
     out: Path,
     made: dict[str, Any],
@@ -337,12 +320,12 @@ def _run(
     from gpuvision.workflows.sensor_pair import SensorPair
     from gpuvision.workflows.simulating import simulate as run
 
-    with progress_bar(description) as progress:
-        done = [run(task, out, progress=progress, **made)]
+    done = []
+    for number, task in enumerate(tasks):
+        with progress_bar(f"{description}{WHICH[number]}") as progress:
+            done.append(run(task, out, progress=progress, **made))
     summary, scale = done[0].summary(), None
-    if other is not None:
-        with progress_bar(f"{description}, second sensor") as progress:
-            done.append(run(other, out, progress=progress, **made))
+    if len(done) > 1:
         pair = SensorPair.fuse(done[0], done[1], SensorFusion(rule=rule.value))
         pair.write(out, inputs=inputs, overwrite=overwrite)
         summary += f"\n{pair.summary()}"
@@ -358,8 +341,8 @@ def _write_recordings(
     made: dict[str, Any],
     inputs: Sequence[str | Path],
     overwrite: bool,
-) -> str:
-    """Write the recording of each sensor, and return lines with the commands that scan them."""
+) -> list[str]:
+    """Write the recording of each sensor, and return the commands that scan them."""
     from gpuvision.workflows.simulated_recording import RECORDING_FILES, write_recording
 
     lines = []
@@ -370,4 +353,4 @@ def _write_recordings(
         write_recording(each.task, folder, file, light=out, inputs=inputs, overwrite=overwrite, **given)
         recording, sensor = (folder / name for name in RECORDING_FILES)
         lines.append(f"next: gpuvision scan {recording} --sensor {sensor} --out {folder / 'scan'}")
-    return "\n".join(lines)
+    return lines

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.accuracy.plan import AccuracyPlan, TimeLimit
+from gpuvision.accuracy.plan import AccuracyLimits, AccuracyPlan, TimeLimit
 from gpuvision.accuracy.trial import micrometres, millionths
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.plan import PlacementPlan
@@ -27,13 +27,11 @@ loop: vision and servo in runs without images; images: vision and servo in rende
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlacementPlanLimits:
-    """Limits of `gpuvision.workflows.planning_placement.plan_placement_settings`.
+class PlacementPlanLimits(AccuracyLimits):
+    """Limits of `gpuvision.workflows.planning_placement.plan_placement_settings`, with those of `AccuracyLimits`.
 
     Attributes
     ----------
-    margin : float
-        Least ratio of the tolerance to the predicted error, at least 1. Default 1.1.
     rate_margin : float
         Least ratio of the time that rate and latency allow to the mean time of a placement, at least 1. Default 1.1.
     plant_gain : float
@@ -46,7 +44,6 @@ class PlacementPlanLimits:
         Number of placements with rendered images that check a setting, 4 or more. Default 24.
     """
 
-    margin: float = 1.1
     rate_margin: float = 1.1
     plant_gain: float = 1.25
     longer_delay: float = 0.5
@@ -54,8 +51,7 @@ class PlacementPlanLimits:
     placements: int = 24
 
     def __post_init__(self) -> None:
-        finite(self.margin, "PlacementPlanLimits.margin", minimum=1.0)
-        finite(self.rate_margin, "PlacementPlanLimits.rate_margin", minimum=1.0)
+        super().__post_init__()
         finite(self.plant_gain, "PlacementPlanLimits.plant_gain", above=1.0)
         finite(self.longer_delay, "PlacementPlanLimits.longer_delay", minimum=0.0)
         integer(self.runs, "PlacementPlanLimits.runs", minimum=8)
@@ -194,11 +190,6 @@ class PlacementSettingsPlan(AccuracyPlan[PlacementTrial]):
     limits: PlacementPlanLimits
 
     @property
-    def margin(self) -> float:
-        """Least ratio of the tolerance to the predicted error."""
-        return self.limits.margin
-
-    @property
     def usable(self) -> list[PlacementTrial]:
         """Settings that may be chosen."""
         return usable_settings(self.trials)
@@ -253,7 +244,7 @@ class PlacementSettingsPlan(AccuracyPlan[PlacementTrial]):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as dictionaries, lists and numbers for JSON."""
-        return super().to_dict() | {"binding": self.binding, "limits": asdict(self.limits)}
+        return super().to_dict() | {"binding": self.binding}
 
 
 def usable_settings(trials: Sequence[PlacementTrial]) -> list[PlacementTrial]:

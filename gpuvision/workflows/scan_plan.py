@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from gpuvision.accuracy.plan import AccuracyPlan
+from gpuvision.accuracy.plan import AccuracyLimits, AccuracyPlan
 from gpuvision.accuracy.trial import millionths
 from gpuvision.host import Plan
 from gpuvision.ranging.line import LineReadout
@@ -20,8 +20,8 @@ _LEGEND = """errors of the heights in um; other: scatter that the noise does not
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScanPlanLimits:
-    """Limits of `plan_scan`.
+class ScanPlanLimits(AccuracyLimits):
+    """Limits of `plan_scan`, with those of `gpuvision.accuracy.plan.AccuracyLimits`.
 
     Attributes
     ----------
@@ -30,18 +30,14 @@ class ScanPlanLimits:
         up to 1.01 times the prediction (measured).
     max_lost : float
         Fraction of the samples that a readout may lose beyond the readout that loses fewest, 0 to 1. Default 0.01.
-    rate_margin : float
-        Least ratio of the measured service rate to the frame rate, at least 1. Default 1.25.
     """
 
     margin: float = 1.05
     max_lost: float = 0.01
-    rate_margin: float = 1.25
 
     def __post_init__(self) -> None:
-        finite(self.margin, "ScanPlanLimits.margin", minimum=1.0)
+        super().__post_init__()
         finite(self.max_lost, "ScanPlanLimits.max_lost", minimum=0.0, maximum=1.0)
-        finite(self.rate_margin, "ScanPlanLimits.rate_margin", minimum=1.0)
 
 
 class ReadoutTrial(NamedTuple):
@@ -134,11 +130,6 @@ class ScanPlan(AccuracyPlan[ReadoutTrial]):
     limits: ScanPlanLimits
 
     @property
-    def margin(self) -> float:
-        """Least ratio of the tolerance to the predicted error."""
-        return self.limits.margin
-
-    @property
     def usable(self) -> list[ReadoutTrial]:
         """Readouts that may be chosen."""
         return usable_trials(self.trials, self.limits)
@@ -178,7 +169,6 @@ class ScanPlan(AccuracyPlan[ReadoutTrial]):
         return super().to_dict() | {
             "rounding": self.rounding,
             "stream": None if self.stream is None else self.stream.to_dict(),
-            "limits": asdict(self.limits),
         }
 
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from gpuvision.accuracy.plan import AccuracyPlan
+from gpuvision.accuracy.plan import AccuracyLimits, AccuracyPlan
 from gpuvision.accuracy.trial import micrometres, millionths
 from gpuvision.validation import finite, integer
 from gpuvision.workflows.light_cache import SimulationTask
@@ -21,15 +21,11 @@ finest: error of the finest setting, estimate; signal: change of the signal; mov
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulationPlanLimits:
-    """Limits of `gpuvision.workflows.planning_simulation.plan_simulation`.
+class SimulationPlanLimits(AccuracyLimits):
+    """Limits of `gpuvision.workflows.planning_simulation.plan_simulation`, with those of `AccuracyLimits`.
 
     Attributes
     ----------
-    margin : float
-        Least ratio of the tolerance to the predicted error, at least 1. Default 1.1.
-    rate_margin : float
-        Least ratio of the time that rate and latency allow to the measured time of a profile, at least 1. Default 1.25.
     max_moved : float
         Largest fraction of the samples that may read another line than with the finest setting, 0 to 1. Chosen. Default
         0.005.
@@ -39,15 +35,12 @@ class SimulationPlanLimits:
         Number of other profiles on which the chosen setting is checked, 1 or more. Default 4.
     """
 
-    margin: float = 1.1
-    rate_margin: float = 1.25
     max_moved: float = 0.005
     profiles: int = 6
     checked: int = 4
 
     def __post_init__(self) -> None:
-        finite(self.margin, "SimulationPlanLimits.margin", minimum=1.0)
-        finite(self.rate_margin, "SimulationPlanLimits.rate_margin", minimum=1.0)
+        super().__post_init__()
         finite(self.max_moved, "SimulationPlanLimits.max_moved", minimum=0.0, maximum=1.0)
         integer(self.profiles, "SimulationPlanLimits.profiles", minimum=2)
         integer(self.checked, "SimulationPlanLimits.checked", minimum=1)
@@ -151,11 +144,6 @@ class SimulationPlan(AccuracyPlan[SettingsTrial]):
     limits: SimulationPlanLimits
 
     @property
-    def margin(self) -> float:
-        """Least ratio of the tolerance to the predicted error."""
-        return self.limits.margin
-
-    @property
     def usable(self) -> list[SettingsTrial]:
         """Settings that may be chosen."""
         return usable_settings(self.trials, self.limits)
@@ -195,7 +183,6 @@ class SimulationPlan(AccuracyPlan[SettingsTrial]):
             "finest": {name: each._asdict() for name, each in self.finest.items()},
             "checked": self.checked,
             "planning_seconds": self.seconds,
-            "limits": asdict(self.limits),
         }
 
 

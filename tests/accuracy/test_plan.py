@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import pytest
 
-from gpuvision.accuracy.plan import AccuracyPlan, PlanError, check_time, fastest_within, time_limit
+from gpuvision.accuracy.plan import AccuracyLimits, AccuracyPlan, PlanError, check_time, fastest_within, time_limit
 from gpuvision.accuracy.trial import CallTime, at_least, loop_times, median_times, trial_table
 
 
@@ -39,16 +39,13 @@ class SettingPlan(AccuracyPlan[Setting]):
     unit: ClassVar[str] = "image"
 
     @property
-    def margin(self) -> float:
-        return 1.25
-
-    @property
     def usable(self) -> list[Setting]:
         return [each for each in self.trials if each.error > 0.0]
 
 
 COARSE, MIDDLE, FINE = Setting("coarse", 1e-4, 8e-6), Setting("middle", 2e-4, 4e-6), Setting("fine", 8e-4, 2e-6)
 TRIALS = (COARSE, MIDDLE, FINE)
+LIMITS = AccuracyLimits(margin=1.25)
 
 
 @pytest.mark.parametrize(
@@ -105,6 +102,13 @@ def test_wrong_limits_are_refused(rate: float | None, latency: float | None, mes
         time_limit(rate, latency, 1.25, "frame")
 
 
+@pytest.mark.parametrize("name", ["margin", "rate_margin"])
+def test_margins_are_1_or_more(name: str) -> None:
+    assert getattr(AccuracyLimits(**{name: 1.0}), name) == 1.0
+    with pytest.raises(ValueError, match=rf"AccuracyLimits\.{name} is 0\.99, expected"):
+        AccuracyLimits(**{name: 0.99})
+
+
 def test_a_setting_that_is_too_slow_is_refused_with_the_nearest_ones() -> None:
     def check(chosen: Setting, rate: float, usable: tuple[Setting, ...] = TRIALS) -> None:
         check_time(chosen, TRIALS, usable, time_limit(rate, None, 1.25, "frame"), 1.25, "setting")
@@ -127,7 +131,7 @@ def test_a_setting_that_is_too_slow_is_refused_with_the_nearest_ones() -> None:
 
 
 def test_a_plan_says_what_a_little_more_buys() -> None:
-    plan = SettingPlan(chosen=MIDDLE, trials=TRIALS, tolerance=6e-6)
+    plan = SettingPlan(chosen=MIDDLE, trials=TRIALS, tolerance=6e-6, limits=LIMITS)
     assert (plan.faster, plan.finer) == (COARSE, FINE)
     assert str(plan) == (
         "middle: predicted error 4 um of 6 um, 200 us per image; a tolerance of 10 um would allow coarse at 0.5 times "
@@ -139,16 +143,17 @@ def test_a_plan_says_what_a_little_more_buys() -> None:
         "faster": COARSE._asdict(),
         "finer": FINE._asdict(),
         "trials": [each._asdict() for each in TRIALS],
+        "limits": {"margin": 1.25, "rate_margin": 1.25},
     }
     near = (Setting("a", 1.92e-4, 4.1e-6), MIDDLE, Setting("b", 8e-4, 3.84e-6))
-    plan = SettingPlan(chosen=MIDDLE, trials=near, tolerance=6e-6)
+    plan = SettingPlan(chosen=MIDDLE, trials=near, tolerance=6e-6, limits=LIMITS)
     assert (plan.faster, plan.finer) == (None, None)  # less than 5 %
     assert str(plan).endswith("no usable setting is faster")
 
 
 def test_a_table_marks_the_chosen_and_the_unusable_settings() -> None:
     lost = Setting("a setting with a long name", 5e-5, math.nan)
-    plan = SettingPlan(chosen=MIDDLE, trials=(lost, *TRIALS), tolerance=6e-6)
+    plan = SettingPlan(chosen=MIDDLE, trials=(lost, *TRIALS), tolerance=6e-6, limits=LIMITS)
     lines = plan.table().splitlines()
     assert [re.split(r"  +", each) for each in lines[1:-1]] == [
         ["- a setting with a long name", "50", "nan"],

@@ -235,12 +235,12 @@ def test_a_second_sensor_has_the_profiles_of_the_first(has_second: bool, monkeyp
         "prepare_simulation",
         lambda *given, **how: asked.append((given, how)) or SimpleNamespace(transports=f"of {given[2]}"),
     )
-    given: Any = ("scene", ("matt",), "one", "other" if has_second else None, {"paths": ("direct",)}, 7)
-    task, second = simulate._prepare(*given)
-    assert task.transports == "of one"
+    given: Any = ("scene", ("matt",), ["one", "other"] if has_second else ["one"], 7)
+    tasks = simulate._prepare(*given, paths=("direct",))
+    assert tasks[0].transports == "of one"
     assert asked[0] == (("scene", ("matt",), "one"), {"profiles": 7, "paths": ("direct",)})
     assert len(asked) == 1 + has_second
-    assert (second is not None) == has_second
+    assert len(tasks) == 1 + has_second
     if has_second:
         assert asked[1] == (("scene", ("matt",), "other"), {"transports": "of one", "paths": ("direct",)})
 
@@ -284,14 +284,14 @@ def test_recordings_of_each_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
     made = {"seed": 5, "device": "d", "mask": "given", "limit": 1.0}
     out = Path("out")
-    text = simulate._write_recordings(found, ["a.toml", "b.toml"], out, made, ["p.stl"], True)
+    lines = simulate._write_recordings(found, ["a.toml", "b.toml"], out, made, ["p.stl"], True)
     how: dict[str, Any] = {"light": out, "inputs": ["p.stl"], "overwrite": True, "seed": 5, "device": "d"}
     assert asked == [
         (("one", out, "a.toml"), how | {"mask": "given"}),
         (("other", out / "second", "b.toml"), how | {"mask": "made"}),
     ]
     recording, sensor = simulated_recording.RECORDING_FILES
-    assert text.splitlines() == [
+    assert lines == [
         f"next: gpuvision scan out/{recording} --sensor out/{sensor} --out out/scan",
         f"next: gpuvision scan out/second/{recording} --sensor out/second/{sensor} --out out/second/scan",
     ]

@@ -145,8 +145,8 @@ def test_the_command_simulates_both_sensors_and_fuses_them(
 
     monkeypatch.setattr(simulating, "simulate", simulate)
     monkeypatch.setattr(SensorPair, "fuse", fuse)
-    given: Any = ("one", "two" if has_second else None)
-    done, summary = _run(*given, Rule.mean, tmp_path, {"seed": 7}, "simulating", ["part.stl"], True)
+    given: Any = ["one", "two"] if has_second else ["one"]
+    done, summary = _run(given, Rule.mean, tmp_path, {"seed": 7}, "simulating", ["part.stl"], True)
     how = {"inputs": ["part.stl"], "overwrite": True}
     both = [("one", "two", "mean"), ("pair", (tmp_path,), how)]
     assert calls == [*(both if has_second else []), ("one", (tmp_path,), how | {"scale": 5.0 if has_second else None})]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import datetime
 import importlib
-import itertools
 import json
 import math
 import platform
@@ -89,6 +88,8 @@ MEASURED = {
 }
 # Cases that a quick run measures, where these are not the first ones of their module.
 QUICK_CASES = {"psd": "float32/1e6", "line": "whole/16", "triangulation": "float32/1e6", "ruler": "100", "blob": "100"}
+# Settings of the cases of a quick run.
+QUICK_SETTINGS: Mapping[str, Mapping[str, Any]] = {"stream": {"run_seconds": 10.0}}
 # Preparation that no measuring time shortens [s]: the stream runs three times for 60 s, and searches its highest rate.
 KNOWN_PREPARATION = {"stream": 200.0}
 _STEADY = 0.2  # largest relative change of the FLOP rate during a valid section
@@ -530,10 +531,12 @@ def _cases(operation: str, device: Device, quick: bool) -> Iterator[Case]:
         yield from module.cases(device)
         return
     chosen = QUICK_CASES.get(operation)
-    found = list(itertools.islice((case for case in module.cases(device) if chosen in (None, case.name)), 1))
-    if chosen is not None and not found:
+    found = module.cases(device, **QUICK_SETTINGS.get(operation, {}))
+    case = next((each for each in found if chosen in (None, each.name)), None)
+    if case is not None:
+        yield case  # `found` is still referenced: the case may use what its generator holds open
+    elif chosen is not None:
         raise LookupError(f"{operation} has no case {chosen!r} on {device.label}, see QUICK_CASES")
-    yield from found
 
 
 def describe_machine(devices: Sequence[Device]) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def stated_interval(row: Mapping[str, Any]) -> tuple[float, float] | None:
     sure = (row.get("confidence") or 0.0) >= CONFIDENCE
     if not sure or low is None or high is None:
         return None
-    ratio = row["ratio"]
+    ratio = float(row["ratio"])
     below, above = (math.hypot(math.log(each / ratio), BETWEEN_RUNS) for each in (low, high))
     return ratio * math.exp(-below), ratio * math.exp(above)
 

@@ -227,6 +227,24 @@ def test_a_section_is_not_repeated_when_the_time_is_over(fake, device):
     assert len(run.probes) == len(run.rows) == 1
 
 
+def test_the_case_of_a_quick_run_keeps_what_its_generator_holds_open(fake, monkeypatch, device):
+    """A stream is open as long as its generator."""
+    given, is_open = [], True
+
+    def cases(device, **settings):
+        nonlocal is_open
+        given.append(settings)
+        try:
+            yield case(ours=lambda: None if is_open else 1 / 0)
+        finally:
+            is_open = False
+
+    monkeypatch.setattr(harness.importlib, "import_module", lambda name: types.SimpleNamespace(cases=cases))
+    run = harness.profile(["stream"], [device], seconds=0.01, quick=True)
+    assert (len(run.rows), run.failures) == (1, [])
+    assert (given, is_open) == ([harness.QUICK_SETTINGS["stream"]], False)
+
+
 def test_a_quick_run_measures_one_case_of_each_operation(fake, monkeypatch, device):
     built = []
 

@@ -28,6 +28,10 @@ _COMPLETE = cl.command_execution_status.COMPLETE
 # Launches that move fewer bytes run inline. Measured: one core of a PC moves 1 MiB in about the time that PoCL needs to
 # wake two worker threads.
 _SHORT_BYTES = 1 << 20
+# Limit for kernels that stream (`Launch.streams`) in several work-groups on Intel's runtime, if the caller waits
+# (`Bound.run`). A caller that does not wait gives them to the workers, which run beside it. Measured on two cores for a
+# PSD readout that moves 130 kB: 4 us in the calling thread, 5.5 us by the workers; about equal for 500 kB.
+_SHORT_RUN_BYTES = 512 << 10
 # Limit for launches whose tuned settings ask for the calling thread (`Launch.inline`). Chosen: half the bytes of the
 # default batch of a stream, because the host work of a stream should overlap with the kernels.
 MAX_INLINE_BYTES = 2 << 20
@@ -38,12 +42,24 @@ class _Site:
     """Queue and kernel of a bound operation, with the arrays that are set as the kernel's arguments.
 
     The arrays stay referenced, because a runtime may abort the process when a kernel uses a freed buffer.
+
+    Attributes
+    ----------
+    queue : pyopencl.CommandQueue
+    kernel : pyopencl.Kernel
+    arguments : tuple
+        Arguments of `pyopencl.enqueue_nd_range_kernel`: queue, kernel, global size, local size.
+    given : tuple of arrays
+        Arguments of the last launch.
+    inline : bool
+        Whether kernels run in the calling thread and are complete when enqueued.
     """
 
     queue: Any
     kernel: Any
+    arguments: tuple[Any, Any, tuple[int, ...], tuple[int, ...] | None]
     given: tuple[Any, ...]
-    inline: bool  # kernels run in the calling thread and are complete when enqueued
+    inline: bool
 
 
 class Bound(Generic[R]):
@@ -72,7 +88,6 @@ class Bound(Generic[R]):
         self.queue = device.queue if queue is None else queue
         self._launch = launch
         self._set_specs(launch.inputs, launch.outputs)
-        self._global, self._local = launch.global_size, launch.local_size  # `fit_work` may halve the groups
         # `Device.wait` with its branch on the runtime resolved here: a short call takes only a few microseconds in
         # total.
         self._wait: Callable[[Any], object] = device.wait if device.kind == "pocl" else cl.Event.wait
@@ -87,9 +102,12 @@ class Bound(Generic[R]):
         self._own = (*self.inputs, *self._own_outputs)
         self._array_specs = (*launch.inputs, *self._computed_specs.values())
         self._inline_site: _Site | None = None
+        self._calls_inline = False  # whether a call that does not wait uses the inline site
         try:
             self._connect(launch)
-            self._enqueue(self._own).wait()
+            self._run_site = self._queue_site if self._inline_site is None else self._inline_site
+            self._call_site = self._run_site if self._calls_inline else self._queue_site
+            self._enqueue(self._own, waits=True).wait()
         except cl.Error as error:
             self._raise(error)
 
@@ -110,10 +128,14 @@ class Bound(Generic[R]):
         known = self._own if device.kind == "intel" and device.shares_memory else ()
         self._known = {id(each): _buffer_over(device.context, each) for each in known}
         self._queue_is_inline = device.is_inline(self.queue)
+        self._finish_queue = self.queue.finish
+        if self._queue_is_inline or not launch.passes_once or launch.inline is False:
+            return
         is_short = launch.nbytes <= (_SHORT_BYTES if launch.inline is None else MAX_INLINE_BYTES)
-        may_run_inline = launch.passes_once and is_short and launch.inline is not False
-        if not self._queue_is_inline and may_run_inline:
-            inline_queue = device.inline_queue(self.queue, groups=1 if launch.inline else launch.groups)
+        call_gains = device.call_gains_inline(groups=1 if launch.inline else launch.groups)
+        self._calls_inline = is_short and call_gains and device.has_inline_queues
+        if self._calls_inline or (launch.streams and launch.nbytes <= _SHORT_RUN_BYTES):
+            inline_queue = device.inline_queue(self.queue)
             self._inline_site = None if inline_queue is None else self._site_on(inline_queue)
 
     @functools.cached_property
@@ -126,7 +148,7 @@ class Bound(Generic[R]):
         if self._inline_site is not None and not self._empty:
             try:
                 self._set_arrays(self._queue_site, self._own)
-                cl.enqueue_nd_range_kernel(self.queue, self._queue_site.kernel, self._global, self._local).wait()
+                cl.enqueue_nd_range_kernel(*self._queue_site.arguments).wait()
             except cl.Error as error:
                 self._raise(error)
 
@@ -142,14 +164,16 @@ class Bound(Generic[R]):
 
     @property
     def inline(self) -> bool:
-        """Whether a call runs the kernel in the calling thread, unless it must wait for an event."""
-        return self._queue_is_inline or self._inline_site is not None
+        """Whether a call runs the kernel in the calling thread, unless it must wait for an event.
+
+        On Intel's runtime `run` and calls with NumPy arrays run more kernels there, see `_SHORT_RUN_BYTES`.
+        """
+        return self._queue_is_inline or self._calls_inline
 
     @property
     def enqueue_arguments(self) -> tuple[Any, Any, tuple[int, ...], tuple[int, ...] | None]:
         """Arguments of `pyopencl.enqueue_nd_range_kernel` for a launch: queue, kernel, global size, local size."""
-        site = self._site()
-        return site.queue, site.kernel, self._global, self._local
+        return self._call_site.arguments
 
     @functools.cached_property
     def _input_names(self) -> list[str]:
@@ -197,8 +221,8 @@ class Bound(Generic[R]):
         """Launch, wait with the least delay, and return the written arrays: `out` or `outputs`."""
         given = self._own if not frames and out is None else self._given(frames, out)
         try:
-            event = self._enqueue(given)
-            if not self._queue_is_inline:
+            event = self._enqueue(given, waits=True)
+            if self._empty or not self._run_site.inline:
                 self._wait(event)
         except cl.Error as error:
             self._raise(error)
@@ -216,35 +240,43 @@ class Bound(Generic[R]):
         outputs = self._own_outputs if out is None or out is self.outputs else self._computed(out)
         return (*(frames or self.inputs), *outputs)
 
-    def _enqueue(self, given: tuple[Any, ...], wait_for: Sequence[Any] | None = None) -> Any:
-        site = self._queue_site if self._inline_site is None else self._site(wait_for)
+    def _enqueue(self, given: tuple[Any, ...], wait_for: Sequence[Any] | None = None, *, waits: bool = False) -> Any:
+        """Launch the kernel and return its event; `waits`: the caller waits for the event at once."""
+        if wait_for or self._empty:
+            return self._enqueue_after(given, wait_for or ())
+        site = self._run_site if waits else self._call_site
+        if site is self._inline_site:
+            self._finish_queue()
         if given is not site.given:
             self._set_arrays(site, given)
-        if wait_for:
-            _flush_queues(wait_for, self.queue)
-        if self._empty:
-            return cl.enqueue_marker(self.queue, wait_for=wait_for)
-        if site.inline:
-            if wait_for:
-                cl.wait_for_events(wait_for)
-            return cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
-        event = cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local, wait_for=wait_for)
-        if given is not self._own:
+        event = cl.enqueue_nd_range_kernel(*site.arguments)
+        if given is not self._own and not site.inline:
             self._hold(event, given)
         return event
 
-    def _site(self, wait_for: Sequence[Any] | None = None) -> _Site:
-        """Return the site to run at: inline for short launches, after all earlier work of the queue.
+    def _enqueue_after(self, given: tuple[Any, ...], wait_for: Sequence[Any]) -> Any:
+        """Launch the kernel after some events, or enqueue a marker where there is nothing to compute.
 
         Launches that must wait for an event run in the queue, because PoCL hangs when one of its devices waits for an
         event of the other.
         """
-        if self._inline_site is None:
-            return self._queue_site
-        if wait_for and any(each.command_execution_status > _COMPLETE for each in wait_for):
-            return self._queue_site
-        self.queue.finish()
-        return self._inline_site
+        site = self._call_site
+        if site is self._inline_site and _are_complete(wait_for):
+            self._finish_queue()
+        elif site is self._inline_site:
+            site = self._queue_site
+        if given is not site.given:
+            self._set_arrays(site, given)
+        _flush_queues(wait_for, self.queue)
+        if self._empty:
+            return cl.enqueue_marker(self.queue, wait_for=wait_for)
+        if site.inline:
+            cl.wait_for_events(wait_for)
+            return cl.enqueue_nd_range_kernel(*site.arguments)
+        event = cl.enqueue_nd_range_kernel(*site.arguments, wait_for=wait_for)
+        if given is not self._own:
+            self._hold(event, given)
+        return event
 
     def on_host(self, frames: Sequence[HostArray], out: R | None = None) -> R:
         """Run on NumPy arrays and wait; where memory is shared, the kernel reads and writes them in place."""
@@ -274,11 +306,13 @@ class Bound(Generic[R]):
         flags, context = cl.mem_flags, self.device.context
         read = [cl.Buffer(context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in frames]
         write = [cl.Buffer(context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in targets]
-        site = self._site()
+        site = self._run_site
+        if site is self._inline_site:
+            self._finish_queue()
         site.given = (None,) * len(self._own)
         for index, memory in zip(self._places, (*read, *write), strict=True):
             site.kernel.set_arg(index, memory)
-        event = cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
+        event = cl.enqueue_nd_range_kernel(*site.arguments)
         for memory, array in zip(write, targets, strict=True):
             # Mapping makes the kernel's writes visible to the host; the address stays the same.
             mapped, _ = cl.enqueue_map_buffer(
@@ -390,7 +424,7 @@ class Bound(Generic[R]):
             )
             kernel = cl.Kernel(program, launch.kernel)
         name = type(operation).__name__
-        self._global, self._local = fit_work(kernel, queue.device, launch, name=name, label=self.device.label)
+        size = fit_work(kernel, queue.device, launch, name=name, label=self.device.label)
         after_inputs = len(launch.inputs)
         after_outputs = after_inputs + len(launch.outputs)
         for place, spec in enumerate(launch.outputs.values(), after_inputs):
@@ -399,7 +433,7 @@ class Bound(Generic[R]):
         tables = iter(self._tables)
         for place, value in enumerate(launch.arguments, after_outputs):
             kernel.set_arg(place, next(tables) if isinstance(value, np.ndarray) else value)
-        return _Site(queue, kernel, (None,) * len(self._own), self.device.is_inline(queue))
+        return _Site(queue, kernel, (queue, kernel, *size), (None,) * len(self._own), self.device.is_inline(queue))
 
     def _upload(self, table: HostArray) -> Any:
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
@@ -417,6 +451,11 @@ def _buffer_over(context: Any, array: DeviceArray) -> Any:
     """Return a buffer over the shared memory of an array."""
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
     return cl.Buffer(context, flags, hostbuf=host_view(array)) if array.nbytes else None
+
+
+def _are_complete(events: Sequence[Any]) -> bool:
+    """Return whether commands have ended; an error counts as an end."""
+    return all(each.command_execution_status <= _COMPLETE for each in events)
 
 
 def _flush_queues(events: Sequence[Any], queue: Any) -> None:

@@ -326,22 +326,16 @@ class Device:
         properties = cl.command_queue_properties.PROFILING_ENABLE if measures else 0
         return (self._new_inline_queue(properties) if inline else None) or self._queue(self.handle, properties)
 
-    def inline_queue(self, like: Any, *, groups: int) -> Any:
-        """Return an inline queue with the properties of a queue, or None where it brings no gain.
+    def inline_queue(self, like: Any) -> Any:
+        """Return an inline queue with the properties of a queue, or None where the runtime has no inline queues."""
+        return self._new_inline_queue(like.properties)
 
-        Parameters
-        ----------
-        like : pyopencl.CommandQueue
-        groups : int
-            Work-groups of the kernel.
+    def call_gains_inline(self, *, groups: int) -> bool:
+        """Return whether a short kernel of some work-groups is better run inline where the caller does not wait for it.
 
-        Returns
-        -------
-        pyopencl.CommandQueue or None
-            On Intel's runtime, whose workers wake faster than PoCL's, only kernels of one work-group gain.
+        Intel's runtime, whose workers wake faster than PoCL's, gains with one work-group only.
         """
-        worthwhile = groups == 1 or self.inline_device is not None
-        return self._new_inline_queue(like.properties) if worthwhile else None
+        return groups == 1 or self.inline_device is not None
 
     def is_inline(self, queue: Any) -> bool:
         """Return whether kernels of this queue run in the thread that enqueues them."""

@@ -48,6 +48,9 @@ class Launch:
         Whether the kernel does little more than read and write its memory once, or is known to take as short for
         another reason. Small launches of such kernels run in the calling thread, because waking a worker thread takes
         longer than the work. Default False.
+    streams : bool
+        Whether the time of the kernel follows from the bytes that it moves: it computes little for each of them.
+        Default False.
     problem_per_group : bool
         Whether each work-group of the work-item variant solves one problem, with results that do not depend on the
         size of the group. A device without registers for the groups then runs the same number of smaller groups.
@@ -66,6 +69,7 @@ class Launch:
     defines: Mapping[str, Define] = field(default_factory=dict)
     arguments: Sequence[Any] = ()
     passes_once: bool = False
+    streams: bool = False
     problem_per_group: bool = False
     inline: bool | None = None
 

@@ -252,8 +252,8 @@ class LaunchBuilder:
         defines : mapping
             Macros in addition to the macros of the real type and of the kernel variant.
         streams : bool
-            Whether the vector variant of the kernel writes past the caches of a CPU (macro ``PAST_CACHES``) when the
-            launch moves more bytes than the last cache holds. Default False.
+            As in `Launch`. The vector variant of such a kernel writes past the caches of a CPU (macro ``PAST_CACHES``)
+            when the launch moves more bytes than the last cache holds. Default False.
 
         Raises
         ------
@@ -274,6 +274,7 @@ class LaunchBuilder:
             defines={**real_defines(self.device, self.real), **variant, **(defines or {})},
             arguments=arguments,
             passes_once=passes_once,
+            streams=streams,
             problem_per_group=problem_per_group,
             inline=self._settings.inline,
         )

@@ -27,9 +27,9 @@ def _name(bound: Bound[Any]) -> str:
 class TracedBound(Bound[R]):
     """Bound operation that records its launches and waits, on the host and on the device."""
 
-    def _enqueue(self, given: tuple[Any, ...], wait_for: Sequence[Any] | None = None) -> Any:
+    def _enqueue(self, given: tuple[Any, ...], wait_for: Sequence[Any] | None = None, *, waits: bool = False) -> Any:
         before = time.perf_counter_ns()
-        event = super()._enqueue(given, wait_for)
+        event = super()._enqueue(given, wait_for, waits=waits)
         self._record("launch", "compute", [event], before)
         return event
 

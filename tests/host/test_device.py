@@ -312,7 +312,7 @@ def test_memory_is_shared_on_a_cpu_with_fine_grained_buffers() -> None:
 @pytest.mark.parametrize("extension", ["", "cl_intel_exec_by_local_thread", "cl_intel_exec_by_local_thread_more"])
 @pytest.mark.parametrize("has_inline_device", [False, True])
 def test_inline_queues(extension: str, has_inline_device: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By PoCL's second device, or by an extension of Intel's runtime, whose kernels of one group alone gain."""
+    """By PoCL's second device, or by an extension of Intel's runtime, whose calls of one group alone gain."""
     other: Any = "the inline device"
     device = paper_device(inline_device=other if has_inline_device else None, extensions=f"cl_khr_fp64 {extension}")
     monkeypatch.setattr(device, "_queue", lambda handle, properties: (handle, properties))
@@ -321,8 +321,8 @@ def test_inline_queues(extension: str, has_inline_device: bool, monkeypatch: pyt
     like: Any = SimpleNamespace(properties=2)
     expected = (other, 2) if has_inline_device else (device.handle, 2 | 1 << 31) if is_intel else None
     for groups in (1, 2):
-        gains = groups == 1 or has_inline_device
-        assert device.inline_queue(like, groups=groups) == (expected if gains else None)
+        assert device.call_gains_inline(groups=groups) == (groups == 1 or has_inline_device)
+    assert device.inline_queue(like) == expected
     assert device.new_queue(inline=True) == (
         (device.handle, 0) if expected is None else (expected[0], expected[1] & ~2)
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import threading
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -147,17 +148,50 @@ def test_work_of_one_group_runs_inline(device):
         np.testing.assert_allclose(host_view(bound.outputs.position), expected(frame), atol=5e-7)
 
 
-def test_short_work_comes_after_the_long_work_before_it(device, rng):
+def test_a_short_stream_of_several_groups_runs_inline_where_the_caller_waits(device, rng):
+    """On Intel's runtime; on PoCL a call that does not wait runs inline, too."""
+    if device.kind not in ("intel", "pocl") or not device.has_inline_queues:
+        pytest.skip("only Intel's runtime and PoCL 3 run launches inline")
+    for count, waits in ((10_000, True), (400_000, False)):
+        bound = READOUT.bind(device, (count, 2), np.float32)
+        assert bound._launch.groups > 1
+        assert bound.inline == (waits and device.kind == "pocl")
+        assert bound._run_site.inline == waits
+        for _ in range(3):
+            frame = rng.uniform(0.1, 1.0, (count, 2)).astype(np.float32)
+            bound.inputs[0].set(frame)
+            np.testing.assert_allclose(host_view(bound.run().position), expected(frame), atol=5e-7)
+            np.testing.assert_allclose(READOUT(frame, device=device).position, expected(frame), atol=5e-7)
+
+
+def test_only_streams_of_several_groups_run_inline_for_a_caller_that_waits(device):
+    """Other short launches compute more for each byte, and gain by all cores of Intel's runtime."""
+    if device.kind != "intel":
+        pytest.skip("on PoCL all short launches run inline")
+    for streams in (False, True):
+        launch = replace(READOUT.launch(device, (10_000, 2), np.dtype(np.float32)), streams=streams)
+        operation = replace(READOUT)
+        object.__setattr__(operation, "launch", lambda *_, launch=launch: launch)
+        assert operation.bind(device, (10_000, 2), np.float32)._run_site.inline == streams
+
+
+@pytest.mark.parametrize("count", [1000, 10_000])
+@pytest.mark.parametrize("waits", [False, True])
+def test_short_work_comes_after_the_long_work_before_it(device, rng, count, waits):
+    """Also where the short work waits and runs inline."""
     long = READOUT.bind(device, (400_000, 2), np.float32)
-    short = READOUT.bind(device, (1000, 2), np.float32)
-    both = cl.array.Array(device.queue, (1000, 2), np.float32, data=long.outputs.position.base_data)
+    short = READOUT.bind(device, (count, 2), np.float32)
+    both = cl.array.Array(device.queue, (count, 2), np.float32, data=long.outputs.position.base_data)
     frame = device.empty((400_000, 2), np.float32)
     for _ in range(10):
         currents = rng.uniform(0.1, 1.0, frame.shape).astype(np.float32) * np.array([0.1, 1.0], np.float32)
         frame.set(currents)
         long(frame)
-        short(both).wait()
-        middle = expected(currents)[:2000].reshape(1000, 2)
+        if waits:
+            short.run(both)
+        else:
+            short(both).wait()
+        middle = expected(currents)[: 2 * count].reshape(count, 2)
         np.testing.assert_allclose(short.outputs.position.get(), expected(middle), atol=1e-5)
 
 

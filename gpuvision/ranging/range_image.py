@@ -130,4 +130,5 @@ class RangeImage(VisionOperation[RangePoints]):
             outputs=build.outputs({"x": shape, "y": shape, "z": shape, "status": shape}),
             defines={**self.geometry.defines(build.real), **type_defines("INPUT", dtype, 16)},
             arguments=[self.packed(build.real), np.uint32(samples)],
+            streams=True,
         )

@@ -133,6 +133,7 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
                 *map(build.real.type, self.sigma or (0.0, 0.0)),
             ],
             passes_once=work.vectors,
+            streams=True,
         )
 
     # ---- construction --------------------------------------------------------------------------------------

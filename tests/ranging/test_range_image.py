@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from contextlib import nullcontext
@@ -12,6 +13,7 @@ import pyopencl.array
 import pytest
 from hypothesis.extra import numpy as hnp
 
+from canary import shifted
 from gpuvision import Device, Status
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
@@ -103,6 +105,23 @@ def test_a_straight_transport_lays_profiles_side_by_side(device, rng, shape, dty
         *expect_straight(op, g, h, transport, given),
         tolerance=6 * 0.1 * np.finfo(dtype).eps,
     )
+
+
+@pytest.mark.parametrize("shift", [0, 1])
+def test_stores_past_small_caches(device, rng, shift):
+    """A device with caches of 1 KiB writes past them: at aligned addresses and at other addresses."""
+    g, h = rng.uniform(-0.05, 0.05, (2, 3, 1043)).astype(np.float32)
+    transport = TILTED.transport(3).astype(np.float32)
+    given = rng.choice(np.array([0, 0, 0, 1], np.uint8), g.shape)
+    small = copy.copy(device)
+    small.cache_bytes = 1024
+    op = RangeImage(geometry=TILTED)
+    defines = op.launch(small, g.shape, g.dtype).defines
+    assert ("PAST_CACHES" in defines) == ("VECTOR_VARIANT" in defines and device.is_cpu)
+    usual = op(g, h, transport, given, device=device)
+    past = op(g, h, transport, given, device=small, out=shifted(usual, shift))
+    for mine, theirs in zip(past, usual, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
 
 
 # A tilted camera 0.3 m away, whose sheet deviates by up to 1.5 mm in a field of 0.1 m.

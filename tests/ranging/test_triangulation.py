@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from canary import shifted
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
 from gpuvision.host.program import options
@@ -79,6 +81,23 @@ def test_against_the_oracle(
     assert result.g.dtype == dtype
     assert result.sigma_g is None
     assert_close(result, operation, u, v)
+
+
+@pytest.mark.parametrize("shift", [0, 1])
+def test_stores_past_small_caches(device: Device, shift: int, rng: np.random.Generator) -> None:
+    """A device with caches of 1 KiB writes past them: at aligned addresses and at other addresses, flags included."""
+    u, v = (rng.uniform(low, high, 4003).astype(np.float32) for low, high in REGION)
+    u[[7, 1000, 4002]] = np.nan
+    small = copy.copy(device)
+    small.cache_bytes = 1024
+    operation = scanner()
+    defines = operation.launch(small, u.shape, u.dtype).defines
+    assert ("PAST_CACHES" in defines) == ("VECTOR_VARIANT" in defines and device.is_cpu)
+    usual = operation(u, v, device=device)
+    past = operation(u, v, device=small, out=shifted(usual, shift))
+    for mine, theirs in zip(past, usual, strict=True):
+        if theirs is not None:
+            np.testing.assert_array_equal(mine, theirs)
 
 
 @ON_DEVICES

@@ -11,7 +11,7 @@ import pytest
 from gpuvision.host import Device
 from gpuvision.ranging.sheet_motion import StraightTransport
 from gpuvision.reference import light_clustering as reference
-from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance, estimate_pairs
+from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance, PairCounts, estimate_pairs
 from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.sensor_view import Exposure
@@ -171,6 +171,23 @@ def test_what_faces_each_other_decides_whether_there_is_a_plan(device: Device) -
     exact = ClusteredIrradiance(scene=scene, tolerance=0.0, min_facing_pairs=gain, device=device)
     assert not exact(segments, receivers, weights, reading).cut.traversed
     assert exact(segments, receivers, weights, reading, tolerance=1e-4).cut.traversed
+
+
+@pytest.mark.double
+def test_few_pairs_are_not_estimated(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, segments, receivers, weights, reading = groove(2, 40, 50)
+    pairs = receivers[..., 0].size * len(segments)
+    estimated = []
+
+    def all_face(*given: Any) -> PairCounts:
+        estimated.append(given)
+        return PairCounts(pairs, pairs)
+
+    monkeypatch.setattr("gpuvision.simulation.clustering.clustered_irradiance.estimate_pairs", all_face)
+    for least, is_estimated in ((pairs // 4, True), (pairs // 4 + 1, False)):
+        light = ClusteredIrradiance(scene=scene, tolerance=1e-4, min_facing_pairs=least, device=device)
+        assert light(segments, receivers, weights, reading).cut.traversed == is_estimated
+        assert len(estimated) == 1
 
 
 def test_few_pairs_face_each_other_on_a_board() -> None:

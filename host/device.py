@@ -20,6 +20,7 @@ from gpuvision.host.arrays import SHARED_FLAGS, DeviceArray
 from gpuvision.host.double_rate import SLOW_RATIO, double_ratio
 from gpuvision.host.errors import DeviceLimitError, DeviceMemoryError, DeviceUnusableError, NoDeviceError
 from gpuvision.host.failure import launch_failure
+from gpuvision.host.huge_pages import advise_huge_pages
 from gpuvision.host.kept import clear_with
 from gpuvision.host.process import check_process
 from gpuvision.host.text import printable, size_in_words
@@ -395,6 +396,7 @@ class Device:
         try:
             if self.shares_memory:
                 memory = cl.SVMAllocation(self.context, size, 0, SHARED_FLAGS, queue)
+                advise_huge_pages(memory.svm_ptr, size)
             else:
                 memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size)
         except cl.Error as error:

@@ -42,6 +42,12 @@ typedef ushort levels __attribute__((ext_vector_type(POSITIONS)));
 typedef levels levels_at __attribute__((aligned(2)));
 typedef float16 floats_at __attribute__((aligned(4)));
 typedef uint16 uints_at __attribute__((aligned(4)));
+typedef ushort16 ushorts_at __attribute__((aligned(2)));
+// Sums of the rows of a tile: of 16 bits for up to CHUNK shifts, otherwise of 32 bits.
+typedef union {
+    ushort narrow[TILE];
+    uint wide[TILE];
+} tile_sums __attribute__((aligned(64)));
 
 #define UNROLLED _Pragma("unroll")
 #define LOWER(a, b) ((a) < (b) ? (a) : (b))
@@ -101,31 +107,46 @@ static inline void keep_sums(levels sums, private uint *to) {
     *high += convert_uint16(sums.hi);
 }
 
-// Sum STRIP * POSITIONS positions from `here` on, for up to CHUNK shifts: 16 bits suffice. The sums of all but the first
-// `known` vectors are added to those at `to`.
+// Sum STRIP * POSITIONS positions from `here` on, for up to CHUNK shifts: 16 bits suffice. Narrow sums are stored from
+// `at` on; otherwise the sums of all but the first `known` vectors are added to the wide sums.
 static inline void sum_strip(global const ushort *here, private const int *shifts, int count, int left, int known,
-                             private uint *to) {
+                             int is_narrow, int at, private tile_sums *tile) {
     levels sums[STRIP];
     UNROLLED
     for (int k = 0; k < STRIP; k++) sums[k] = 0;
     for (int i = 0; i < count; i++) add_levels(here + shifts[i], left, sums);
+    const int start = last_start(left);
+    if (is_narrow) {
+        private ushort *to = tile->narrow + at;
+        UNROLLED
+        for (int k = 0; k < STRIP - 1; k++) *(private levels_at *)(to + k * POSITIONS) = sums[k];
+        *(private levels_at *)(to + start) = sums[STRIP - 1];
+        return;
+    }
+    private uint *to = tile->wide + at;
     UNROLLED
     for (int k = 0; k < STRIP - 1; k++)
         if (k >= known) keep_sums(sums[k], to + k * POSITIONS);
     // The last vector may repeat positions of the one before it.
-    const int start = last_start(left);
-    const levels at = LANES_OF_LEVELS + (levels)(ushort)start;
-    keep_sums(at >= (levels)(ushort)((STRIP - 1) * POSITIONS) ? sums[STRIP - 1] : (levels)0, to + start);
+    const levels lane = LANES_OF_LEVELS + (levels)(ushort)start;
+    keep_sums(lane >= (levels)(ushort)((STRIP - 1) * POSITIONS) ? sums[STRIP - 1] : (levels)0, to + start);
 }
 
-// Store the scores of a block of min(columns, BLOCK) positions at `to`; return its least key.
-static inline uint store_scores(private const uint *sums, int columns, float scale, global float *to) {
+// Return 16 sums of a tile.
+static inline uint16 sums_at(private const tile_sums *tile, int is_narrow, int at) {
+    if (is_narrow) return convert_uint16(*(private const ushorts_at *)(tile->narrow + at));
+    return *(private const uints_at *)(tile->wide + at);
+}
+
+// Store the scores of a block of min(columns, BLOCK) positions, with the sums from `at` on, at `to`; return its least key.
+static inline uint store_scores(private const tile_sums *tile, int is_narrow, int at, int columns, float scale,
+                                global float *to) {
     const uint16 lane = (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
     uint16 least = NO_KEY;
     if (columns >= BLOCK) {
         UNROLLED
         for (int k = 0; k < BLOCK; k += 16) {
-            const uint16 part = *(private const uints_at *)(sums + k), key = part * BLOCK + (lane + (uint)k);
+            const uint16 part = sums_at(tile, is_narrow, at + k), key = part * BLOCK + (lane + (uint)k);
             least = LOWER(least, key);
 #ifdef WITH_SCORES
             *(global floats_at *)(to + k) = convert_float16(part) * scale;
@@ -135,9 +156,10 @@ static inline uint store_scores(private const uint *sums, int columns, float sca
     }
     uint key = NO_KEY;
     for (int k = 0; k < columns; k++) {
-        key = min(key, sums[k] * BLOCK + (uint)k);
+        const uint sum = is_narrow ? tile->narrow[at + k] : tile->wide[at + k];
+        key = min(key, sum * BLOCK + (uint)k);
 #ifdef WITH_SCORES
-        to[k] = (float)sums[k] * scale;
+        to[k] = (float)sum * scale;
 #endif
     }
     return key;
@@ -155,18 +177,21 @@ static inline void sum_rows(global const ushort *restrict level, private const i
     const int vectors = (max(columns, BLOCK) + POSITIONS - 1) / POSITIONS, length = vectors * POSITIONS;
     const int tile = TILE / length;
     const float scale = score_scale(used);
-    uint sums[TILE] __attribute__((aligned(64)));
+    const int is_narrow = used <= CHUNK;
+    tile_sums sums;
     for (int top = first; top < end; top += tile) {
         const int bottom = min(top + tile, end);
-        for (int k = 0; k < (bottom - top) * length; k += 16) *(private uint16 *)(sums + k) = 0;
-        for (int chunk = 0; chunk < used; chunk += CHUNK) {
+        if (!is_narrow)
+            for (int k = 0; k < (bottom - top) * length; k += 16) *(private uint16 *)(sums.wide + k) = 0;
+        // Without shifts one pass stores sums of 0.
+        for (int chunk = 0; chunk < max(used, 1); chunk += CHUNK) {
             const int count = min(used - chunk, CHUNK);
             for (int row = top; row < bottom; row++) {
                 global const ushort *here = level + (size_t)row * stride;
-                private uint *to = sums + (row - top) * length;
                 for (int vector = 0; vector < vectors; vector += STRIP) {
                     const int from = min(vector, vectors - STRIP), at = from * POSITIONS;
-                    sum_strip(here + at, shifts + chunk, count, columns - at, vector - from, to + at);
+                    sum_strip(here + at, shifts + chunk, count, columns - at, vector - from, is_narrow,
+                              (row - top) * length + at, &sums);
                 }
             }
         }
@@ -174,7 +199,7 @@ static inline void sum_rows(global const ushort *restrict level, private const i
             const size_t place = (size_t)turn * rows + row;
             for (int block = 0; block < blocks; block++) {
                 const int from = block_from(block, columns);
-                const uint key = store_scores(sums + (row - top) * length + from, columns, scale,
+                const uint key = store_scores(&sums, is_narrow, (row - top) * length + from, columns, scale,
                                               scores + place * columns + from);
                 store_least(key, scale, least, column, place * blocks + block, from);
             }

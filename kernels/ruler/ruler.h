@@ -27,6 +27,7 @@
 // gpuvision/matching/features/ruler.py, with their units.
 
 #define RULER_SLOPES_CAPACITY (RULER_CAPACITY - 2 * TAPS)
+#define LANES_SHIFT 4 // LANES is 1 << LANES_SHIFT in the vector variant
 #define RULER_MIDDLE(table) ((real)0.5f * ((table)[RULER_LENGTH] - 1))
 #define RULER_SIGN ((bits)1 << (8 * sizeof(real) - 1)) // bit of the sign
 #define RULER_LARGEST 1e37f  // largest sum over lines; gradients of larger ones could overflow
@@ -50,6 +51,9 @@ typedef struct {
 #ifdef PER_RULER
     reals nearest, farthest; // least and greatest spacing of a pair [samples]
     masks is_pair;
+#endif
+#ifdef VECTOR_VARIANT
+    reals first_sample, last_sample; // first sample of the part of the ruler in this lane, and last one of the ruler
 #endif
 } ruler_place;
 
@@ -94,6 +98,10 @@ static inline masks ruler_layout(int rows, int columns, reals x, reals y, reals 
     place->across_y = zero_where(away, cosine);
     place->last_column = (columns - 2) - column;
     place->last_row = (rows - 2) - row;
+#ifdef VECTOR_VARIANT
+    place->first_sample = 0;
+    place->last_sample = table[RULER_LENGTH] - 1;
+#endif
 #ifdef PAIRS
     ruler_set_polarity(table[RULER_POLARITY], ~(masks)0, place);
 #else
@@ -265,16 +273,31 @@ static inline void ruler_find(private const reals *values, private const ruler_p
 
 #include "ruler/ruler_lanes.h"
 
-// Measure 16 rulers of a given layout with its flags, one in each lane; fills edges[MAX_EDGES].
+// Join the samples and flags of rulers in parts: part p of ruler r, `samples` samples, is in lane (p << shift) + r.
+static inline void ruler_join_parts(int shift, int samples, constant real *table, private reals *profile,
+                                    private masks *flags) {
+    private real *values = (private real *)profile;
+    private bits *all = (private bits *)flags;
+    const int parts = LANES >> shift, rulers = 1 << shift, length = (int)table[RULER_LENGTH];
+    for (int lane = rulers; lane < LANES; lane++) all[lane & (rulers - 1)] |= all[lane];
+    for (int part = 1; part < parts; part++)
+        for (int i = 0; i < samples && part * samples + i < length; i++)
+            for (int ruler = 0; ruler < rulers; ruler++)
+                values[(part * samples + i) * LANES + ruler] = values[i * LANES + (part << shift) + ruler];
+}
+
+// Measure rulers of a given layout with its flags, one in each lane, or 2^shift rulers in parts of `samples` samples;
+// fills edges[MAX_EDGES].
 static inline void ruler_measure_placed(global const CODE *image, int rows, int columns,
-                                        private const ruler_place *place, masks flags, constant real *table,
-                                        constant real *model, private ruler_edge *edges) {
+                                        private const ruler_place *place, int shift, int samples, masks flags,
+                                        constant real *table, constant real *model, private ruler_edge *edges) {
     reals profile[RULER_CAPACITY];
 #ifdef RULER_PATCHES_H
-    if (ruler_has_patches(place, rows, columns)) flags |= ruler_patch_sums(image, place, columns, table, profile);
+    if (ruler_has_patches(place, rows, columns)) flags |= ruler_patch_sums(image, place, columns, samples, table, profile);
     else
 #endif
-        flags |= ruler_sums(image, place, columns, table, model, profile);
+        flags |= ruler_sums(image, place, columns, samples, table, model, profile);
+    if (shift < LANES_SHIFT) ruler_join_parts(shift, samples, table, profile, &flags);
     ruler_find(profile, place, flags, table, edges);
 }
 
@@ -283,22 +306,31 @@ static inline void ruler_measure_lanes(global const CODE *image, int rows, int c
                                 reals sine, constant real *table, constant real *model, private ruler_edge *edges) {
     ruler_place place;
     const masks flags = ruler_layout(rows, columns, x, y, cosine, sine, table, &place);
-    ruler_measure_placed(image, rows, columns, &place, flags, table, model, edges);
+    ruler_measure_placed(image, rows, columns, &place, LANES_SHIFT, (int)table[RULER_LENGTH], flags, table, model, edges);
 }
 
 // Measure up to 16 rulers in memory, `stride` numbers apart; lanes beyond `count` repeat the last ruler.
+//
+// Sampling takes most of the time. Up to 8 rulers are sampled in 2, 4, 8 or 16 equal parts side by side, which takes as
+// much less time; the samples are the same.
 static inline void ruler_measure(global const CODE *image, int rows, int columns, global const real *rulers, uint stride,
                           uint count, constant real *table, constant real *model, private ruler_edge *edges) {
+    int shift = LANES_SHIFT;
+    while (shift > 0 && count <= 1u << (shift - 1)) shift--;
+    const uint in_part = (1u << shift) - 1; // bits of the number of a ruler in a part
     real given[RULER_INPUTS][LANES];
     for (uint lane = 0; lane < LANES; lane++)
-        for (int k = 0; k < RULER_INPUTS; k++) given[k][lane] = rulers[stride * (ulong)min(lane, count - 1) + k];
+        for (int k = 0; k < RULER_INPUTS; k++)
+            given[k][lane] = rulers[stride * (ulong)min(lane & in_part, count - 1) + k];
     ruler_place place;
     const masks flags = ruler_layout(rows, columns, vload16(0, given[0]), vload16(0, given[1]), vload16(0, given[2]),
                                      vload16(0, given[3]), table, &place);
 #ifdef PER_RULER
     ruler_set_kind(vload16(0, given[4]), vload16(0, given[5]), vload16(0, given[6]), table, &place);
 #endif
-    ruler_measure_placed(image, rows, columns, &place, flags, table, model, edges);
+    const int parts = LANES >> shift, samples = ((int)table[RULER_LENGTH] + parts - 1) / parts;
+    place.first_sample = LANED(convert_real)((LANE_NUMBERS >> shift) * samples);
+    ruler_measure_placed(image, rows, columns, &place, shift, samples, flags, table, model, edges);
 }
 #else
 #include "ruler/ruler_group.h"

@@ -88,18 +88,22 @@ static inline masks ruler_begin(reals from, masks last, masks across) {
     return place > high ? high : place;
 }
 
-// Position of a sample on the current line, and the step to the next line.
+// Number of a sample, its position on the current line, and the step to the next line.
 typedef struct {
     masks column, row, across_x, across_y;
+    reals sample;
 } ruler_walk;
 
+// Start at sample `sample` of each lane's part of a ruler; behind the last sample of the ruler the last one is repeated.
 static inline void ruler_start(ruler_walk *walk, const ruler_place *place, int sample) {
+    const reals number = place->first_sample + (real)sample;
+    walk->sample = number < place->last_sample ? number : place->last_sample;
 #if !defined(LENS) && !defined(CAMERA)
     // Slightly less than a pixel, so that rounding cannot push lines over the border of an image that they span.
     const real less = RULER_ONE * (1 - (real)0x1p-20f);
     walk->across_x = LANED(convert_bits)(place->across_x * less);
     walk->across_y = LANED(convert_bits)(place->across_y * less);
-    const reals x = place->x + sample * place->along_x, y = place->y + sample * place->along_y;
+    const reals x = place->x + walk->sample * place->along_x, y = place->y + walk->sample * place->along_y;
     walk->column = ruler_begin(x, place->last_column, walk->across_x);
     walk->row = ruler_begin(y, place->last_row, walk->across_y);
 #endif
@@ -112,12 +116,12 @@ static inline void ruler_step(ruler_walk *walk) {
 }
 
 // Store fractions and pixel of the sample on the current line and advance to the next line; return flags.
-static inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int pitch, int sample, int line,
-                        constant real *model, private reals *x, private reals *y, private uint16 *pixel) {
+static inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int pitch, int line, constant real *model,
+                               private reals *x, private reals *y, private uint16 *pixel) {
     masks flags = 0;
 #if defined(LENS) || defined(CAMERA)
-    reals from_x = place->x + sample * place->along_x + line * place->across_x;
-    reals from_y = place->y + sample * place->along_y + line * place->across_y;
+    reals from_x = place->x + walk->sample * place->along_x + line * place->across_x;
+    reals from_y = place->y + walk->sample * place->along_y + line * place->across_y;
     flags = ruler_distort(&from_x, &from_y, place, model);
     const masks most_x = ruler_end(place->last_column), most_y = ruler_end(place->last_row);
     walk->column = LANED(convert_bits)(from_x * (real)RULER_ONE);
@@ -167,9 +171,9 @@ static inline void ruler_unpack(masks words, ruler_levels *a, ruler_levels *b, r
 #endif
 #define RULER_SLOTS (2 * RULER_AHEAD) // samples whose fractions are kept, a power of two
 
-// Sum the samples over the lines; return flags.
+// Sum `length` samples of each lane over the lines; return flags.
 static inline __attribute__((always_inline)) masks ruler_sums(global const CODE *image, const ruler_place *place, int pitch,
-                                                       constant real *table, constant real *model,
+                                                       int length, constant real *table, constant real *model,
                                                        private reals *profile) {
     uint16 pixels[2 * WIDTH];
     reals x[RULER_SLOTS * WIDTH], y[RULER_SLOTS * WIDTH];
@@ -178,19 +182,17 @@ static inline __attribute__((always_inline)) masks ruler_sums(global const CODE 
     for (int i = 0; i < RULER_AHEAD; i++) {
         ruler_start(&walk, place, i);
         for (int k = i * WIDTH; k < (i + 1) * WIDTH; k++)
-            flags |= ruler_next(&walk, place, pitch, i, k - i * WIDTH, model, x + k, y + k, pixels + k);
+            flags |= ruler_next(&walk, place, pitch, k - i * WIDTH, model, x + k, y + k, pixels + k);
     }
     global const CODE *below = image + pitch;
 #ifdef RULER_PACKED
     masks words[2 * WIDTH];
     for (int j = 0; j < WIDTH; j++) ruler_pack(image, below, pixels + j, words + j);
 #endif
-    const int length = (int)table[RULER_LENGTH];
     for (int i = 0; i < length; i++) {
         const int now = i % 2 * WIDTH, after = WIDTH - now, ahead = (i + RULER_AHEAD) % 2 * WIDTH;
         const int slot = i % RULER_SLOTS * WIDTH, next_slot = (i + RULER_AHEAD) % RULER_SLOTS * WIDTH;
-        const int next = min(i + RULER_AHEAD, length - 1);
-        ruler_start(&walk, place, next);
+        ruler_start(&walk, place, i + RULER_AHEAD);
         ruler_levels whole = 0;
         reals rest = 0;
         for (int j = 0; j < WIDTH; j++) {
@@ -201,8 +203,7 @@ static inline __attribute__((always_inline)) masks ruler_sums(global const CODE 
 #else
             ruler_fetch(image, below, (private const ulong *)(pixels + now + j), &a, &b, &c, &d);
 #endif
-            flags |= ruler_next(&walk, place, pitch, next, j, model, x + next_slot + j, y + next_slot + j,
-                                pixels + ahead + j);
+            flags |= ruler_next(&walk, place, pitch, j, model, x + next_slot + j, y + next_slot + j, pixels + ahead + j);
             b -= a;
             d -= c + b;
             c -= a;

@@ -95,22 +95,21 @@ PATCH_INLINE masks ruler_blend(masks column, masks row, private const masks *row
 #endif
 }
 
-// Start the walks of samples i and i + 1, or of the last sample.
-static inline void ruler_start_pair(private ruler_walk *walks, private const ruler_place *place, int i, int length) {
-    ruler_start(walks, place, min(i, length - 1));
-    ruler_start(walks + 1, place, min(i + 1, length - 1));
+// Start the walks of samples i and i + 1.
+static inline void ruler_start_pair(private ruler_walk *walks, private const ruler_place *place, int i) {
+    ruler_start(walks, place, i);
+    ruler_start(walks + 1, place, i + 1);
 }
 
-// Sum the samples over the lines; return flags. Of an odd number of samples the last one is computed twice.
-PATCH_INLINE masks ruler_patch_sums(global const uchar *image, private const ruler_place *place, int pitch,
+// Sum `length` samples of each lane over the lines; return flags. Of an odd number of samples one more is computed.
+PATCH_INLINE masks ruler_patch_sums(global const uchar *image, private const ruler_place *place, int pitch, int length,
                                     constant real *table, private reals *profile) {
     ruler_patch patches[PATCH_SLOTS][PATCHES];
     ruler_pixels pixels[2][PATCHES];
     ruler_walk walks[2];
-    const int length = (int)table[RULER_LENGTH];
     masks flags = 0;
     for (int pair = 0; pair < 2; pair++) {
-        ruler_start_pair(walks, place, 2 * pair, length);
+        ruler_start_pair(walks, place, 2 * pair);
         for (int k = 0; k < PATCHES; k++) ruler_place_patch(place, pitch, LINES_OF(k), walks, patches[pair] + k);
     }
     for (int k = 0; k < PATCHES; k++) ruler_load_patch(image, pitch, patches[0] + k, pixels[0] + k);
@@ -120,7 +119,7 @@ PATCH_INLINE masks ruler_patch_sums(global const uchar *image, private const rul
         private ruler_pixels *loaded = pixels[pair % 2], *loading = pixels[(pair + 1) % 2];
         masks whole[2] = {0, 0};
         reals rest[2] = {0, 0};
-        ruler_start_pair(walks, place, 2 * pair + 4, length);
+        ruler_start_pair(walks, place, 2 * pair + 4);
         for (int k = 0; k < PATCHES; k++) {
             ruler_load_patch(image, pitch, next + k, loading + k);
             ruler_place_patch(place, pitch, LINES_OF(k), walks, after + k);

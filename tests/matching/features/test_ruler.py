@@ -515,6 +515,32 @@ def test_canaries_and_bound_calls(device: Device, variant: Any, rng: np.random.G
             np.testing.assert_array_equal(out, theirs)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+@pytest.mark.parametrize(("length", "saturation"), [(64, None), (51, 255.0)])
+def test_few_rulers_in_parts_give_the_same_bits(
+    device: Device, dtype: Any, length: int, saturation: float | None, rng: np.random.Generator
+) -> None:
+    """Up to 8 rulers are sampled in parts side by side; the parts of a ruler are joined, and so are their flags."""
+    values, rulers = step(rng)
+    image = image_of(np.clip(values, 0.0, 254.0), dtype)
+    rulers[1, 0] = np.nan
+    x, y, cosine, sine = rulers[2]
+    at = 0.5 * length - 6.0  # near the end of a ruler: in its last part
+    image[
+        round(y + at * sine) - 1 : round(y + at * sine) + 2, round(x + at * cosine) - 1 : round(x + at * cosine) + 2
+    ] = 255
+    operation = replace(STRONGEST, length=length, saturation=saturation, ambiguity=None if saturation is None else 0.8)
+    every = operation(image, rulers, device=device)
+    assert bool(every.status[2] & Status.SATURATED) == (saturation is not None)
+    assert np.mean(np.isfinite(every.position)) > 0.5
+    for count in (1, 2, 3, 4, 5, 8, 9, 20):
+        for mine, theirs in zip(
+            operation(image, np.ascontiguousarray(rulers[:count]), device=device), every, strict=True
+        ):
+            if mine is not None:
+                np.testing.assert_array_equal(mine, theirs[:count], err_msg=str(count))
+
+
 @pytest.mark.parametrize("count", [1, 3, 5])
 def test_a_group_may_have_fewer_rulers(device: Device, count: int, rng: np.random.Generator) -> None:
     """Work-groups of four rulers: the last group computes the remaining rulers, and writes nothing beyond them."""

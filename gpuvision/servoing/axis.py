@@ -14,6 +14,7 @@ and one matrix exponential steps it. The payload is light: it does not act back 
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -150,7 +151,17 @@ _Mode = tuple[int, int, int, int]
 
 
 class AxisStepper:
-    """Exact motion of an axis between two commands."""
+    """Exact motion of an axis between two commands.
+
+    It has no state of a motion. `of` returns the same stepper for equal axes, with the matrix exponentials that earlier
+    plants needed: they are most of the time of a short placement.
+    """
+
+    @staticmethod
+    @functools.lru_cache(maxsize=16)
+    def of(axis: Axis) -> AxisStepper:
+        """Return the stepper of an axis."""
+        return AxisStepper(axis)
 
     def __init__(self, axis: Axis) -> None:
         self.axis = axis

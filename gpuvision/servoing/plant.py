@@ -59,7 +59,7 @@ class SimulatedPlant:
         if not watchdog > 0.0:
             raise ValueError(f"watchdog is {watchdog}, expected a time > 0, or infinity for none")
         self.axes, self._watchdog = tuple(axes), math.inf if math.isinf(watchdog) else _ticks(watchdog)
-        self._steppers = [AxisStepper(each) for each in axes]
+        self._steppers = [AxisStepper.of(each) for each in axes]
         position = numbers(start, (3,), "start")
         states = [each.start(where) for each, where in zip(axes, position, strict=True)]
         for axis, state, away in zip(axes, states, numbers(swing, (3,), "swing"), strict=True):

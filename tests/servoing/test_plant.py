@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from gpuvision.servoing.axis import Axis, FineStage
+from gpuvision.servoing.axis import Axis, AxisStepper, FineStage
 from gpuvision.servoing.plant import SimulatedPlant
 
 COMMANDS = ((0.0, 0.05), (0.02, -0.03), (0.045, 0.0), (0.06, 0.2))
@@ -205,6 +205,20 @@ def test_start_and_swing_of_each_axis() -> None:
     np.testing.assert_allclose(plant.pose(times), expected, atol=1e-12)
     with pytest.raises(ValueError, match=r"a plant has 3 axes \(x, y, theta\), got 2"):
         SimulatedPlant((Axis(), Axis()))
+
+
+def test_equal_axes_share_their_matrices_and_no_motion() -> None:
+    axis = Axis(lag=2e-3, resonance=2.0 * math.pi * 40.0)
+    assert AxisStepper.of(axis) is AxisStepper.of(dataclasses.replace(axis))
+    assert AxisStepper.of(axis) is not AxisStepper.of(dataclasses.replace(axis, lag=3e-3))
+    poses = []
+    for speed in (1.0, -2.0, 1.0):
+        plant = SimulatedPlant((axis, axis, Axis()))
+        for k in range(4):
+            plant.command(1e-3 * k, np.array([speed, 0.5 * speed, 0.0]))
+        poses.append(plant.pose(np.linspace(0.0, 4e-3, 9)))
+    np.testing.assert_array_equal(poses[0], poses[2])
+    np.testing.assert_allclose(poses[1], -2.0 * poses[0], atol=1e-15)
 
 
 def test_history_keeps_its_number_of_commands() -> None:

@@ -80,7 +80,8 @@ def named_files(path: str | Path) -> tuple[Path, ...]:
 def write_settings(source: str | Path, machine: Machine, path: str | Path) -> None:
     """Write a machine file with other settings.
 
-    These are camera window, frame rate, control, tolerance of the release, and times of the stages.
+    These are camera window, frame rate, control, times of the stages, and of the release the tolerance, the fixed wait
+    and the vibration.
 
     Parameters
     ----------
@@ -116,6 +117,10 @@ def write_settings(source: str | Path, machine: Machine, path: str | Path) -> No
     table["loop"] = {key: each for key, each in (loop | given).items() if each is not None}
     table["delay"] = {**table.get("delay", {}), **machine.stages}
     tolerance |= {"position": machine.tolerance.position, "angle": machine.tolerance.angle}
+    settling = machine.settling
+    found = {"wait": settling.wait, "frequency": settling.frequency, "damping": settling.damping}
+    if found := {key: each for key, each in found.items() if each is not None}:
+        table["settling"] |= found
     with atomic_write(path) as file:
         tomli_w.dump(table, file)
 

@@ -18,13 +18,12 @@ from gpuvision.accuracy.trial import median_times
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.servoing.loop import SimulatedClock
-from gpuvision.servoing.placement.control import Settling
 from gpuvision.servoing.placement.machine import Machine
-from gpuvision.servoing.placement.placing import Placement, count_commands, error_share, place_part, predicted_frames
+from gpuvision.servoing.placement.placing import Placement, count_commands, error_share, place_part
 from gpuvision.servoing.placement.plan import PlacementPlan
+from gpuvision.servoing.placement.rehearsal import IdentifyingMove
 from gpuvision.servoing.placement.vision import BoardPoseSensor, SimulatedCamera
 from gpuvision.servoing.plant import SimulatedPlant
-from gpuvision.servoing.settling import vibration_of_loop
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
 from gpuvision.validation import integer
 
@@ -32,8 +31,6 @@ Float64 = npt.NDArray[np.float64]
 
 # The board is rendered this far beyond the landing zone [px] (chosen).
 _MARGIN_PX = 32
-# Time in which the vibration of the steered head is identified [periods of the slowest resonance] (chosen).
-_IDENTIFICATION = 12.0
 _TIMED = 15  # frames of the timing, of which the median counts (chosen)
 # True poses in the time after the contact, in which a swing must stay within the tolerance.
 _LATER = 33
@@ -74,8 +71,10 @@ class PlacementCell:
         self._camera = SimulatedCamera(board, machine, lambda _: rest, rest, device=device, seed=seed)
         self._sensor = BoardPoseSensor(self._camera, machine, plan, self._camera.dtype, device=device)
 
-    def place(self, start: Float64, swing: Float64, true: Float64, offset: Float64) -> tuple[Placement, Float64, float]:
-        """Place a part from a start error (3,) with a vibration (3,).
+    def place(
+        self, start: Float64, swing: Float64, true: Float64, offset: Float64, seed: int
+    ) -> tuple[Placement, Float64, float]:
+        """Place a part from a start error (3,) with a vibration (3,), and with another sensor by a seed.
 
         Returns
         -------
@@ -83,7 +82,7 @@ class PlacementCell:
             Run, motion, and largest true error less the offset (3,) of calibration and drift after the contact, as a
             fraction of the tolerance.
         """
-        placement, plant = self._steer(self.machine, start, swing, true)
+        placement, plant = self._steer(self.machine, start, swing, true, seed)
         target, settling = self._plan.target, self.machine.settling
         motion = plant.pose(placement.record.time) - target
         if not placement.released:
@@ -96,18 +95,9 @@ class PlacementCell:
     def identify(self, start: Float64) -> None:
         """Find the vibration of the steered head in a move from a start error (3,), and take it for the rule."""
         machine = self.machine
-        slowest = min((axis.resonance for axis in machine.axes if axis.resonance), default=math.inf)
-        response = predicted_frames(machine, start) * machine.period
-        wait = response + _IDENTIFICATION * 2.0 * math.pi / slowest
-        longest = replace(machine.tolerance, max_time=machine.tolerance.max_time + wait + machine.landing)
-        moved = replace(machine, settling=Settling(rule="fixed", wait=wait), tolerance=longest)
-        placement, _ = self._steer(moved, start, np.array(machine.swing), machine.pipette_in_camera.pose)
-        if not placement.released:
-            raise ValueError(f"the vibration of the head cannot be identified: {placement.reason}")
-        found = vibration_of_loop(placement.record, placement.first_pose + response)
-        (fx, fy, ft), (dx, dy, dt) = (each.tolist() for each in found)
-        settling = replace(machine.settling, frequency=(fx, fy, ft), damping=(dx, dy, dt))
-        self.machine = replace(machine, settling=settling)
+        move = IdentifyingMove.of(machine, start)
+        placement, _ = self._steer(move.machine, start, np.array(machine.swing), machine.pipette_in_camera.pose)
+        self.machine = replace(machine, settling=move.settling(machine.settling, placement))
 
     def rest(self, count: int) -> Float64:
         """Return the errors (n, 3) of the measured poses of a head that rests at the target, in ``count`` frames."""
@@ -131,7 +121,7 @@ class PlacementCell:
         return median_times([lambda: sensor(machine.landing)], _TIMED)[0]
 
     def _steer(
-        self, machine: Machine, start: Float64, swing: Float64, true: Float64
+        self, machine: Machine, start: Float64, swing: Float64, true: Float64, seed: int | None = None
     ) -> tuple[Placement, SimulatedPlant]:
         """Run the loop for a part and return the run and the plant."""
         target = self._plan.target
@@ -142,7 +132,7 @@ class PlacementCell:
             watchdog=machine.control.watchdog * machine.period,
             swing=swing,
         )
-        self._camera.follow(plant.pose, true)
+        self._camera.follow(plant.pose, true, seed=seed)
         self._sensor.reset()
         landing = 0.0 if self._plan.landing is None else machine.landing
         return place_part(machine, target, plant, self._sensor, SimulatedClock(), landing=landing), plant

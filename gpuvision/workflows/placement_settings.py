@@ -15,7 +15,7 @@ from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.servoing.placement.budget import ModelTolerance, model_tolerance, predict_budget
 from gpuvision.servoing.placement.control import Control
 from gpuvision.servoing.placement.machine import Machine, PlacementCamera
-from gpuvision.servoing.placement.placing import predicted_frames
+from gpuvision.servoing.placement.placing import rule_frames
 from gpuvision.servoing.placement.plan import PlacementPlan, plan_placement, tracking_imaging
 from gpuvision.servoing.placement.rehearsal import start_zone
 from gpuvision.workflows.placement_cell import PlacementCell
@@ -34,7 +34,8 @@ _RULERS = (0.25, 0.5, 1.0)
 _GAINS = {"latest": (1.0, 0.5), "smith": (1.0, 0.5)}
 # Random motion in a frame of the Kalman filter, in standard deviations of a pose: 0.1 averages about ten frames.
 _MOTIONS = (1.0, 0.3, 0.1)
-# Tolerances of the release, relative to the machine's: a factor of 2 costs a frame or a few.
+# Tolerances of the release, or waits of the rule "fixed", relative to the machine's: a factor of 2 in the tolerance
+# costs a frame or a few.
 _RELEASES = (0.25, 0.5, 1.0, 2.0, 4.0)
 # Start errors for the mean time by theory, as parts of the landing zone: middles of equal parts of a half axis.
 _STARTS = (0.125, 0.375, 0.625, 0.875)
@@ -145,7 +146,7 @@ class PlacementSettings:
         """Yield the settings of a machine with a camera window: rulers, controls, and tolerances of the release."""
         rulers = 0
         for budget in self._budgets():
-            plan = self._planned(_released(machine, max(_RELEASES)), budget)
+            plan = self._planned(_with_tolerance(machine, max(_RELEASES)), budget)
             if plan is None or len(plan.features.length) == rulers:  # refused, or no more rulers have room
                 continue
             rulers = len(plan.features.length)
@@ -172,7 +173,7 @@ class PlacementSettings:
             for release in _RELEASES:
                 try:
                     controlled = replace(_released(machine, release), control=control)
-                except ValueError:  # unstable with this delay
+                except ValueError:  # unstable with this delay, or a wait above the longest time
                     continue
                 features = self._planned(controlled, budget, plan)
                 if features is None:
@@ -211,7 +212,7 @@ class PlacementSettings:
     def _by_theory(self, machine: Machine, budget: int, plan: PlacementPlan) -> Setting:
         """Return a setting with its error budget and the mean number of frames of the step response."""
         zone = start_zone(machine)
-        frames = [predicted_frames(machine, part * zone) for part in _STARTS]
+        frames = [rule_frames(machine, part * zone) for part in _STARTS]
         errors = predict_budget(machine, plan, frames)
         fixed, vision, total = (
             placement_error(np.sum([errors.sources[name] for name in names], axis=0), self._part_radius)
@@ -293,6 +294,14 @@ def _changed(machine: Machine, **changes: Any) -> Machine:
 
 
 def _released(machine: Machine, factor: float) -> Machine:
+    """Return the machine with its fixed wait, or else its release tolerance, multiplied by a factor."""
+    settling = machine.settling
+    if settling.wait is not None:
+        return replace(machine, settling=replace(settling, wait=factor * settling.wait))
+    return _with_tolerance(machine, factor)
+
+
+def _with_tolerance(machine: Machine, factor: float) -> Machine:
     """Return the machine with its release tolerance multiplied by a factor."""
     tolerance = machine.tolerance
     looser = replace(tolerance, position=factor * tolerance.position, angle=factor * tolerance.angle)

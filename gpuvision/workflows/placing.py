@@ -248,10 +248,11 @@ def simulate_placements(
 
     Notes
     -----
-    Every placement draws a new error of the calibration and a new drift from their covariances, and a start error
-    that is evenly distributed in the landing zone. The board is rendered as it is drawn, without etch bias. An axis
-    with a ``swing`` starts with a vibration, whose amplitude is evenly distributed. If the rule "vibration" has no
-    frequencies, a move without a release finds them first. `ReleaseRule` waits for the predicted number of frames;
+    Every placement draws a new error of the calibration and a new drift from their covariances, the noise of another
+    sensor with other differences between its pixels, and a start error that is evenly distributed in the landing zone.
+    The board is rendered as it is drawn, without etch bias. An axis with a ``swing`` starts with a vibration, whose
+    amplitude is evenly distributed. If the rule "vibration" has no frequencies, a move without a release finds them
+    first. `ReleaseRule` waits for the predicted number of frames;
     ``settled`` counts the frames of the true error, apart from this rule.
     """
     integer(count, "count", minimum=1)
@@ -267,13 +268,15 @@ def simulate_placements(
     }
     cell = PlacementCell(artwork, machine, plan, device, seed)
     starts, swings = rng.uniform(-zone, zone, (count, 3)), rng.uniform(-1.0, 1.0, (count, 3)) * np.array(machine.swing)
+    seeds = rng.integers(1 << 32, size=count).tolist()
     if machine.settling.rule == "vibration" and machine.settling.frequency is None:
         cell.identify(zone)
     sources = {name: each @ plan.camera_to_board.T for name, each in draws.items()}
     runs = []
     for number, (start, swing) in enumerate(zip(starts, swings, strict=True)):
         true = calibrated + draws["calibration"][number] + draws["drift"][number]
-        runs.append(cell.place(start, swing, true, sources["calibration"][number] + sources["drift"][number]))
+        offset = sources["calibration"][number] + sources["drift"][number]
+        runs.append(cell.place(start, swing, true, offset, seeds[number]))
         if progress is not None:
             progress(number + 1, count)
     placements, motions, reach = zip(*runs, strict=True)

@@ -172,7 +172,8 @@ def test_outcome_of_placements(
     truth = {name: placement_plans.Measured(each[2], each[0]) for name, each in SETTINGS.items()}
     truth["extra"] = placement_plans.Measured(5.0, 0.5)
     trials = tuple(
-        SimpleNamespace(name=name, seconds=each[0], error=each[1], aborted=0.0) for name, each in SETTINGS.items()
+        SimpleNamespace(name=name, seconds=each[0], error=each[1], fixed=0.0, vision=0.0, loop=each[1], aborted=0.0)
+        for name, each in SETTINGS.items()
     )
 
     def choose(trials: Any, check: Any, *, tolerance: float, rate: float) -> Any:
@@ -183,14 +184,14 @@ def test_outcome_of_placements(
 
     asked: list[str] = []
 
-    def measure(job: Any, trial: Any, device: Any, *, seed: int) -> placement_plans.Measured:
+    def measure(job: Any, trial: Any, device: Any, **_: Any) -> placement_plans.Measured:
         asked.append(trial.name)
         return truth[trial.name]
 
     job: Any = SimpleNamespace(
         artwork=None, target=None, machine=None, part_radius=1e-3, tolerance=tolerance, rate=rate
     )
-    extra = SimpleNamespace(name="extra", seconds=0.4, aborted=0.0)
+    extra = SimpleNamespace(name="extra", seconds=0.4, error=1.0, fixed=0.0, vision=0.0, loop=1.0, aborted=0.0)
     tried = SimpleNamespace(trials=trials, left_out=("extra",), check=None)
     monkeypatch.setattr(placement_plans, "random_job", lambda rng: job)
     monkeypatch.setattr(placement_plans, "try_placements", lambda *_, **__: tried)
@@ -217,8 +218,15 @@ def test_a_setting_that_drops_a_part_is_no_accurate_one(monkeypatch: pytest.Monk
     """The true error: vision and servo of the runs, and the covariance of calibration and drift."""
     runs = [SimpleNamespace(released=True, record=SimpleNamespace(time=np.array([0.0, each]))) for each in (1.0, 3.0)]
     sources = {"vision and servo": np.array([[3.0, 0.0, 0.2], [0.0, 4.0, 0.0]])}
-    result = SimpleNamespace(placements=runs, sources=sources)
-    monkeypatch.setattr(placement_plans, "simulate_placements", lambda *_, **__: result)
+    counts, seeds = list[int](), set[int]()
+
+    def simulate(*_: Any, count: int, seed: int, **__: Any) -> Any:
+        counts.append(count)
+        seeds.add(seed)
+        rows = {name: np.tile(each, (count // 2, 1)) for name, each in sources.items()}
+        return SimpleNamespace(placements=runs * (count // 2), sources=rows)
+
+    monkeypatch.setattr(placement_plans, "simulate_placements", simulate)
     covariances = (np.diag([1.0, 2.0, 0.25]), np.diag([0.5, 0.0, 0.0]))
     machine: Any = SimpleNamespace(
         pipette_in_camera=SimpleNamespace(pose_covariance=covariances[0]),
@@ -229,11 +237,28 @@ def test_a_setting_that_drops_a_part_is_no_accurate_one(monkeypatch: pytest.Monk
     job: Any = SimpleNamespace(artwork=None, target=None, machine=machine, part_radius=2.0)
     trial: Any = SimpleNamespace(machine=machine, budget=60)
     device: Any = None
-    found = placement_plans.measure(job, trial, device, seed=1)
+
+    def measured(tolerance: float, longest: float) -> placement_plans.Measured:
+        counts.clear()
+        return placement_plans.measure(job, trial, device, tolerance=tolerance, longest=longest, seed=1)
+
     square = (4.5 + 1.0 + 0.5) + (8.0 + 2.0) + 4.0 * (0.02 + 0.25)
-    assert found == (pytest.approx(math.sqrt(square)), 2.75)
+    error = math.sqrt(square)
+    found = measured(9.0, 9.0)
+    assert found[:2] == (pytest.approx(error), pytest.approx(2.75))
+    # Squares of 9 + 4 * 0.04 and of 16: half their difference is less than sqrt(2) of their mean, which counts.
+    sigma = math.sqrt(2.0 / 24.0) * (9.16 + 16.0) / 2.0 / (2.0 * error)
+    assert found[2:] == (pytest.approx(sigma), pytest.approx(1.0 / math.sqrt(23.0)))
+    assert counts == [24]
+    # Close to the tolerance, or accurate and close to the longest time, more placements follow, with other seeds.
+    for tolerance, longest in ((error + sigma, 9.0), (error - sigma, 9.0), (9.0, 2.9)):
+        assert measured(tolerance, longest)[:2] == (pytest.approx(error), pytest.approx(2.75))
+        assert counts[:2] == [24, 72]
+    assert len(seeds) >= 2
+    assert measured(1.0, 2.75)[0] == pytest.approx(error)
+    assert counts == [24]
     runs[1].released = False
-    assert placement_plans.measure(job, trial, device, seed=1) == (math.inf, math.inf)
+    assert measured(9.0, 9.0) == (math.inf, math.inf, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(

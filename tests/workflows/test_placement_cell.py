@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gpuvision.servoing.placement import rehearsal
 from gpuvision.workflows import placement_cell
 from gpuvision.workflows.placement_cell import PlacementCell, Repeatability
 
@@ -48,16 +49,17 @@ def test_vibration_is_identified_in_twelve_periods_of_the_slowest_resonance(monk
     def changed(old: Any, **changes: Any) -> Any:
         return SimpleNamespace(**{**vars(old), **changes})
 
-    monkeypatch.setattr(placement_cell, "replace", changed)
-    monkeypatch.setattr(placement_cell, "Settling", SimpleNamespace)
-    monkeypatch.setattr(placement_cell, "predicted_frames", lambda machine, start: 20)
+    for module in (rehearsal, placement_cell):
+        monkeypatch.setattr(module, "replace", changed)
+    monkeypatch.setattr(rehearsal, "Settling", SimpleNamespace)
+    monkeypatch.setattr(rehearsal, "predicted_frames", lambda machine, start: 20)
     started: list[float] = []
 
     def vibration(record: Any, start: float) -> Any:
         started.append(start)
         return np.array([[30.0, 20.0, 0.0], [0.02, 0.03, 0.0]])
 
-    monkeypatch.setattr(placement_cell, "vibration_of_loop", vibration)
+    monkeypatch.setattr(rehearsal, "vibration_of_loop", vibration)
     machine: Any = SimpleNamespace(
         axes=[SimpleNamespace(resonance=2.0 * math.pi * frequency) for frequency in (30.0, 20.0, 0.0)],
         period=1e-3,
@@ -142,14 +144,14 @@ def test_reach_is_the_largest_error_in_a_period_after_the_contact(monkeypatch: p
     monkeypatch.setattr(cell, "_steer", lambda *args: given.append(args) or (run, plant))
     monkeypatch.setattr(placement_cell, "error_share", lambda _, error: float(np.abs(error).max()))
     start, swing, true = (np.full(3, value) for value in (1.0, 2.0, 3.0))
-    placement, motion, reach = cell.place(start, swing, true, offset)
-    assert given == [(machine, start, swing, true)]
+    placement, motion, reach = cell.place(start, swing, true, offset, 7)
+    assert given == [(machine, start, swing, true, 7)]
     assert placement is run
     np.testing.assert_allclose(motion, np.outer(times, [1.0, 2.0, 3.0]) - target)
     np.testing.assert_allclose(asked[1], np.linspace(1.5, 1.6, 33))
     assert reach == pytest.approx(3.0 * 1.6 - 1.5)
     for axis in machine.axes:
         axis.resonance = 0.0
-    assert cell.place(start, swing, true, offset)[2] == pytest.approx(3.0 * 1.5 - 1.5)  # rigid axes: at the contact
+    assert cell.place(start, swing, true, offset, 7)[2] == pytest.approx(3.0 * 1.5 - 1.5)  # rigid axes: at the contact
     run.released = False
-    assert math.isnan(cell.place(start, swing, true, offset)[2])
+    assert math.isnan(cell.place(start, swing, true, offset, 7)[2])

@@ -601,16 +601,16 @@ class Cell:
         self.calls.append(("identify", zone.copy()))
         self.machine = SimpleNamespace(**{**vars(self.machine), "identified": True})
 
-    def place(self, start: Any, swing: Any, true: Any, offset: Any) -> Any:
+    def place(self, start: Any, swing: Any, true: Any, offset: Any, seed: int) -> Any:
         number = sum(call[0] == "place" for call in self.calls)
-        self.calls.append(("place", start.copy(), swing.copy(), true.copy(), offset.copy()))
+        self.calls.append(("place", start.copy(), swing.copy(), true.copy(), offset.copy(), seed))
         run = SimpleNamespace(released=number != 1, steered_frames=10 + number)
         return run, np.array([start, offset + 1e-6 * (number + 1)]), 0.25 * number
 
 
 @pytest.mark.parametrize("rule", ["vibration", "known", "response"])
 def test_placements_begin_at_random_errors_within_the_landing_zone(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Start errors fill 0.9 of the zone less the swing; calibration and drift are drawn anew for each part."""
+    """Start errors fill 0.9 of the zone less the swing; calibration, drift and sensor are drawn anew for each part."""
     for name, function in (
         ("check_resonances", lambda machine: None),
         ("plan_placement", lambda *given, **how: planned.append((given, how)) or plan),
@@ -653,6 +653,7 @@ def test_placements_begin_at_random_errors_within_the_landing_zone(rule: str, mo
         np.testing.assert_allclose(told, zone)
         assert result.machine.identified
     starts, swings, true, offsets = (np.array([call[k] for call in calls]) for k in range(1, 5))
+    assert len({call[5] for call in calls}) == count
     assert np.all(np.abs(starts) <= zone)
     assert np.all(np.abs(starts).max(axis=0) > 0.8 * zone)
     assert np.all(starts.min(axis=0) < -0.5 * zone)

@@ -151,6 +151,32 @@ def test_sampling_error_of_frames_without_noise_is_within_the_budget(
     assert np.all((ratio > 0.1) & (ratio < 1.0)), ratio
 
 
+def test_another_sensor_has_other_pixels(artwork: Artwork, machine: Machine, device: Device) -> None:
+    """The mean of many frames shows the differences between the pixels: alike for one seed, independent for two."""
+    place = np.array(TARGET[:2])
+    board = ReflectanceMap.of(
+        artwork, pixel=machine.camera.pixel, region=(place - 3e-3, place + 3e-3), blur_px=machine.camera.blur_px
+    )
+    rest, true = np.array(TARGET), machine.pipette_in_camera.pose
+
+    def nozzle(time: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(rest, (*np.shape(time), 3))
+
+    camera = vision.SimulatedCamera(board, machine, nozzle, true, device=device, seed=1)
+
+    def mean_frame(seed: int | None) -> np.ndarray:
+        camera.follow(nozzle, true, seed=seed)
+        frames = camera(23.5 * machine.period)
+        assert len(frames) == 24
+        return np.mean([each.image for each in frames], axis=0, dtype=np.float64)
+
+    first, again, other = mean_frame(None), mean_frame(None), mean_frame(2)
+    # Noise from frame to frame averages out; the differences between the pixels do not.
+    assert np.std(first - again) < 0.5 * np.std(first - other)
+    assert np.mean(first) == pytest.approx(np.mean(other), rel=0.01)
+    assert np.std(mean_frame(2) - other) < 0.5 * np.std(first - other)
+
+
 def test_frames_that_arrive_during_the_registration_are_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first frame is registered, which takes 0.25 s; the next one is the first that arrives after that."""
     monkeypatch.setattr(vision, "move_view", lambda view, pose: SimpleNamespace(pose=pose))

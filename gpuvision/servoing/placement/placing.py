@@ -112,7 +112,7 @@ class ReleaseRule:
         machine = self._machine
         if self.start is None:
             self.start, self._first = error.copy(), time
-            self.frames = _frames_of_rule(machine, error)
+            self.frames = rule_frames(machine, error)
         self._row = self._row + 1 if error_share(machine, error) <= 1.0 else 0
         if time - self._first < (self.frames - 0.5) * machine.period:
             return False
@@ -146,8 +146,8 @@ def swing_limit(machine: Machine) -> Float64:
     return np.array([side, side, machine.tolerance.angle])
 
 
-def _frames_of_rule(machine: Machine, error: Float64) -> int:
-    """Return the least number of frames from the first measured error (3,) to the release."""
+def rule_frames(machine: Machine, error: npt.ArrayLike) -> int:
+    """Return the least number of frames from the first measured error (3,) to the release, by the rule of a machine."""
     if machine.settling.wait is not None:
         return math.ceil(machine.settling.wait * machine.rate - 1e-9)
     return predicted_frames(machine, error)

@@ -13,13 +13,16 @@ from gpuvision.servoing.loop import SimulatedClock
 from gpuvision.servoing.observer import PoseMeasurement
 from gpuvision.servoing.placement.control import Settling
 from gpuvision.servoing.placement.machine import Machine
-from gpuvision.servoing.placement.placing import count_commands, place_part, predicted_frames
+from gpuvision.servoing.placement.placing import Placement, count_commands, place_part, predicted_frames
 from gpuvision.servoing.placement.plan import PlacementPlan
 from gpuvision.servoing.plant import SimulatedPlant
+from gpuvision.servoing.settling import vibration_of_loop
 from gpuvision.servoing.simulated_sensor import SimulatedPoseSensor
 
 Float64 = npt.NDArray[np.float64]
 
+# Time in which the vibration of the steered head is identified [periods of the slowest resonance] (chosen).
+_IDENTIFICATION = 12.0
 _PERIODS = 10.0  # length of the run beyond the step response [periods of the slowest resonance] (chosen)
 _START = 0.5  # start error as a part of the landing zone (chosen)
 # Standard deviations of the poses that the observer gets, as a part of the tolerance (chosen): the poses have no error.
@@ -100,10 +103,74 @@ def start_zone(machine: Machine) -> Float64:
     return zone
 
 
+class IdentifyingMove(NamedTuple):
+    """Move of a head without a release, which shows the vibration of the steered head.
+
+    Attributes
+    ----------
+    machine : Machine
+        Machine that waits until the head only swings, and for twelve periods of the slowest resonance.
+    response : float
+        Time from the first measured pose after which the head only swings [s].
+    """
+
+    machine: Machine
+    response: float
+
+    @classmethod
+    def of(cls, machine: Machine, start: Float64) -> IdentifyingMove:
+        """Return the move of a machine from a start error (3,)."""
+        slowest = min((axis.resonance for axis in machine.axes if axis.resonance), default=math.inf)
+        response = predicted_frames(machine, start) * machine.period
+        wait = response + _IDENTIFICATION * 2.0 * math.pi / slowest
+        longest = replace(machine.tolerance, max_time=machine.tolerance.max_time + wait + machine.landing)
+        return cls(replace(machine, settling=Settling(rule="fixed", wait=wait), tolerance=longest), response)
+
+    def settling(self, settling: Settling, placement: Placement) -> Settling:
+        """Return a rule "vibration" with the frequencies and damping ratios of the move.
+
+        Raises
+        ------
+        ValueError
+            The move was aborted, or is too short.
+        """
+        if not placement.released:
+            raise ValueError(f"the vibration of the head cannot be identified: {placement.reason}")
+        found = vibration_of_loop(placement.record, placement.first_pose + self.response)
+        (fx, fy, ft), (dx, dy, dt) = (each.tolist() for each in found)
+        return replace(settling, frequency=(fx, fy, ft), damping=(dx, dy, dt))
+
+
+def identify_vibration(machine: Machine, plan: PlacementPlan) -> Machine:
+    """Return a machine with the rule "vibration" with the vibration of its steered head, found without images.
+
+    Raises
+    ------
+    ValueError
+        The move that shows the vibration was aborted, or is too short.
+    """
+    zone = start_zone(machine)
+    move = IdentifyingMove.of(machine, zone)
+    placement, _ = _steer(move.machine, plan, zone, np.array(machine.swing), np.zeros(3), 0)
+    return replace(machine, settling=move.settling(machine.settling, placement))
+
+
 def _rehearse(
     machine: Machine, plan: PlacementPlan, start: Float64, swing: Float64, offset: Float64, seed: int
 ) -> tuple[Float64, float]:
     """Return error (3,) and time of a placement; NaN where the part is not released."""
+    placement, plant = _steer(machine, plan, start, swing, offset, seed)
+    if not placement.released:
+        return np.full(3, math.nan), math.nan
+    released = placement.record.time[-1]
+    error = plant.pose(released) - plan.target
+    return error, float(machine.delay.latency + released + machine.settling.lead)
+
+
+def _steer(
+    machine: Machine, plan: PlacementPlan, start: Float64, swing: Float64, offset: Float64, seed: int
+) -> tuple[Placement, SimulatedPlant]:
+    """Run the loop for a part with poses of the predicted covariance and an offset (3,); return run and plant."""
     plant = SimulatedPlant(
         machine.axes,
         start=plan.target + start,
@@ -126,12 +193,7 @@ def _rehearse(
         fault=seen,
         seed=seed,
     )
-    placement = place_part(machine, plan.target, plant, sensor, SimulatedClock(), landing=landing)
-    if not placement.released:
-        return np.full(3, math.nan), math.nan
-    released = placement.record.time[-1]
-    error = plant.pose(released) - plan.target
-    return error, float(machine.delay.latency + released + machine.settling.lead)
+    return place_part(machine, plan.target, plant, sensor, SimulatedClock(), landing=landing), plant
 
 
 def check_resonances(machine: Machine) -> None:

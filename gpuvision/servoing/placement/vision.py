@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -83,22 +84,28 @@ class SimulatedCamera:
         device: Device | None = None,
         seed: int = 0,
     ) -> None:
-        render = board_renderer(board, machine.camera, seed=seed)
-        device = Device.best() if device is None else device
-        self._real = np.dtype(np.float64 if device.has_double else np.float32)
-        self._bound = render.bind(device, (1, _SUBPOSES, 3), self._real)
+        self._render_board = board_renderer(board, machine.camera, seed=seed)
+        self._device = Device.best() if device is None else device
+        self._real = np.dtype(np.float64 if self._device.has_double else np.float32)
+        self._bound = self._render_board.bind(self._device, (1, _SUBPOSES, 3), self._real)
         delay = machine.delay
         self._period, self._latency, self._exposure = machine.period, delay.latency, delay.exposure
         self._nozzle, self._camera_in_pipette = nozzle, invert_pose(pipette_in_camera)
-        self.dtype = render.dtype
+        self.dtype = self._render_board.dtype
         """Dtype of the frames."""
         self._frame = self._first = 0
 
-    def follow(self, nozzle: Callable[[Float64], Float64], pipette_in_camera: Float64) -> None:
+    def follow(
+        self, nozzle: Callable[[Float64], Float64], pipette_in_camera: Float64, *, seed: int | None = None
+    ) -> None:
         """Start again at time 0 with another motion and another true pose of the nozzle in the camera frame.
 
-        The numbers of the frames, and so their noise, go on.
+        With a seed also with another sensor of the same kind: other noise, and other differences between the pixels.
+        Without one the numbers of the frames, and so their noise, go on.
         """
+        if seed is not None:
+            self._render_board = replace(self._render_board, seed=seed)
+            self._bound = self._render_board.bind(self._device, (1, _SUBPOSES, 3), self._real)
         self._nozzle, self._camera_in_pipette = nozzle, invert_pose(pipette_in_camera)
         self._first = self._frame
 

@@ -26,6 +26,7 @@ _BACKGROUND = 5.0  # width of the median filter that finds the board, in apertur
 _MOST_FITTED = 200  # apertures of the least-squares fit. Chosen: they determine the place to a tenth of one offset
 _ROUNDS = 6  # of the least-squares fit
 _CONVERGED = 1e-8  # shift of a round [m]
+_CONVERGED_SIGMAS = 0.1  # or [standard deviations]. Derived: it adds 0.5 % to the root-mean-square error
 _TUKEY = 4.685
 _SECOND_PEAK = 0.95  # a second place whose correlation reaches this share of the best one is as good. Chosen
 
@@ -50,6 +51,8 @@ class Alignment:
         Correlation of the height map with the pattern, 0 to 1.
     second_correlation : float
         Correlation of the second best place, more than half an aperture away.
+    converged : bool
+        Whether the last round of the fit moved the centre by at most a tenth of its standard deviation. Default True.
     """
 
     placement: BoardPlacement
@@ -59,6 +62,7 @@ class Alignment:
     count: int
     correlation: float
     second_correlation: float
+    converged: bool = True
 
     @property
     def is_ambiguous(self) -> bool:
@@ -124,6 +128,7 @@ def align_apertures(
         count=fit.deposits,
         correlation=best,
         second_correlation=second,
+        converged=fit.converged,
     )
 
 
@@ -135,6 +140,7 @@ class _RigidFit(NamedTuple):
     residual_scale: float
     deposits: int
     centre: Float64
+    converged: bool = True
 
 
 def _fit_deposits(
@@ -158,10 +164,11 @@ def _fit_deposits(
         )
         fit = _fit_rigid(found, placement)
         before, placement = placement, fit.placement
-        moved = placement.to_map(middle) - before.to_map(middle)
-        if margin == settings.margin and np.hypot(*moved) < _CONVERGED:
+        moved = float(np.hypot(*(placement.to_map(middle) - before.to_map(middle))))
+        if margin == settings.margin and moved < _CONVERGED:
             break
-    return fit
+    sigma = math.sqrt(float(np.trace(fit.covariance[:2, :2])))
+    return fit._replace(converged=moved <= max(_CONVERGED, _CONVERGED_SIGMAS * sigma))
 
 
 def _coarse_heights(z: Float64, grid: Grid, apertures: Sequence[Aperture]) -> tuple[Grid, Float64]:

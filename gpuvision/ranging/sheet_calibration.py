@@ -51,6 +51,9 @@ Float64 = npt.NDArray[np.float64]
 
 # Tuning constant of Tukey's loss: 95 % efficiency for normal noise.
 _TUKEY = 4.685
+# Square of the last step [standard deviations] of a fit that has converged. Derived: a tenth of a standard deviation
+# adds 0.5 % to the root-mean-square error.
+_CONVERGED_SQUARE = 0.01
 # Degrees of freedom that the line of a view contributes to the tests: offset, direction and curvature.
 _NUMBERS_PER_VIEW = 3
 
@@ -208,6 +211,7 @@ class _Solution:
     noise_covariance: Float64
     by_camera: Float64
     view_ratio: float
+    converged: bool
 
     @classmethod
     def of(cls, frame: SheetFrame, readings: SheetReadings, sigma: float, count: int, limits: SheetLimits) -> _Solution:
@@ -231,6 +235,7 @@ class _Solution:
             noise_covariance=max(ratio, 1.0) * inverse,
             by_camera=inverse @ by_camera,
             view_ratio=ratio,
+            converged=float(change @ side) <= _CONVERGED_SQUARE,
         )
 
 
@@ -318,4 +323,5 @@ def _result(solution: _Solution, test: BendTest | None, sigma: float, lengths: S
         bend_test=test,
         residuals=tuple(np.split(pixels, ends)),
         coordinates=tuple(np.split(system.flat, ends)),
+        converged=solution.converged,
     )

@@ -63,6 +63,8 @@ class SheetFit:
         Per view (n,): distance of each reading from the sheet's line [px]; NaN for outliers.
     coordinates : tuple of numpy.ndarray
         Per view (n, 2): G and H of each reading [m].
+    converged : bool
+        Whether the last step of the fit was at most a tenth of the standard deviations. Default True.
     """
 
     origin: Float64
@@ -77,6 +79,7 @@ class SheetFit:
     bend_test: BendTest | None
     residuals: tuple[Float64, ...]
     coordinates: tuple[Float64, ...]
+    converged: bool = True
 
     @property
     def normal(self) -> Float64:

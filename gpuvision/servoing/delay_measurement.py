@@ -28,6 +28,7 @@ from gpuvision.validation import finite, integer
 
 Float64 = npt.NDArray[np.float64]
 
+_MAX_ITERATIONS = 1000  # of the simplex
 # Nodes [sigma] and weights of the trapezoids over the jitter (chosen). The command has a corner at each frame: Gaussian
 # quadrature with few nodes gives the likelihood a ripple as large as its curvature.
 _NODES = np.linspace(-4.0, 4.0, 21)
@@ -62,6 +63,9 @@ class MeasuredDelay(NamedTuple):
         Mean delay in frames: in units of the median time between two samples.
     delays : numpy.ndarray
         (k,): delays [s] of the single samples that show it, in which jitter exceeds noise. They contain the noise.
+    converged : bool
+        Whether the search for the largest likelihood ended at its maximum, not at its largest number of iterations.
+        Default True.
     """
 
     mean: float
@@ -72,6 +76,7 @@ class MeasuredDelay(NamedTuple):
     noise: float
     frames: float
     delays: Float64
+    converged: bool = True
 
 
 def excitation(count: int, speed: float, *, hold: int = 4, seed: int = 0) -> Float64:
@@ -163,7 +168,8 @@ def measure_delay(
             f"the measured position does not follow the command (correlation {correlation:.2f}); excite the axis"
         )
     fit = _Likelihood(times, known, seen, float(delays[-1]), step)
-    best = min((fit.maximise(start, jitter * step) for jitter in (0.03, 0.3)), key=fit.cost)
+    found = (fit.maximise(start, jitter * step) for jitter in (0.03, 0.3))
+    best, is_largest = min(found, key=lambda each: fit.cost(each[0]))
     covariance = fit.covariance(best)
     scale, _, noise = fit.linear(best)
     mean, jitter = float(best[0]) * step, math.exp(best[1]) * step
@@ -177,6 +183,7 @@ def measure_delay(
         noise,
         mean / step,
         fit.single_delays(best) if is_seen else np.zeros(0),
+        is_largest,
     )
 
 
@@ -262,13 +269,14 @@ class _Likelihood:
         _, _, residual, variance = self._weighted(parameters, scale)
         return 0.5 * (residual**2 / variance + np.log(variance))
 
-    def maximise(self, delay: float, jitter: float) -> Float64:
-        """Return the parameters of the largest likelihood, from a first delay and jitter [s]."""
+    def maximise(self, delay: float, jitter: float) -> tuple[Float64, bool]:
+        """Return the parameters of largest likelihood, from a first delay and jitter [s], and whether it converged."""
         first = np.array([max(delay / self._step, 0.1), math.log(jitter / self._step), 0.0])
         _, _, residual, _ = self._weighted(first, 0.0)
         first[2] = math.log(max(float(np.std(residual)), 1e-9 * self._unit) / self._unit)
-        options = {"xatol": 1e-5, "fatol": 1e-6, "maxiter": 1000, "initial_simplex": _simplex(first)}
-        return np.asarray(minimize(self.cost, first, method="Nelder-Mead", options=options).x, np.float64)
+        options = {"xatol": 1e-5, "fatol": 1e-6, "maxiter": _MAX_ITERATIONS, "initial_simplex": _simplex(first)}
+        found = minimize(self.cost, first, method="Nelder-Mead", options=options)
+        return np.asarray(found.x, np.float64), bool(found.success)
 
     def covariance(self, best: Float64) -> Float64:
         """Return the covariance (3, 3): inverse Hessian, squared gradients of the samples, inverse Hessian."""

@@ -106,6 +106,8 @@ class DelayAnalysis:
                 f"the measured motion is {self.measured.scale:.3g} times the commanded motion; check the units of the "
                 "columns command and measured [m] or [rad]"
             )
+        if not self.measured.converged:
+            found.append("the fit of the delay stopped before it converged; record more motion")
         sampled = self.measured.mean / self.measured.frames if self.measured.frames else self.budget.period
         if abs(sampled / self.budget.period - 1.0) > _PERIOD_ERROR:
             found.append(

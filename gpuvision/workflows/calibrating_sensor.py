@@ -388,6 +388,10 @@ def _warnings(geometry: SensorGeometry, lines: Sequence[LineImage]) -> list[str]
             f"the laser lines scatter {math.sqrt(sheet.view_ratio):.1f} times as much from view to view as readings "
             "and poses predict; the uncertainties include it"
         )
+    if not sheet.converged:
+        warnings.append(
+            "the fit of the sheet stopped before it converged; its uncertainties are those of its last step"
+        )
     if transport is None:
         warnings.append(
             "no transport views: the part is assumed to move along -(g x h), perpendicular to the sheet; a negative "

@@ -144,6 +144,8 @@ class PasteInspection:
                 "the paste pattern fits about as well at another place of the search range; give --initial-pose and a "
                 "smaller --search-range, or --pose"
             )
+        if self.alignment is not None and not self.alignment.converged:
+            found.append("the fit of the board's place to the deposits did not converge; measure again with --pose")
         if self.alignment is not None and self.alignment.correlation < _WEAK_CORRELATION:
             found.append(
                 f"the height map correlates with the paste pattern by {self.alignment.correlation:.2f} only; check the "

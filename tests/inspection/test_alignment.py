@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from gpuvision.inspection import alignment
 from gpuvision.inspection.alignment import (
     _coarse_heights,
     _fit_rigid,
@@ -27,7 +28,7 @@ PLACES = [(0.3, 0.3), (1.2, 0.35), (2.3, 0.5), (0.4, 1.4), (1.5, 1.1), (2.2, 1.9
 
 
 @pytest.mark.parametrize("side", ["top", "bottom"])
-def test_a_shifted_and_turned_board_is_found(rng, side):
+def test_a_shifted_and_turned_board_is_found(rng, side, monkeypatch):
     """Shift of 0.4 mm and rotation of 2 degrees; one deposit is missing and one is displaced."""
     grid = board_grid(300, 280, cell=15e-6)
     apertures = [circle(str(k), (1e-3 * x, 1e-3 * y), 150e-6) for k, (x, y) in enumerate(PLACES)]
@@ -44,6 +45,10 @@ def test_a_shifted_and_turned_board_is_found(rng, side):
     assert found.count == 6
     assert found.correlation > 0.6
     assert not found.is_ambiguous
+    assert found.converged
+    monkeypatch.setattr(alignment, "_ROUNDS", 1)
+    first = align_apertures(z, grid, apertures, SETTINGS, initial=initial, search_range=(0.6e-3, math.radians(3.0)))
+    assert not first.converged
 
 
 def test_the_covariance_is_the_spread(rng):
@@ -116,7 +121,7 @@ def test_the_covariance_of_few_deposits_is_their_variance(rng, count):
     centre = 1e-3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     errors, variances = [], []
     for _ in range(250):
-        found, covariance, _, _, middle = _fit_rigid(
+        found, covariance, _, _, middle, _ = _fit_rigid(
             SimpleNamespace(offset=rng.normal(0, 1e-6, (count, 2)), centre=centre), here
         )
         shift = found.to_map(middle) - middle

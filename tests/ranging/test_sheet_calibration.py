@@ -243,6 +243,8 @@ def test_the_fit_ends_when_the_noise_does_not_change(rng: np.random.Generator, m
         counts.append(calls)
     assert counts[0] == counts[1]
     np.testing.assert_array_equal(fits[0].origin, fits[1].origin)
+    assert fits[0].converged
+    assert not fit_sheet(camera_of(TRUTH), lines, limits=replace(DEFAULT_LIMITS, max_iterations=1)).converged
 
 
 def test_derivatives_of_the_distances(rng):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gpuvision.servoing import delay_measurement
 from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.delay_measurement import MeasuredDelay, chirp, excitation, measure_delay
 from gpuvision.servoing.plant import SimulatedPlant
@@ -81,7 +82,7 @@ def test_uncertainty_covers_the_error_of_a_whole_delay_in_100_recordings() -> No
     _check_sigma_of_a_whole_delay(100)
 
 
-def test_missing_frames_and_a_chirp() -> None:
+def test_missing_frames_and_a_chirp(monkeypatch: pytest.MonkeyPatch) -> None:
     time = PERIOD * np.arange(500)
     command = chirp(500, PERIOD, 1e-3, 2.0, 60.0)
     rng = np.random.default_rng(1)
@@ -89,6 +90,9 @@ def test_missing_frames_and_a_chirp() -> None:
     measured[rng.random(500) < 0.3] = np.nan
     found = measure_delay(time, command, measured)
     assert abs(found.mean - 4.2e-3) < 1e-5
+    assert found.converged
+    monkeypatch.setattr(delay_measurement, "_MAX_ITERATIONS", 3)
+    assert not measure_delay(time, command, measured).converged
 
 
 def test_delay_of_a_running_loop() -> None:

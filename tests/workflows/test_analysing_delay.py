@@ -147,5 +147,7 @@ def test_warnings() -> None:
     (text,) = analysis(measured=measured(frames=2.6)).warnings
     assert text.startswith("the samples of the recording are 11.54 ms apart, the frames 10 ms")
     assert analysis(measured=measured(frames=2.8)).warnings == analysis(measured=measured(frames=0.0)).warnings == ()
+    (text,) = analysis(measured=measured(converged=False)).warnings
+    assert text.startswith("the fit of the delay stopped before it converged")
     (text,) = analysis(budget=DelayBudget(period=PERIOD)).warnings
     assert text.startswith("the delay is 0")

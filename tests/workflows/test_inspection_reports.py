@@ -161,6 +161,7 @@ def changed(**values: Any) -> Alignment:
     [
         ({"alignment": changed(second_correlation=0.77)}, "the paste pattern fits about as well at another place"),
         ({"alignment": changed(correlation=0.29, second_correlation=0.0)}, "the height map correlates with the paste"),
+        ({"alignment": changed(converged=False)}, "the fit of the board's place to the deposits did not converge"),
         ({"deposits": {"board_scatter": 4.1e-6}}, "the board scatters by 4.1 um about the reference surfaces, the sig"),
         ({"settings": PasteSettings(stencil=1e-4, threshold=7.9e-6)}, "the noise of the heights is 2 um, the threshol"),
     ],

@@ -173,20 +173,23 @@ def minimise_alternating(packed: PackedLines, order: int, solver: str, *, max_ro
     objective = _Objective(packed, order)
     lens = np.concatenate([np.zeros(order), centre_from_curvature(packed)])
     points = mean_intersections(packed)
-    before, done = objective.cost(lens, points), 0
+    before, done, is_least = objective.cost(lens, points), 0, False
     while done < max_rounds:
         done += 1
         points = _fit_vanishing_points(objective, lens, points)
         lens = ALTERNATING_SOLVERS[solver](objective, lens, points)
         after = objective.cost(lens, points)
-        if before - after <= _SETTLED * before:
+        is_least = before - after <= _SETTLED * before
+        if is_least:
             break
         before = after
     parameters = Parameters(lens[:order], lens[order:], _homogeneous(points))
     evaluation = evaluate(packed, parameters)
     slopes = residual_jacobian(order, evaluation)
     normal = normal_equations(packed, parameters, evaluation, slopes)
-    return AlternatingMinimum(Minimum(parameters, evaluation, slopes, normal, done, ""), objective.evaluations)
+    return AlternatingMinimum(
+        Minimum(parameters, evaluation, slopes, normal, done, "", is_least), objective.evaluations
+    )
 
 
 def _fit_vanishing_points(objective: _Objective, lens: Float64, points: Float64) -> Float64:

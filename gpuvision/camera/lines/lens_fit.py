@@ -244,7 +244,7 @@ def residuals_px(packed: PackedLines, found: Minimum, families: LineFamilies) ->
 def fit_warnings(
     fit: LensFit, packed: PackedLines, found: Minimum, straight: float, bends: float, limits: LensFitLimits
 ) -> Iterator[str]:
-    """Yield a warning for every parameter that the data do not determine.
+    """Yield a warning for every parameter that the data do not determine, and for a fit that has not converged.
 
     Parameters
     ----------
@@ -257,6 +257,8 @@ def fit_warnings(
     limits : LensFitLimits
         Thresholds.
     """
+    if not found.converged:
+        yield "the fit stopped before it converged; the uncertainties were computed at its last step"
     single = np.bincount(packed.family, minlength=packed.families) < 2
     if fit.lines == "vanishing" and single.any():
         yield f"families {np.flatnonzero(single).tolist()} have fewer than two lines, hence no vanishing point"

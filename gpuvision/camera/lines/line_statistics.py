@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -218,6 +219,7 @@ def fit_reweighted(
             scale = max(scale, _ROUNDING)
             weight = robust_weights(distance, scale, stage)
             found = minimise(packed, found.parameters, weight=weight, keep_centre=keep_centre)
-            if np.max(np.abs(weight - before)) <= _SETTLED:
+            is_settled = bool(np.max(np.abs(weight - before)) <= _SETTLED)
+            if is_settled:
                 break
-    return found, weight, scale
+    return replace(found, converged=found.converged and is_settled), weight, scale

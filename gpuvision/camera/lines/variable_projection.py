@@ -74,6 +74,8 @@ class Minimum:
         Number of steps tried.
     at_bound
         Active bound: "", "centre" or "fold".
+    converged
+        Whether another criterion than the largest number of steps ended the minimisation. Default True.
     """
 
     parameters: Parameters
@@ -82,6 +84,7 @@ class Minimum:
     normal: NormalEquations
     iterations: int
     at_bound: str
+    converged: bool = True
 
 
 def minimise(
@@ -137,8 +140,9 @@ def minimise(
             if next_evaluation is not None and next_evaluation.cost <= evaluation.cost + rounding:
                 break
             damping = max(10.0 * damping, _DAMPING[1])
-            if damping > _DAMPING[2] or gain < variance * evaluation.cost or iterations >= limits.max_iterations:
-                return replace(found, iterations=iterations, at_bound=max(bounds))
+            is_least = damping > _DAMPING[2] or gain < variance * evaluation.cost
+            if is_least or iterations >= limits.max_iterations:
+                return replace(found, iterations=iterations, at_bound=max(bounds), converged=is_least)
         parameters, evaluation, damping = (
             trial,
             next_evaluation,
@@ -147,8 +151,9 @@ def minimise(
         # Predict the next gain: gains decrease at least by the last ratio.
         coming = gain * min(gain / gained, 1.0) if gained > 0.0 else gain
         gained = gain
-        if coming <= max(variance * evaluation.cost, rounding) or iterations >= limits.max_iterations:
-            return Minimum(parameters, evaluation, slopes, normal, iterations, max(bounds))
+        is_least = coming <= max(variance * evaluation.cost, rounding)
+        if is_least or iterations >= limits.max_iterations:
+            return Minimum(parameters, evaluation, slopes, normal, iterations, max(bounds), is_least)
 
 
 def _damped_step(normal: NormalEquations, damping: float) -> Float64:

@@ -131,6 +131,7 @@ def test_solvers_minimise_what_the_thesis_says(points: np.ndarray, solver: str) 
     # Three rounds of alternating fits are far from convergence.
     assert distance_sum(packed, lens, places) < 0.5 * before
     assert found.evaluations > found.minimum.iterations == 3
+    assert not found.minimum.converged
     # Convergence ends the solvers, not the limit of 2000 evaluations a round.
     assert found.evaluations < 2000
 

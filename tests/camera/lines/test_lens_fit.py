@@ -23,7 +23,7 @@ FIT = SimpleNamespace(
 )
 # Half of the points lie within 0.05 pixels: a standard deviation of 0.0741.
 PACKED = SimpleNamespace(family=np.array([0, 0, 1, 1]), families=2, unit=100.0)
-FOUND: dict[str, Any] = {"at_bound": None, "parameters": SimpleNamespace(k=np.zeros(2))}
+FOUND: dict[str, Any] = {"at_bound": None, "converged": True, "parameters": SimpleNamespace(k=np.zeros(2))}
 
 
 def _fit(**changes: Any) -> Any:
@@ -57,6 +57,10 @@ def test_families_of_one_line() -> None:
     packed = SimpleNamespace(family=np.array([0, 1, 1, 2]), families=4, unit=100.0)
     _only("families [0, 2, 3] have fewer than two lines", FIT, packed)
     assert _warnings(_fit(lines="free"), packed) == []
+
+
+def test_a_fit_that_has_not_converged() -> None:
+    _only("stopped before it converged", converged=False)
 
 
 def test_outliers() -> None:

@@ -76,6 +76,9 @@ def test_reweighting_ends_when_the_weights_stay(
     start = minimise(packed, Parameters(np.empty(0), np.zeros(2), None))
     found, weight, scale = line_statistics.fit_reweighted(packed, start, loss, None, keep_centre=False)
     assert rounds < len(calls) < 20 * rounds
+    assert found.converged
+    monkeypatch.setattr(line_statistics, "_MAX_ROUNDS", 1)
+    assert not line_statistics.fit_reweighted(packed, start, loss, None, keep_centre=False)[0].converged
     distance = found.evaluation.distance
     limit = {"huber": 1.345, "tukey": 4.685}[loss] * scale
     huber, tukey = limit / np.maximum(np.abs(distance), limit), np.maximum(1.0 - (distance / limit) ** 2, 1e-4) ** 2

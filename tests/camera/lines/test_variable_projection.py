@@ -151,6 +151,7 @@ def test_the_number_of_steps_is_limited(rng: np.random.Generator) -> None:
     for most in (1, 2, 60):
         found = minimise(packed, start, limits=MinimisationLimits(max_iterations=most))
         assert found.iterations == most or most == 60
+        assert found.converged == (most == 60)
         costs.append(found.evaluation.cost)
     assert 2 < found.iterations < 12
     assert costs[0] > costs[1] > costs[2]

@@ -6,10 +6,11 @@ import enum
 
 
 class Status(enum.IntFlag):
-    """Bits of the ``status`` array (uint8) that every operation returns with its values; 0 means a valid sample.
+    """Bits of the ``status`` array that every operation returns with its values; 0 means a valid sample.
 
     A flagged value is NaN, with exceptions that the docstring of each result names: a sample with ``SATURATED`` or
-    ``AMBIGUOUS`` may keep its value.
+    ``AMBIGUOUS`` may keep its value, a fit with ``NOT_CONVERGED`` keeps it. The array has the type uint8, and uint16 in
+    the results of fits, which may have ``NOT_CONVERGED``.
     """
 
     OK = 0
@@ -30,3 +31,9 @@ class Status(enum.IntFlag):
     """No measurement lies near enough to this place, or the frame of the sample is damaged."""
     NOT_INVERTIBLE = 128
     """The mapping is not one-to-one here: the lens is beyond its fold, or the sampling runs backwards."""
+    NOT_CONVERGED = 256
+    """The iterations of a fit ended more than a tenth of a standard deviation from the solution."""
+
+
+SAMPLE_FLAGS = tuple(flag for flag in Status if 0 < flag < 256)
+"""Flags of the samples of a frame or image: all but NOT_CONVERGED, which fits no array of uint8."""

@@ -3,7 +3,17 @@
 from gpuvision.host import cache as cache  # before pyopencl is imported: it checks the cache folder's variable
 
 # isort: split
-from gpuvision.host.arrays import Array, DeviceArray, FloatArray, HostArray, IntArray, StatusArray, host_view, to_numpy
+from gpuvision.host.arrays import (
+    Array,
+    DeviceArray,
+    FitStatusArray,
+    FloatArray,
+    HostArray,
+    IntArray,
+    StatusArray,
+    host_view,
+    to_numpy,
+)
 from gpuvision.host.batch import Batch
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
@@ -75,6 +85,7 @@ __all__ = [
     "DeviceMemoryError",
     "DeviceUnusableError",
     "FileLimit",
+    "FitStatusArray",
     "FloatArray",
     "GpuVisionError",
     "HostArray",

@@ -16,6 +16,7 @@ Array: TypeAlias = NDArray[Any] | cl.array.Array
 FloatArray: TypeAlias = NDArray[np.floating[Any]] | cl.array.Array
 IntArray: TypeAlias = NDArray[np.int32] | cl.array.Array
 StatusArray: TypeAlias = NDArray[np.uint8] | cl.array.Array
+FitStatusArray: TypeAlias = NDArray[np.uint16] | cl.array.Array
 
 S = TypeVar("S", bound=np.generic)
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from matplotlib.lines import Line2D
 
 from gpuvision.plots.figure import new_figure, write_png
-from gpuvision.status import Status
+from gpuvision.status import SAMPLE_FLAGS, Status
 
 Array = npt.NDArray[Any]
 
@@ -126,7 +126,7 @@ def _draw_line(axes: Any, frame: LineFrame, along: str, length: float) -> None:
 
 
 def _frame_title(frame: LineFrame) -> str:
-    flags = {flag: float(np.mean((frame.status & flag) != 0)) for flag in Status if flag}
+    flags = {flag: float(np.mean((frame.status & flag) != 0)) for flag in SAMPLE_FLAGS}
     worst = max(flags, key=lambda flag: flags[flag])
     text = f"frame {frame.number}: line in {100 * frame.found_fraction:.0f} %"
     return text + (f", {worst.name} {100 * flags[worst]:.0f} %" if flags[worst] > 0 else "")

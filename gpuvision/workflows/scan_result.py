@@ -26,7 +26,7 @@ from gpuvision.ranging.range_image import RangePoints
 from gpuvision.ranging.regrid import MAX_MAP_CELLS, Grid, HeightMap
 from gpuvision.ranging.sheet_motion import RotatingSheet
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.status import Status
+from gpuvision.status import SAMPLE_FLAGS, Status
 from gpuvision.workflows.scan_errors import ScanErrors, error_budget
 
 Array = npt.NDArray[Any]
@@ -147,7 +147,7 @@ class Scan:
     def counts(self) -> dict[str, int]:
         """Return the number of samples without a flag (``OK``) and with each flag; a sample may have several flags."""
         status = to_numpy(self.points.status)
-        flags = {str(flag.name): int(np.count_nonzero(status & flag)) for flag in Status if flag}
+        flags = {str(flag.name): int(np.count_nonzero(status & flag)) for flag in SAMPLE_FLAGS}
         return {"OK": int(np.count_nonzero(status == 0))} | flags
 
     def advice(self) -> tuple[str, ...]:
@@ -352,7 +352,7 @@ def scan_advice(status: npt.NDArray[np.uint8], sensor: Sensor) -> tuple[str, ...
     """
     camera = isinstance(sensor.readout, LineReadout)
     turning = isinstance(sensor.transport, RotatingSheet)
-    frequent = {flag for flag in Status if flag and np.mean((status & flag) != 0) >= 1 / 3}
+    frequent = {flag for flag in SAMPLE_FLAGS if np.mean((status & flag) != 0) >= 1 / 3}
     sentences = []
     if Status.NO_DATA in frequent:
         sentences.append(

@@ -27,7 +27,7 @@ from gpuvision.ranging.range_image import RangeImage, RangePoints
 from gpuvision.ranging.regrid import Direction, Grid, HeightMap, Regrid
 from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.status import Status
+from gpuvision.status import SAMPLE_FLAGS, Status
 from gpuvision.workflows.focus_frames import read_focus_peak
 from gpuvision.workflows.opened_recording import open_for_scan
 from gpuvision.workflows.scan_errors import ScanErrors, focus_errors, predict_errors, sigma_outputs
@@ -429,7 +429,7 @@ def resample_heights(
     """
     x, y, z, status = to_numpy(points.x), to_numpy(points.y), to_numpy(points.z), to_numpy(points.status)
     if not np.any(np.isfinite(z)):
-        flags = ", ".join(flag.name or "" for flag in Status if flag and np.any(status & flag))
+        flags = ", ".join(flag.name or "" for flag in SAMPLE_FLAGS if np.any(status & flag))
         advice = "; ".join(scan_advice(status, sensor)) or "check thresholds and [output] limits"
         raise ValueError(f"no valid sample in {len(z)} frames ({flags}); {advice}")
     output = sensor.output

@@ -61,16 +61,20 @@ static inline void put_line(LINE_ROWS rows, int i, int rulers, global const Boar
         put_line_row(rows, first + 1, line, x + side * c, y + side * s, has_angle ? 2 * offset_variance : REAL_NAN);
 }
 
-// Fit LANES lines from `first` on, or in a work-group one line; store their rows, and the weight of each edge. `reach`:
-// largest |u| + |v| in sigmas. The least scale is the rounding error of the places, in sigmas.
+// Fit LANES lines from `first` on, or in a work-group one line; store their rows and status, and the weight of each edge.
+// `reach`: largest |u| + |v| in sigmas. The least scale is the rounding error of the places, in sigmas.
 INLINE void fit_lines(laned_points all, reals reach, int first, int lines, global const BoardLine *line,
-                      constant int *pairs, int trials, int steps, LINE_ROWS rows, global real *edge_weights) {
-    const laned_fit fit = line_fit(all, pairs, trials, steps, (reals)REAL_EPSILON * reach + (reals)1e-30f);
+                      constant int *pairs, int trials, int steps, LINE_ROWS rows, global real *edge_weights,
+                      global ushort *status) {
+    const reals rounding = (reals)REAL_EPSILON * reach + (reals)1e-30f;
+    const laned_fit fit = line_fit(all, pairs, trials, steps, rounding, rounding);
+    const masks flags = line_status(fit);
     for (int lane = 0; lane < LANES && first + lane < lines && GROUP_ITEM == 0; lane++) {
         const int has_angle = LANE_BITS(fit.points, lane) > 1 && !LANE_BITS(fit.coincide, lane);
         put_line(rows, first + lane, all.count, line + first + lane, LANE(fit.line.x, lane), LANE(fit.line.y, lane),
                  LANE(fit.line.c, lane), LANE(fit.line.s, lane), LANE(fit.variance_of_offset, lane),
                  LANE(fit.variance_of_angle, lane), has_angle);
+        status[first + lane] = (ushort)LANE_BITS(flags, lane);
     }
     for (int k = GROUP_ITEM; k < all.count; k += GROUP_ITEMS) {
         const laned_point at = point_at(all, k);

@@ -39,7 +39,8 @@ kernel void board_edges(global const CODE *restrict image, global const BoardRul
 // Robust lines through the edges of a board, as rows of its pose (board_line.h).
 //
 // Inputs:  places (lines, each, 2): u, v [m]; sigmas (lines, each): across the line [m]; line (lines,) BoardLine.
-// Outputs: rows (lines * rows of a line,) PoseRow, as pose/pose.cl takes them; edge_weights (lines, each).
+// Outputs: rows (lines * rows of a line,) PoseRow, as pose/pose.cl takes them; edge_weights (lines, each); status (lines,),
+//          as in line_fit/line_fit.cl.
 // Tables:  pairs (pair_trials, 2): edges of the start candidates of a line.
 // Options: BOARD_LINES; the options of board_line.h.
 // Work:    a group of up to 64 items per line, as in line_fit/line_fit.cl.
@@ -49,15 +50,15 @@ kernel void board_edges(global const CODE *restrict image, global const BoardRul
 
 kernel void board_lines(global const real *restrict places, global const real *restrict sigmas,
                         global const BoardLine *restrict line, global PoseRow *restrict rows,
-                        global real *restrict edge_weights, const int lines, const int each, constant int *pairs,
-                        const int pair_trials, const int steps) {
+                        global real *restrict edge_weights, global ushort *restrict status, const int lines,
+                        const int each, constant int *pairs, const int pair_trials, const int steps) {
     const int i = get_group_id(0);
     local real sums[ROOM_FOR_SUMS], distances[ROOM_FOR_DISTANCES];
     // Places are relative to the point of their line: no other origin is needed.
     const laned_points all = {places + 2 * i * each, sigmas + i * each, 0, 0, distances, sums, each};
     real reach;
     about_first_point(all, &reach);
-    fit_lines(all, reach, i, lines, line, pairs, pair_trials, steps, rows, edge_weights);
+    fit_lines(all, reach, i, lines, line, pairs, pair_trials, steps, rows, edge_weights, status);
 }
 #else
 // Inputs:  image (rows, columns), type CODE; rulers (lines, each) BoardRuler; line (lines,) BoardLine.
@@ -66,7 +67,7 @@ kernel void board_lines(global const real *restrict places, global const real *r
 // Outputs: pose (3,) x, y [m], theta [rad]; deformation (3,); placement (2,) [m]; covariance (POSE_PARAMETERS,
 //          POSE_PARAMETERS); residuals [m] and weights (lines, rows of a line); scale, residual_scale, condition, rank,
 //          inliers, status, etch [m], inlier_fraction, leverage: one number each (pose/pose.cl); edges [px], edge_status,
-//          edge_weights (lines, each).
+//          edge_weights (lines, each); of_lines (lines,): status, as in line_fit/line_fit.cl.
 // Options: the options of ruler/ruler.h, line_fit/line_fit.h and pose/pose.h; MAX_RULERS_PER_LINE: capacity
 //          for the rulers of a line; MAX_RULERS: capacity for all rulers.
 // Work:    one work-item.
@@ -79,10 +80,10 @@ kernel void board_pose(global const CODE *restrict image, global const BoardRule
                       global real *restrict placement, global real *restrict covariance,
                       global real *restrict residuals, global real *restrict weights, global real *restrict scale,
                       global real *restrict residual_scale, global real *restrict condition, global int *restrict rank,
-                      global int *restrict inliers, global uchar *restrict status, global real *restrict etch,
+                      global int *restrict inliers, global ushort *restrict status, global real *restrict etch,
                       global real *restrict inlier_fraction, global real *restrict leverage,
                       global real *restrict edges, global uchar *restrict edge_status,
-                      global real *restrict edge_weights, constant real *table,
+                      global real *restrict edge_weights, global ushort *restrict of_lines, constant real *table,
                       constant real *model, const int rows, const int columns, const int lines, const int each,
                       constant int *pairs, const int pair_trials, constant int *subsets, const int trials,
                       const int steps, const real rank_tolerance, const real min_inlier_fraction,
@@ -123,7 +124,7 @@ kernel void board_pose(global const CODE *restrict image, global const BoardRule
             reach = far > reach ? far : reach;
         }
         const laned_points points = {x, y, certainty, distances, each};
-        fit_lines(points, reach, first, lines, line, pairs, pair_trials, steps, all, edge_weights);
+        fit_lines(points, reach, first, lines, line, pairs, pair_trials, steps, all, edge_weights, of_lines);
     }
     const pose_row missing = {0, 0, 0, 0, 0, 0, 0, 0};
     for (int i = count; i < all.count; i++) put_row(all, i, missing);

@@ -78,7 +78,7 @@ kernel void feature_pose(global const WIDE *restrict expected, global const real
                          global const real *restrict drilled_covariance, global const uchar *restrict drilled_status,
                          global const real *restrict placed_drilled,
 #endif
-                         global WIDE *restrict pose, global WIDE *restrict covariance, global uchar *restrict status,
+                         global WIDE *restrict pose, global WIDE *restrict covariance, global ushort *restrict status,
                          global real *restrict residuals, global real *restrict weights,
                          global uchar *restrict feature_status, global real *restrict scale,
                          global real *restrict residual_scale, global real *restrict condition,

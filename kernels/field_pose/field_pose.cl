@@ -83,7 +83,7 @@ kernel void field_pose_refinement(global const float *restrict points, global co
                                   global float *restrict poses, global float *restrict covariance,
                                   global float *restrict information, global float *restrict score,
                                   global float *restrict scale, global float *restrict share,
-                                  global uchar *restrict status, constant float *shapes,
+                                  global ushort *restrict status, constant float *shapes,
                                   global const uchar *restrict nearest, const int count, const int rows,
                                   const int columns, const float first_x, const float first_y, const float cell,
                                   const float scale_squared, const float max_range_squared, const int steps) {
@@ -160,9 +160,6 @@ kernel void field_pose_refinement(global const float *restrict points, global co
     // det > MIN_EIGENVALUE_RATIO trace (sum of principal minors): for eigenvalues l1 << l2 <= l3 this bounds l1 / l3.
     const int weak = !(determinant > (float)MIN_EIGENVALUE_RATIO * all * minors);
     const int bad = !finite || few || outside;
-    status[i] = !finite ? STATUS_NOT_FINITE
-                        : (few ? STATUS_LOW_SIGNAL
-                               : (outside ? STATUS_OUT_OF_RANGE : (weak ? STATUS_AMBIGUOUS : STATUS_OK)));
     const float variance = sum_psi_squared / fmax(sum_curvature - 3.0f, 1.0f) + 1e-12f;
     poses[3 * i] = bad ? NAN : pose.x;
     poses[3 * i + 1] = bad ? NAN : pose.y;
@@ -185,6 +182,11 @@ kernel void field_pose_refinement(global const float *restrict points, global co
         const float size = scatter.xx * cofactor.xx + scatter.xy * cofactor.xy + scatter.xt * cofactor.xt;
         known = sandwich(hessian, cofactor, 1.0f / size);
     }
+    const int is_open = has_not_converged(hessian, known, here, lever, variance);
+    status[i] = !finite   ? STATUS_NOT_FINITE
+                : few     ? STATUS_LOW_SIGNAL
+                : outside ? STATUS_OUT_OF_RANGE
+                          : (weak ? STATUS_AMBIGUOUS : STATUS_OK) | (is_open ? STATUS_NOT_CONVERGED : STATUS_OK);
     known.xt /= lever;
     known.yt /= lever;
     known.tt /= lever * lever;

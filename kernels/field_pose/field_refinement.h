@@ -112,6 +112,26 @@ static inline float3 damped_step(const normal_equations undamped, float damping,
                     (c.xt * of.x + c.yt * of.y + c.tt * of.t) * scale * lever);
 }
 
+// Pose to this length [m] and angle [rad] by rounding, in a field of 20 m.
+#define POSE_ROUNDING 3e-5f
+
+// Return whether a pose has not converged: the Newton step from it exceeds the rounding, and a tenth of a standard
+// deviation (CONVERGED_SQUARE). `hessian`: second derivatives of the cost over 2 / c^2, and `known`: variance times the
+// inverse covariance, both by (x, y, t / lever). `at`: gradient at the pose. The damping bounds the step along a
+// direction that the points do not determine.
+static inline int has_not_converged(normal_equations hessian, normal_equations known, normal_equations at, float lever,
+                                    float variance) {
+    normal_equations of = hessian;
+    of.x = at.x;
+    of.y = at.y;
+    of.t = at.t * lever;
+    const float3 left = damped_step(of, 1e-4f, 1.0f);
+    const float square = known.xx * left.x * left.x + known.yy * left.y * left.y + known.tt * left.z * left.z +
+                         2 * (known.xy * left.x * left.y + known.xt * left.x * left.z + known.yt * left.y * left.z);
+    const int is_beyond_rounding = fabs(left.x) + fabs(left.y) > POSE_ROUNDING || fabs(left.z) * lever > POSE_ROUNDING;
+    return is_beyond_rounding && square > CONVERGED_SQUARE * variance;
+}
+
 // Store a symmetric matrix times `scale` as (3, 3).
 static inline void store_symmetric(global float *to, normal_equations of, float scale) {
     to[0] = of.xx * scale;

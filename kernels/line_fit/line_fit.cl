@@ -16,7 +16,6 @@
 #define GROUP_PER_PROBLEM
 #endif
 #include "line_fit/line_fit.h"
-#include "common/status.h"
 
 #ifdef VECTOR_VARIANT
 // Gather the values of global memory at the index in each lane.
@@ -33,7 +32,7 @@ kernel void line_fit_sets(global const INPUT *restrict points,
 #endif
                           global real *restrict normal, global real *restrict distance, global real *restrict centre,
                           global real *restrict covariance, global real *restrict scale, global int *restrict inliers,
-                          global real *restrict weights, global uchar *restrict status, const long lines,
+                          global real *restrict weights, global ushort *restrict status, const long lines,
                           const int count, constant int *pairs, const int trials, const int steps,
                           const real min_scale) {
 #ifdef IN_GROUP
@@ -86,10 +85,9 @@ kernel void line_fit_sets(global const INPUT *restrict points,
     // The scale is at least the rounding error of the coordinates: eps times the largest |x| + |y|, in sigmas.
     const reals rounding = (reals)REAL_EPSILON * reach + (reals)1e-30f;
     const reals least_scale = rounding > (reals)min_scale ? rounding : (reals)min_scale;
-    laned_fit fit = line_fit(all, pairs, trials, steps, least_scale);
+    const laned_fit fit = line_fit(all, pairs, trials, steps, least_scale, rounding);
 
-    const masks few = mask_of(fit.points < 2);
-    const masks bad = few | fit.coincide;
+    const masks bad = mask_of(fit.points < 2) | fit.coincide;
 #ifdef WITH_WEIGHTS
     for (int k = GROUP_ITEM; k < count; k += GROUP_ITEMS) {
         const laned_point at = point_at(all, k);
@@ -101,8 +99,7 @@ kernel void line_fit_sets(global const INPUT *restrict points,
     }
 #endif
     if (GROUP_ITEM) return;
-    masks flags = few ? (masks)STATUS_NO_DATA : (fit.coincide ? (masks)STATUS_AMBIGUOUS : (masks)0);
-    flags |= ~bad & mask_of(2 * fit.inliers < fit.points) & (masks)STATUS_AMBIGUOUS;
+    const masks flags = line_status(fit);
     // The direction is ambiguous by half a turn: choose c > 0, or c = 0 and s > 0.
     const masks back =
         mask_of(fit.line.c < (reals)0) | (mask_of(fit.line.c == (reals)0) & mask_of(fit.line.s < (reals)0));
@@ -124,6 +121,6 @@ kernel void line_fit_sets(global const INPUT *restrict points,
         covariance[4 * i + 3] = LANE(offset, lane);
         scale[i] = LANE(of, lane);
         inliers[i] = (int)LANE_BITS(in, lane);
-        status[i] = (uchar)LANE_BITS(flags, lane);
+        status[i] = (ushort)LANE_BITS(flags, lane);
     }
 }

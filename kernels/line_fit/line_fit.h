@@ -10,6 +10,7 @@
 #define LINE_FIT_H
 
 #include "common/group.h"
+#include "common/status.h"
 #include "line_fit/line_fit_points.h"
 
 #ifdef GIVEN_SCALE
@@ -27,6 +28,7 @@ typedef struct {
     reals scale, variance_of_angle, variance_of_offset;
     masks points, inliers; // number of points, and of points with a weight above 0
     masks coincide;        // lanes whose points coincide: no direction
+    masks is_open;         // lanes that have not converged (CONVERGED_SQUARE of common/status.h)
 } laned_fit;
 
 // Return the signed distance of (x, y) to the line.
@@ -210,16 +212,24 @@ INLINE reals line_scale(laned_line line, laned_points all, reals reach, real few
 #endif
 }
 
-// Compute the number of inliers and the variances.
+// Sums of the variances and of the convergence.
+#define LINE_SUMS 7
+
+// Compute the number of inliers, the variances, and whether the fit has converged.
 //
 // Covariance of an M-estimator (Huber, 1981): f A^-1 with A = sum of h h^T / sigma^2 over the inliers. A is diagonal
 // for offset and angle at the weighted mean: sum w and sum w u^2. With a given scale f = scale^2 / EFFICIENCY,
 // otherwise f = scale^2 (sum psi(z)^2 / (n - 2)) / (mean psi'(z))^2, NaN for two inliers.
-INLINE void line_variances(laned_fit *fit, laned_points all) {
+//
+// Convergence: the gradient of offset and angle is (sum w v, sum w u v) with the robust weights w, and the second
+// derivatives are A times the mean of psi'. The square of the Newton step in standard deviations is then g A^-1 g / (f
+// mean^2). The rounding of the distances, up to 4 times `rounding` (the rounding of the largest coordinate, in sigmas)
+// for each point, adds up to 16 n rounding^2 to g A^-1 g.
+INLINE void line_variances(laned_fit *fit, laned_points all, reals rounding) {
     const reals per_scale = (reals)1 / fit->scale;
-    reals sums[5];
+    reals sums[LINE_SUMS];
     EACH_PART(part) {
-        reals sum = 0, sum_uu = 0, slopes = 0, squares = 0;
+        reals sum = 0, sum_uu = 0, slopes = 0, squares = 0, right = 0, right_u = 0;
         masks inliers = 0;
         for (int i = part; i < all.count; i += PARTS) {
             const laned_point at = point_at(all, i);
@@ -232,28 +242,36 @@ INLINE void line_variances(laned_fit *fit, laned_points all) {
             sum += w, sum_uu += w * u * u;
             slopes += kept_where(is_in, loss_slope(z));
             squares += kept_where(is_in, weight * weight * z * z);
+            right += w * weight * v, right_u += w * weight * u * v;
         }
         sums[0] = sum, sums[1] = sum_uu, sums[2] = slopes, sums[3] = squares, sums[4] = LANED(convert_real)(inliers);
-        group_put(sums, 5, part, all.sums);
+        sums[5] = right, sums[6] = right_u;
+        group_put(sums, LINE_SUMS, part, all.sums);
     }
-    GROUP_SPACE const reals *totals = group_total(sums, 5, all.sums);
+    GROUP_SPACE const reals *totals = group_total(sums, LINE_SUMS, all.sums);
     const reals many = totals[4];
     fit->inliers = to_masks(many);
     reals factor = fit->scale * fit->scale;
+    const reals each = totals[2] / many;
 #ifdef SCALE
     factor *= (reals)(1 / (real)(EFFICIENCY));
 #else
-    const reals each = totals[2] / many;
     factor *= totals[3] / (many - (reals)2) / (each * each);
     factor = fit->inliers > 2 ? factor : (reals)REAL_NAN;
 #endif
     fit->variance_of_offset = factor / totals[0];
     fit->variance_of_angle = factor / totals[1];
+    const reals left = totals[5] * totals[5] / totals[0] + totals[6] * totals[6] / totals[1];
+    const reals slope = each > (reals)0 ? each : (reals)0;
+    const reals limit = slope * slope * (reals)CONVERGED_SQUARE * factor + (reals)16 * many * rounding * rounding;
+    fit->is_open = mask_of(left > limit);
 }
 
 // Fit the lines: start, then `steps` reweighted steps. `pairs` (trials, 2) holds the points of the start candidates.
-INLINE laned_fit line_fit(laned_points all, constant const int *pairs, int trials, int steps, reals min_scale) {
-    laned_fit fit = {line_middle(all), min_scale, 0, 0, 0, 0, 0};
+// `rounding`: of the largest coordinate, in sigmas; the scale is at least as large.
+INLINE laned_fit line_fit(laned_points all, constant const int *pairs, int trials, int steps, reals min_scale,
+                          reals rounding) {
+    laned_fit fit = {line_middle(all), min_scale, 0, 0, 0, 0, 0, 0};
     reals present;
     EACH_PART(part) {
         masks points = 0;
@@ -276,8 +294,17 @@ INLINE laned_fit line_fit(laned_points all, constant const int *pairs, int trial
 #ifndef ROBUST
     fit.scale = line_scale(fit.line, all, (reals)INFINITY, FEW_FITTED, min_scale);
 #endif
-    line_variances(&fit, all);
+    line_variances(&fit, all, rounding);
     return fit;
+}
+
+// Return the status flags of the fits. Lines without a direction have no results: fewer than two points, or all points
+// coincide.
+static inline masks line_status(laned_fit fit) {
+    const masks few = mask_of(fit.points < 2), bad = few | fit.coincide;
+    masks flags = few ? (masks)STATUS_NO_DATA : (fit.coincide ? (masks)STATUS_AMBIGUOUS : (masks)0);
+    flags |= ~bad & mask_of(2 * fit.inliers < fit.points) & (masks)STATUS_AMBIGUOUS;
+    return flags | (~bad & fit.is_open & (masks)STATUS_NOT_CONVERGED);
 }
 
 #endif

@@ -23,6 +23,7 @@
 #ifndef POSE_H
 #define POSE_H
 
+#include "common/status.h"
 #include "pose/pose_matrix.h"
 #include "pose/pose_start.h"
 
@@ -70,7 +71,7 @@ typedef struct {
 #define ROOM_FOR_DISTANCES CAPACITY
 #endif
 
-// Weight of a row in the sums.
+// Weight of a row in the normal matrix. The right side, the gradient of the loss, always has the robust weights.
 #define WEIGHTED 0   // robust weight
 #define EVENLY 1     // 1 for rows with a robust weight above 0 (inliers), 0 for others
 #define EVERY_ROW 2  // 1
@@ -91,7 +92,8 @@ INLINE GROUP_SPACE const reals *pose_summed(GROUP_SPACE const laned_pose *at_pos
             const reals z = equation.residual * at.certainty * (reals)per_scale, weight = loss_weight(z);
             const masks is_in = mask_of(at.certainty * weight > (reals)0);
             const reals counts = how == WEIGHTED ? weight : how == EVENLY ? kept_where(is_in, (reals)1) : (reals)1;
-            add_equation(equation, at.certainty * at.certainty * counts, sums->matrix, sums->right);
+            const reals square = at.certainty * at.certainty;
+            add_equation(equation, square * counts, square * weight, sums->matrix, sums->right);
             inliers -= is_in;
             slopes += kept_where(is_in, loss_slope(z));
             squares += kept_where(is_in, weight * weight * z * z);
@@ -121,6 +123,7 @@ typedef struct {
     real inlier_fraction, leverage; // least inlier fraction of the information; largest leverage of an inlier
     int present, inliers, rank;
     int is_singular; // normal equations of the last step
+    int is_open;     // the pose has not converged (CONVERGED_SQUARE of common/status.h)
 } solved_pose;
 
 // Least variance of the residuals that is multiplied into the covariance: above the smallest normal number by the
@@ -140,14 +143,18 @@ static inline void pose_quality(private solved_pose *fit, pose_matrix inlier_mat
     fit->condition = sqrt(largest / max(least, (real)REAL_EPSILON * largest));
 }
 
-// Compute the covariance from the normal equations of the inliers, each with weight 1.
+// Compute the covariance from the normal equations of the inliers, each with weight 1, and whether the pose has converged.
 //
 // Covariance of an M-estimator (Huber, 1981): variance * A^-1, A = sum of h h^T / sigma^2 over the inliers. With a
 // given scale, variance = scale^2 / EFFICIENCY. Otherwise it is estimated from the residuals z in units of the scale:
 // variance = scale^2 (sum psi(z)^2 / (n - FREEDOMS)) / (mean psi'(z))^2; without degrees of freedom residual_scale is
 // NaN and the sigmas are trusted, variance = 1.
+//
+// Convergence: the Newton step from the pose is A^-1 g / (mean psi'(z)), with the gradient g (robust weights). Its square
+// in standard deviations is g A^-1 g / (variance mean^2). Rounding changes the residual of a row by rho = 8 epsilon (1 +
+// displacement) (SolvePose), and g A^-1 g by up to the sum of (rho / sigma)^2: the rows' errors are projected.
 static inline void pose_covariance(private solved_pose *fit, private const pose_sums *sums) {
-    reals factor[TRIANGLE];
+    reals factor[TRIANGLE], left[FREEDOMS];
     for (int i = 0; i < TRIANGLE; i++) factor[i] = sums->matrix[i];
     factored(factor);
     const real free = (real)(fit->inliers - FREEDOMS), mean = FIRST(sums->slopes) / fit->inliers;
@@ -162,6 +169,14 @@ static inline void pose_covariance(private solved_pose *fit, private const pose_
     const real variance = is_usual ? whole : 1;
     fit->variance = variance;
     fit->covariance_factor = is_usual ? 1 : whole;
+    solved(factor, sums->right, left);
+    real square = 0;
+    for (int i = 0; i < FREEDOMS; i++) square += FIRST(left[i]) * FIRST(sums->right[i]);
+    const laned_pose pose = fit->pose;
+    const real moved = FIRST(FABS(pose.dxx) + FABS(pose.dxy) + FABS(pose.dyx) + FABS(pose.dyy) + FABS(pose.x) + FABS(pose.y));
+    const real rounding = 8 * REAL_EPSILON * (1 + moved), slope = max(mean, (real)0);
+    fit->is_open = square > slope * slope * CONVERGED_SQUARE * whole +
+                                rounding * rounding * FIRST(sums->matrix[CELL(0, 0)] + sums->matrix[CELL(1, 1)]);
     for (int i = 0; i < FREEDOMS; i++) {
         reals unit[FREEDOMS], column[FREEDOMS];
         for (int k = 0; k < FREEDOMS; k++) unit[k] = (reals)(real)(i == k);

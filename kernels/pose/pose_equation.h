@@ -80,11 +80,12 @@ static inline laned_pose pose_after(laned_pose pose, private const reals *step) 
     return next;
 }
 
-// Add weight h h^T to the lower triangle of the normal matrix, and weight h residual to the right side.
-static inline void add_equation(pose_equation equation, reals weight, private reals *matrix, private reals *right) {
+// Add weight h h^T to the lower triangle of the normal matrix, and right_weight h residual to the right side.
+static inline void add_equation(pose_equation equation, reals weight, reals right_weight, private reals *matrix,
+                                private reals *right) {
     for (int i = 0; i < FREEDOMS; i++) {
         const reals weighted = weight * equation.row[i];
-        right[i] += weighted * equation.residual;
+        right[i] += right_weight * equation.row[i] * equation.residual;
         for (int j = 0; j <= i; j++) matrix[CELL(i, j)] += weighted * equation.row[j];
     }
 }

@@ -4,7 +4,6 @@
 #define POSE_RESULT_H
 
 #include "pose/pose.h"
-#include "common/status.h"
 
 // Output arrays of the kernels, in the order of the fields of BoardPose (pose.py); deformation and placement may be
 // null.
@@ -20,7 +19,7 @@ typedef struct {
     global real *condition;
     global int *rank;
     global int *inliers;
-    global uchar *status;
+    global ushort *status;
     global real *etch;
     global real *inlier_fraction;
     global real *leverage;
@@ -112,7 +111,8 @@ static inline void store_pose(GROUP_SPACE const solved_pose *fit, pose_rows all,
                       : few       ? STATUS_NO_DATA
                       : refused   ? STATUS_AMBIGUOUS
                       : away      ? STATUS_OUT_OF_RANGE
-                                  : STATUS_OK;
+                      : fit->is_open ? STATUS_NOT_CONVERGED
+                                     : STATUS_OK;
     to.pose[3 * item] = bad ? REAL_NAN : move_x - ((axx - 1) * frame.x + axy * frame.y);
     to.pose[3 * item + 1] = bad ? REAL_NAN : move_y - (ayx * frame.x + (ayy - 1) * frame.y);
     to.pose[3 * item + 2] = bad ? REAL_NAN : turn;

@@ -78,7 +78,7 @@ BETWEEN_BARRIERS laned_pose pose_through(laned_pose start, pose_rows all, consta
 #else
             const reals weight = mask_of(of[k].certainty > (reals)0) ? (reals)1 : (reals)0;
 #endif
-            add_equation(equation_of(candidate, of[k]), weight, matrix, right);
+            add_equation(equation_of(candidate, of[k]), weight, weight, matrix, right);
         }
         add_etch(candidate, all.etch, matrix, right);
         *bad |= factored(matrix);

@@ -43,6 +43,7 @@ _SPACING_GROUP = 1.2  # largest by smallest spacing of a group of rulers (chosen
 # Start candidates of the robust pose: with 50 % outliers all four rows of a candidate are good often enough, so that
 # all candidates contain an outlier on 7 of 1e8 boards (derived).
 _TRIALS = 256
+_NOT_CONVERGED = "the fit of the pose ended more than a tenth of its standard deviation from the best pose"
 
 
 class BoardMeasurer:
@@ -210,7 +211,8 @@ class BoardMeasurer:
         weights, residuals = (np.asarray(to_numpy(each), np.float64) for each in (fit.weights, fit.residuals))
         rulers = rulers._replace(weight=np.nan_to_num(weights[:count]), residual=residuals[:count])
         fiducials = fiducials.with_pose(weights[count:], residuals[count:])
-        if int(to_numpy(fit.status)):
+        status = Status(int(to_numpy(fit.status)))
+        if status & ~Status.NOT_CONVERGED:
             found = count_true(rulers.found, fiducials.found, fiducials.found)
             return refuse_measurement(rulers, fiducials, _reason_of(fit, found, self.limits))
         residual_scale = float(to_numpy(fit.residual_scale))
@@ -228,6 +230,7 @@ class BoardMeasurer:
             rulers=rulers,
             fiducials=fiducials,
             reason="",
+            warnings=(_NOT_CONVERGED,) if status else (),
         )
         return self._check(solution, float(to_numpy(fit.scale)), scale)
 
@@ -271,7 +274,7 @@ class BoardMeasurer:
         if not np.all(np.isfinite(solution.covariance)):
             return solution
         fit = self._fit(solution.rulers, solution.fiducials, scale, None, "similarity")
-        if int(to_numpy(fit.status)) or float(to_numpy(fit.residual_scale)) == 0.0:
+        if int(to_numpy(fit.status)) & ~Status.NOT_CONVERGED or float(to_numpy(fit.residual_scale)) == 0.0:
             return solution
         limits = self.limits
         covariance = _covariance_of(fit)
@@ -291,7 +294,8 @@ class BoardMeasurer:
         if solution.reason or is_wrong:
             before = solution.reason or f"a wrong scale moves the pose by {effect:.1f} standard deviations"
             return solution._replace(reason=f"{before}: {wrong}")
-        return solution._replace(warnings=(wrong,), covariance=solution.covariance + np.outer(moved, moved))
+        warnings = (*solution.warnings, wrong)
+        return solution._replace(warnings=warnings, covariance=solution.covariance + np.outer(moved, moved))
 
     def _placement_motion(self, pose: Float64) -> Float64:
         """Return the motion of the placement point x, y [m] and the turn [rad] of a pose."""

@@ -10,12 +10,12 @@ import numpy as np
 
 from gpuvision.host import (
     Device,
+    FitStatusArray,
     FloatArray,
     IntArray,
     Launch,
     LaunchBuilder,
     Precision,
-    StatusArray,
     Variant,
     capacity,
     flags,
@@ -49,9 +49,11 @@ class LineFits(NamedTuple):
         Number of points with a weight above 0.
     weights : float, (..., points), optional
         Weight of each point in the fit, 0 to 1. None unless ``with_weights``.
-    status : uint8, (...,)
+    status : uint16, (...,)
         `Status` flags. NO_DATA: fewer than two points. AMBIGUOUS: all points coincide, so that the direction is
         undefined (results are NaN), or fewer than half of the points are inliers (results are valid numbers).
+        NOT_CONVERGED (with results): ``max_iterations`` ended the fit at a line from which the next step to the
+        solution exceeds a tenth of its standard deviations, and the rounding of the points.
     """
 
     normal: FloatArray
@@ -61,7 +63,7 @@ class LineFits(NamedTuple):
     scale: FloatArray
     inliers: IntArray
     weights: FloatArray | None
-    status: StatusArray
+    status: FitStatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +96,8 @@ class FitLines(VisionOperation[LineFits]):
         Number of point pairs tried for the start, 1 or more, default 64; all pairs where there are not more. 64 random
         pairs all contain an outlier once in 1e19 sets with 30 % outliers, once in 1e8 sets with 50 % outliers.
     max_iterations : int
-        Number of reweighted fits, 1 or more, default 12.
+        Number of reweighted fits, 1 or more, default 12. A line that has not converged after them has the flag
+        NOT_CONVERGED.
     weighted : bool
         Whether the operation takes the standard deviations of the points as a second input. Default False.
     with_weights : bool
@@ -175,7 +178,7 @@ class FitLines(VisionOperation[LineFits]):
             work=work,
             problem_per_group=True,
             more_inputs=[(shape[:-1], dtype)] if self.weighted else [],
-            outputs=build.outputs(shapes, inliers=np.int32),
+            outputs=build.outputs(shapes, inliers=np.int32, status=np.uint16),
             defines={
                 **type_defines("INPUT", dtype),
                 **loss_defines(self.loss, self.tuning_constant),

@@ -24,12 +24,12 @@ import numpy.typing as npt
 from gpuvision.host import (
     Define,
     Device,
+    FitStatusArray,
     FloatArray,
     IntArray,
     Launch,
     LaunchBuilder,
     Spec,
-    StatusArray,
     Variant,
     WorkSize,
     capacity,
@@ -260,11 +260,12 @@ class FieldPoses(NamedTuple):
         Standard deviation of an inlier's distance to its line [m].
     inlier_fraction : float32, (starts,)
         Share of the points within the scale of the map from a line.
-    status : uint8, (starts,)
+    status : uint16, (starts,)
         `Status` flags. AMBIGUOUS (with a pose): the points determine only a part of the pose, for example points on a
-        single line or circle; the rest of the pose stays near the start. Otherwise all fields are NaN: LOW_SIGNAL
-        (fewer than four points on lines), OUT_OF_RANGE (the pose left the map), NOT_FINITE (the start is not finite, or
-        beyond 1e6 m).
+        single line or circle; the rest of the pose stays near the start. NOT_CONVERGED (with a pose):
+        ``max_iterations`` ended the refinement at a pose from which the next step to the least cost exceeds a tenth of
+        its standard deviations, and 3e-5 m or rad. Otherwise all fields are NaN: LOW_SIGNAL (fewer than four points on
+        lines), OUT_OF_RANGE (the pose left the map), NOT_FINITE (the start is not finite, or beyond 1e6 m).
     """
 
     poses: FloatArray
@@ -273,7 +274,7 @@ class FieldPoses(NamedTuple):
     score: FloatArray
     residual_std: FloatArray
     inlier_fraction: FloatArray
-    status: StatusArray
+    status: FitStatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,7 +289,8 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
     map : DistanceMap
         Distance map of the field; its ``scale`` is c of the cost r^2 / (c^2 + r^2) (Geman-McClure loss).
     max_iterations : int
-        Largest number of Levenberg-Marquardt steps, 1 or more, default 40.
+        Largest number of Levenberg-Marquardt steps, 1 or more, default 40. A pose that has not converged after them has
+        the flag NOT_CONVERGED.
     count : int, optional
         Number of starts. None takes the number from a call; `bind` needs a number.
 
@@ -342,7 +344,7 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
             work=WorkSize(starts, (1,)),
             more_inputs=[((self.count, 3), build.real)],
             outputs=build.outputs(
-                shapes | dict.fromkeys(("score", "residual_std", "inlier_fraction", "status"), starts)
+                shapes | dict.fromkeys(("score", "residual_std", "inlier_fraction", "status"), starts), status=np.uint16
             ),
             defines={"MIN_EIGENVALUE_RATIO": f"{_MIN_EIGENVALUE_RATIO}f", "PRIOR_POINTS": f"{_PRIOR_POINTS}f"},
             arguments=[
@@ -375,7 +377,7 @@ class PoseCandidate(NamedTuple):
         Index of the candidate that the field's symmetry maps this one to: no measurement of lines can tell them apart.
         None: it is not among the candidates.
     status : Status
-        OK; or AMBIGUOUS: the points determine a part of the pose only.
+        OK; AMBIGUOUS: the points determine a part of the pose only; NOT_CONVERGED: see `FieldPoses`.
     """
 
     pose: npt.NDArray[np.float64]

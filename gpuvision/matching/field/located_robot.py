@@ -77,6 +77,8 @@ class LocatedRobot:
         sigmas = f"sigmas {1e3 * sx:.2g} mm, {1e3 * sy:.2g} mm, {math.degrees(sigma_heading):.2g} degrees"
         if each.status & Status.AMBIGUOUS:
             sigmas = "the points fix a part of it only"
+        if each.status & Status.NOT_CONVERGED:
+            sigmas += ", not converged"
         symmetric_twin = "" if each.symmetric_twin is None else f"; twin of {each.symmetric_twin + 1}"
         return (
             f"{number + 1}: x {x:.3f} m, y {y:.3f} m, heading {math.degrees(heading):.2f} degrees; {sigmas}; "

@@ -24,6 +24,7 @@ from gpuvision.host import (
     Define,
     Device,
     DeviceArray,
+    FitStatusArray,
     FloatArray,
     IntArray,
     Launch,
@@ -71,6 +72,9 @@ class BoardPoseEstimate(NamedTuple):
         `Status` flags of the rulers, as in `Edges`.
     edge_weights : float32, (lines, rulers_per_line)
         Weight of each edge in the fit of its line, 0 to 1.
+    line_status : uint16, (lines,)
+        `Status` flags of the fits of the lines, as in `LineFits`. A line with one edge is NO_DATA: it has no direction,
+        and takes part with its offset.
     """
 
     pose: FloatArray
@@ -84,13 +88,14 @@ class BoardPoseEstimate(NamedTuple):
     condition: FloatArray
     rank: IntArray
     inliers: IntArray
-    status: StatusArray
+    status: FitStatusArray
     etch_bias: FloatArray
     inlier_fraction: FloatArray
     leverage: FloatArray
     edges: FloatArray
     edge_status: StatusArray
     edge_weights: FloatArray
+    line_status: FitStatusArray
 
 
 def place_rulers(
@@ -179,10 +184,13 @@ class BoardLines(NamedTuple):
         Feature rows as `SolvePose` takes them: two of each line, or one where a line has one ruler.
     edge_weights : float32, (lines, rulers_per_line)
         Weight of each edge in the fit of its line, 0 to 1.
+    status : uint16, (lines,)
+        `Status` flags of the fits, as in `LineFits`.
     """
 
     rows: FloatArray
     edge_weights: FloatArray
+    status: FitStatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,7 +261,9 @@ class FitBoardLines(VisionOperation[BoardLines]):
             work=build.work(lines, each=1, group=_GROUP, grouping="per_element"),
             problem_per_group=True,
             more_inputs=[((lines, rulers), build.real), ((lines, len(LINE)), build.real)],
-            outputs=build.outputs({"rows": (rows, numbers), "edge_weights": (lines, rulers)}),
+            outputs=build.outputs(
+                {"rows": (rows, numbers), "edge_weights": (lines, rulers), "status": (lines,)}, status=np.uint16
+            ),
             defines={
                 **{name: value for name, value in options.items() if name not in _OPTIONS_OF_POSE},
                 **type_defines("INPUT", build.real),
@@ -378,14 +388,15 @@ class BoardPoseEstimator(OperationSequence[BoardPoseEstimate]):
         pairs = start_pairs(self.rulers_per_line, solver.max_trials)
         found = (self.lines, self.rulers_per_line)
         shapes = solver.shapes((), (self.lines, self._rows_of_line))
-        shapes |= dict.fromkeys(("edges", "edge_status", "edge_weights"), found)
+        shapes |= dict.fromkeys(("edges", "edge_status", "edge_weights"), found) | {"line_status": (self.lines,)}
+        flag_types = {"status": np.uint16, "edge_status": np.uint8, "line_status": np.uint16}
         limits = (*solver.limits(build.real), *solver.placement, solver.etch_bias_certainty)
         return build.launch(
             "board_pose/board_pose.cl",
             "board_pose",
             work=work,
             more_inputs=[((*found, len(RULER)), build.real), ((self.lines, len(LINE)), build.real)],
-            outputs=build.outputs(shapes, rank=np.int32, inliers=np.int32, edge_status=np.uint8),
+            outputs=build.outputs(shapes, rank=np.int32, inliers=np.int32, **flag_types),
             defines={
                 **edges.defines,
                 **solver.defines(count, vectors=True),
@@ -419,11 +430,8 @@ class BoardPoseEstimator(OperationSequence[BoardPoseEstimate]):
             Stage("pose", SolveBoardLines(solver=self.solver, lines=self.lines), ("fits.rows",)),
         ]
         outputs = {name: f"pose.{name}" for name in BoardPose._fields}
-        return Layout(
-            inputs,
-            stages,
-            outputs | {"edges": "edges.edges", "edge_status": "edges.status", "edge_weights": "fits.edge_weights"},
-        )
+        outputs |= {"edges": "edges.edges", "edge_status": "edges.status", "edge_weights": "fits.edge_weights"}
+        return Layout(inputs, stages, outputs | {"line_status": "fits.status"})
 
     def specs(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Specs:
         """Return inputs, outputs and memory; see `Operation.specs`."""

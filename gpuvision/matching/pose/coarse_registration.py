@@ -278,12 +278,13 @@ class CoarseRegistration:
             max_trials=self._trials,
         )
         fits = solver(rows, device=device)
-        status, pose, deformation = (to_numpy(each) for each in (fits.status, fits.pose, fits.deformation))
+        pose, deformation = to_numpy(fits.pose), to_numpy(fits.deformation)
+        refused = (to_numpy(fits.status) & ~Status.NOT_CONVERGED) != 0
         motions = [
-            start if status[number] else compose(start, pose[number], deformation[number])
+            start if refused[number] else compose(start, pose[number], deformation[number])
             for number, start in enumerate(starts)
         ]
-        etch_biases = np.where(status == 0, to_numpy(fits.etch_bias), 0.0)
+        etch_biases = np.where(refused, 0.0, to_numpy(fits.etch_bias))
         return self._score(image, motions, etch_biases, device)
 
     @functools.cached_property
@@ -333,7 +334,7 @@ class CoarseRegistration:
             measured = self._measure_rulers(image, self.rulers, [motion], [etch_bias], ruler, device)
             fit = solver(self._pose_rows(self.rulers, [motion], measured), device=device)
             status = Status(int(to_numpy(fit.status)[0]))
-            if status:
+            if status & ~Status.NOT_CONVERGED:
                 return self._refuse(status, best, others)
             motion = compose(motion, to_numpy(fit.pose)[0], to_numpy(fit.deformation)[0])
             etch_bias = float(to_numpy(fit.etch_bias)[0])
@@ -346,7 +347,8 @@ class CoarseRegistration:
         close = [other for other in others if not last.is_better_than(other, self.limits)]
         pose, deformation = decompose(motion, self.placement)
         errors = registration_errors(self._fitted_edges(motion, fit), self.transform)
-        return self._refuse(Status.AMBIGUOUS if close else Status.OK, last, close or others)._replace(
+        status |= Status.AMBIGUOUS if close else Status.OK
+        return self._refuse(status, last, close or others)._replace(
             pose=pose,
             deformation=deformation if self.transform != "rigid" else np.zeros(3),
             placement=motion[:, 2],

@@ -23,6 +23,7 @@ from gpuvision.camera.lens import Lens
 from gpuvision.host import (
     Define,
     Device,
+    FitStatusArray,
     FloatArray,
     IntArray,
     Launch,
@@ -60,12 +61,12 @@ class FeaturePose(NamedTuple):
         x, y [m]: the point of the artwork at the middle of the full image; theta [rad]: counter-clockwise angle from
         the artwork's x axis to the direction of increasing columns, -pi to pi. float32 on devices without double
         precision.
-        Where the status is not OK, all fields are NaN unless their description says otherwise.
+        Where the status is neither OK nor NOT_CONVERGED, all fields are NaN unless their description says otherwise.
     covariance : float64, (3, 3)
         Covariance of the pose. Residuals smaller than the sigmas of the features do not reduce it. float32 on devices
         without double precision.
-    status : uint8
-        `Status` flags, as in `BoardPose`: NO_DATA, AMBIGUOUS, OUT_OF_RANGE, NOT_FINITE.
+    status : uint16
+        `Status` flags, as in `BoardPose`: NO_DATA, AMBIGUOUS, OUT_OF_RANGE, NOT_FINITE, NOT_CONVERGED (with a pose).
     residuals, weights : float32, (rows,)
         Residual along the normal in the artwork [m], and weight in the pose, 0 to 1: of each ruler, then of the two
         principal axes of each fiducial.
@@ -82,7 +83,7 @@ class FeaturePose(NamedTuple):
 
     pose: FloatArray
     covariance: FloatArray
-    status: StatusArray
+    status: FitStatusArray
     residuals: FloatArray
     weights: FloatArray
     feature_status: StatusArray
@@ -288,7 +289,7 @@ class SolveFeatures(VisionOperation[FeaturePose]):
         shapes: dict[str, tuple[int, ...] | None] = dict.fromkeys(FeaturePose._fields, ())
         shapes |= {"pose": (3,), "covariance": (3, 3), "motion": (3,), "motion_covariance": (3, 3)}
         shapes |= {"residuals": (rows,), "weights": (rows,), "feature_status": (features,)}
-        types: dict[str, Any] = {"pose": dtype, "covariance": dtype, "feature_status": np.uint8}
+        types: dict[str, Any] = {"pose": dtype, "covariance": dtype, "feature_status": np.uint8, "status": np.uint16}
         types |= {"rank": np.int32, "inliers": np.int32}
         sigmas = (self.ruler_sigma_px, self.matched_sigma_px, self.drilled_sigma_px)
         limits = (solver.min_scale, *solver.limits(real), solver.etch_bias_certainty, *sigmas, self.size_tolerance)

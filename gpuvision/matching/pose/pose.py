@@ -20,12 +20,12 @@ import numpy.typing as npt
 from gpuvision.host import (
     Define,
     Device,
+    FitStatusArray,
     FloatArray,
     IntArray,
     Launch,
     LaunchBuilder,
     Precision,
-    StatusArray,
     Variant,
     capacity,
     flags,
@@ -81,11 +81,13 @@ class BoardPose(NamedTuple):
         Number of parameter combinations that the features determine.
     inliers : int32, (...,)
         Number of rows with a weight above 0.
-    status : uint8, (...,)
+    status : uint16, (...,)
         `Status` flags. NO_DATA: fewer rows than unknowns. AMBIGUOUS (refused): the features do not determine all
         unknowns (``rank``; or with their weights, which ended the iteration), too few of them agree on one
         (``inlier_fraction``), or an unknown has no second feature that checks it (``leverage``). OUT_OF_RANGE
-        (refused): the pose lies outside ``search_range``. NOT_FINITE: the initial pose is not finite.
+        (refused): the pose lies outside ``search_range``. NOT_FINITE: the initial pose is not finite. NOT_CONVERGED
+        (with a pose): ``max_iterations`` ended the fit at a pose from which the next step to the solution exceeds a
+        tenth of its standard deviations, and the rounding.
     etch_bias : float, (...,)
         Distance from the drawn edges to the copper's edges [m], one value for the board; 0 without ``etch_bias_sigma``.
     inlier_fraction : float, (...,)
@@ -107,7 +109,7 @@ class BoardPose(NamedTuple):
     condition: FloatArray
     rank: IntArray
     inliers: IntArray
-    status: StatusArray
+    status: FitStatusArray
     etch_bias: FloatArray
     inlier_fraction: FloatArray
     leverage: FloatArray
@@ -250,7 +252,8 @@ class SolvePose(VisionOperation[BoardPose]):
         contain an outlier on 2 of 1e4 boards, 256 on 1e-15; with ``etch_bias_sigma`` a candidate has four rows, and 256
         all contain an outlier on 7 of 1e8 boards.
     max_iterations : int
-        Number of Gauss-Newton iterations, 1 or more, default 12.
+        Number of Gauss-Newton iterations, 1 or more, default 12. A pose that has not converged after them has the flag
+        NOT_CONVERGED.
     precision : {None, "single", "double"}
         Precision of the arithmetic and of the results; None follows the input.
     variant : {"auto", "vector", "work_item"}
@@ -347,7 +350,9 @@ class SolvePose(VisionOperation[BoardPose]):
             work=work,
             problem_per_group=True,
             more_inputs=[((*batch, 3), dtype)] if self.with_initial_pose else [],
-            outputs=build.outputs(self.shapes(batch, (*batch, count)), rank=np.int32, inliers=np.int32),
+            outputs=build.outputs(
+                self.shapes(batch, (*batch, count)), rank=np.int32, inliers=np.int32, status=np.uint16
+            ),
             defines={
                 **self.defines(count, vectors=work.vectors),
                 **type_defines("INPUT", dtype),

@@ -265,7 +265,7 @@ def register_images(
     )
     found, start = fix(image, device=device), np.array([*away, 0.0])
     if found.misfit > tolerance_px:
-        found = found._replace(status=Status.AMBIGUOUS)
+        found = found._replace(status=found.status | Status.AMBIGUOUS)
     return found._replace(
         pose=found.pose + start, placement=found.placement + away, runner_up_pose=found.runner_up_pose + start
     )

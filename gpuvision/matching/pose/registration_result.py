@@ -74,8 +74,9 @@ class Registration(NamedTuple):
         Number of verification rulers in the image.
     status : Status
         OK. With a pose: AMBIGUOUS (among the rulers that agree with one of the two poses only, too few more agree with
-        this pose than with the runner-up). Refused: LOW_SIGNAL (no pose reaches the least score), NO_DATA (too few
-        known edges in the image), AMBIGUOUS with NaN (the found edges do not determine all unknowns).
+        this pose than with the runner-up), NOT_CONVERGED (the last fit of the edges, see `BoardPose`). Refused:
+        LOW_SIGNAL (no pose reaches the least score), NO_DATA (too few known edges in the image), AMBIGUOUS with NaN
+        (the found edges do not determine all unknowns).
     etch_bias : float
         Displacement of all edges along their normals; 0 where it is not solved for, NaN where the pose is refused.
     misfit : float

@@ -219,7 +219,7 @@ def fit_of(*, status: int = 0, residual_scale: float = 2.0, sigma: float = 1e-4,
     """Return a similarity whose placement point moves by 3 um along x, relative to the pose of `solved`."""
     factor = 2.0 if residual_scale > 1.0 else 1.0
     return types.SimpleNamespace(
-        status=np.array(status, np.uint8),
+        status=np.array(status, np.uint16),
         residual_scale=np.array(residual_scale),
         covariance=np.diag([1e-6, 1e-6, 1e-4, factor * sigma]) ** 2,
         deformation=np.array([error, error, 0.0]),
@@ -237,6 +237,26 @@ def scale_test(monkeypatch: pytest.MonkeyPatch, fit: Any, **changes: Any) -> Pos
     tested = measurer._test_scale(found, 20e-6)
     assert all(each[2:] == (20e-6, None, "similarity") for each in asked)
     return tested
+
+
+def test_a_pose_that_has_not_converged_is_kept_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    rulers, marks = rulers_of([1e-6] * 3, [1] * 3), fiducials_of([], [])
+    measurer = measurer_of(placement=np.zeros(2), spacing=np.ones(3))
+    for status, count in ((0, 0), (256, 1)):
+        fit = types.SimpleNamespace(
+            **vars(fit_of(status=status, residual_scale=1.0)),
+            weights=np.ones(3),
+            residuals=np.zeros(3),
+            scale=np.array(1.0),
+            condition=np.array(2.0),
+        )
+        monkeypatch.setattr(measurer, "_fit", lambda *_, fit=fit: fit)
+        found = measurer._solve(rulers, marks, 20e-6, None)
+        assert (found.reason, len(found.warnings)) == ("", count)
+        np.testing.assert_allclose(found.pose, [3e-6, 0.0, 0.0])
+        tested = scale_test(monkeypatch, fit_of(error=1e-3), warnings=found.warnings)
+        assert tested.warnings[:count] == found.warnings
+        assert len(tested.warnings) == count + 1
 
 
 def test_a_scale_that_is_not_known_or_not_significant_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -82,9 +82,9 @@ kernel void line_steps(global const real *given, global const real *start, const
     PUT(line_score(line, all, 7));
     const laned_line first = line_start(all, pairs, trials, 7);
     PUT_LINE(first);
-    laned_fit fit = {line, 1 / per_scale, 0, 0, 0, 0, 0};
-    line_variances(&fit, all);
-    PUT(fit.variance_of_angle), PUT(fit.variance_of_offset), PUT(fit.inliers);
+    laned_fit fit = {line, 1 / per_scale, 0, 0, 0, 0, 0, 0};
+    line_variances(&fit, all, 1e-30f);
+    PUT(fit.variance_of_angle), PUT(fit.variance_of_offset), PUT(fit.inliers), PUT(fit.is_open != 0);
 }
 """
 
@@ -228,3 +228,9 @@ def assert_steps(
         psi = np.sum((robust * z / scale)[is_in] ** 2)
         factor = scale**2 * psi / free / mean**2 if free > 0 else math.nan
     np.testing.assert_allclose(out[18:20], [factor / (inlier @ u**2), factor / inlier.sum()], rtol=1e-3)
+    # The Newton step to the minimum, in standard deviations, decides on convergence.
+    gradient = np.array([np.sum(weight * robust * off(line)), np.sum(weight * robust * u * off(line))])
+    mean = max(float(np.sum(slope[is_in]) / is_in.sum()), 0.0)
+    square = float(np.sum(gradient**2 / [inlier.sum(), inlier @ u**2])) / factor
+    if not 0.9 < square / (0.01 * mean**2 + 1e-30) < 1.1:
+        assert out[21] == (square > 0.01 * mean**2)

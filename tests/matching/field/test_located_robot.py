@@ -82,6 +82,9 @@ def test_summary(device: Device) -> None:
         "2: x 1.000 m, y 2.000 m, heading 28.65 degrees; the points fix a part of it only; score 0.125, 75% of the "
         "points on lines; twin of 1",
     ]
+    near = located(device, candidates=(KNOWN._replace(status=Status.NOT_CONVERGED),))
+    assert "0.57 degrees, not converged; score" in near.summary()
+    assert near.report()["candidates"][0]["status"] == "NOT_CONVERGED"
     few = located(device, candidates=(), evidence=EVIDENCE._replace(expected=0, seen=math.nan))
     assert few.summary() == "2 points, 60% of them on lines"
     assert "; 0% of what should be seen" in located(device, evidence=EVIDENCE._replace(seen=-0.5)).summary()

@@ -130,6 +130,23 @@ def test_as_its_parts(device: Device, variant: Any, rng: np.random.Generator) ->
 
 
 @VARIANTS
+@pytest.mark.parametrize("loss", ["tukey", "huber"])
+def test_fits_that_have_not_converged(device: Device, variant: Any, loss: Any, rng: np.random.Generator) -> None:
+    """One iteration flags most poses and some lines, and keeps their values; twelve flag none."""
+    flags = {1: [], 12: []}
+    for steps, found in flags.items():
+        for _ in range(6):
+            fix = operation(variant, max_iterations=steps, loss=loss)
+            result = fix(picture(rng, shifted=(2,)), *board_rulers(), device=device)
+            assert np.isfinite(result.pose).all()
+            found.append((int(result.status), *result.line_status.tolist()))
+    assert set(np.ravel(flags[1])) == {0, int(Status.NOT_CONVERGED)}
+    assert np.count_nonzero(np.array(flags[1])[:, 0]) >= 2
+    assert np.count_nonzero(np.array(flags[1])[:, 1:]) >= 3
+    assert not np.any(flags[12])
+
+
+@VARIANTS
 def test_forty_lines_of_one_ruler(device: Device, variant: Any, rng: np.random.Generator) -> None:
     """More lines than work-items of a group, and lines without an angle of their own."""
     normal, point, along = artwork()

@@ -183,6 +183,11 @@ def test_pose_is_the_least_squares_minimum(
     rows = one_by_one(features, image, view, device, length_of(bound))
     pose = robust.solve_pose(rows[:, :7], 3, 1.0, "tukey", 4.685, found.motion.astype(np.float64))
     assert_near(found.motion, pose, (3e-9, 3e-9, 1e-6))  # a fiftieth of the standard deviations
+    assert found.status == Status.OK
+    once = bind(features, device, etch_bias_sigma=0.0, solver=SolvePose(loss="huber", scale=1.0, max_iterations=1))
+    first = once(image, NEAR)
+    assert first.status == Status.NOT_CONVERGED
+    assert np.isfinite(first.pose).all()
 
 
 def test_errors_are_as_predicted(artwork: Artwork, features: FeatureSet, device: Device) -> None:

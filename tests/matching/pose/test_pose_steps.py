@@ -41,7 +41,7 @@ kernel void pose_steps(global const real *given, global real *made) {
     PUT(next.dxx), PUT(next.dxy), PUT(next.dyx), PUT(next.dyy), PUT(next.x), PUT(next.y), PUT(next.etch);
     for (int k = 0; k < TRIANGLE; k++) matrix[k] = k;
     for (int k = 0; k < FREEDOMS; k++) right[k] = -k;
-    add_equation(equation, at[13], matrix, right);
+    add_equation(equation, at[13], 0.5f * at[13], matrix, right);
     add_etch(pose, at[22], matrix, right);
     for (int k = 0; k < TRIANGLE; k++) PUT(matrix[k]);
     for (int k = 0; k < FREEDOMS; k++) PUT(right[k]);
@@ -134,7 +134,7 @@ def test_equations_and_steps(
         size = len(lower[0])
         normal = row[6] * np.outer(slopes, slopes)
         prior = np.diag([0.0] * parameters + [numbers[22] ** 2] * has_etch)
-        right = row[6] * off * np.array(slopes) - np.arange(freedoms)
+        right = 0.5 * row[6] * off * np.array(slopes) - np.arange(freedoms)
         right[parameters:] -= numbers[22] ** 2 * etch
         start = 8 + freedoms
         np.testing.assert_allclose(

@@ -41,6 +41,29 @@ def test_a_batch_with_exactly_the_margin_keeps_up(rate: float, batch: int) -> No
     assert chosen.batch == batch
 
 
+@pytest.mark.parametrize(
+    ("headroom", "latency", "batch"),
+    [
+        (None, None, 2),
+        (1.6, None, 2),
+        (1.61, None, 4),
+        (2.4, None, 4),
+        (2.41, None, 8),
+        (3.0, None, 8),  # the fastest: a batch of 16 takes longer
+        (3.0, 5e-3, 4),
+    ],
+)
+def test_a_larger_batch_gives_the_headroom(headroom: float | None, latency: float | None, batch: int) -> None:
+    """A batch of one frame has too little margin. A batch of 8 is complete after 7 ms."""
+    rates = {1: 1200.0, 2: 1600.0, 4: 2400.0, 8: 2500.0, 16: 1250.0}
+    chosen = planned(
+        lambda size, inline: Cost(rates[size], 1e-4, 1e-5), headroom=headroom, latency=latency, batches=(*rates,)
+    )
+    assert chosen.batch == batch
+    assert chosen.trials[-1].batch == batch
+    assert chosen.ring == {2: 101, 4: 51, 8: 26}[batch]
+
+
 @pytest.mark.parametrize(("latency", "batch"), [(2e-3, 2), (1.9999e-3, None)])
 def test_a_batch_may_take_exactly_the_latency(latency: float, batch: int | None) -> None:
     """A batch of two frames is complete after 1 ms and takes 1 ms."""

@@ -36,9 +36,9 @@ class ScanJob:
     Attributes
     ----------
     recording : str, Path or numpy.ndarray
-        Camera recording, or frames (frames, rows, columns).
+        Recording, or frames: (frames, rows, columns) of a camera, (frames, strips, 2) of a PSD.
     sensor : Sensor
-        Sensor of the recording, with the noise of its camera.
+        Sensor of the recording, with its noise.
     """
 
     recording: str | Path | npt.NDArray[Any]

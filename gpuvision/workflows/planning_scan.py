@@ -1,4 +1,4 @@
-"""Planning of a scan: try line readouts on a sample of the recording, and choose the fastest that is accurate enough.
+"""Planning of a scan: try readouts on a sample of the recording, and choose the fastest that is accurate enough.
 
 The error of the heights comes from the error model of `gpuvision.workflows.scan_errors`, the time from the device.
 """
@@ -20,6 +20,7 @@ from gpuvision.host import ArraySource, Device, Plan, StreamError, plan_stream, 
 from gpuvision.normal_distribution import MAD_TO_SIGMA
 from gpuvision.ranging.background import sample_frames
 from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.validation import finite
@@ -34,18 +35,21 @@ Progress = Callable[[int, int | None], object]
 _WINDOWS = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 180)
 _HALF_WIDTHS = (1.2, 2.0)  # of the windows, over half the width of the line: noise moves the peak within the line
 _UNKNOWN_LENGTH = 1 << 40  # frames of a recording that does not tell: its stream has no end
+# Service rate over frame rate of a stream, where a larger batch gives it. Measured: of 17 streams of the smallest
+# sufficient batch, 2 were late beside other work; a paced source takes time that the service rate does not contain.
+_HEADROOM = 2.0
 _ROUNDS = 15  # of the timing, of which the median counts
 _QUIET = 1.5  # times the least noise of a readout, up to which its scatter shows the texture. Chosen
 _EDGE = 8.0  # robust standard deviations of the second differences of heights. Chosen: noise stays below
 
 
-class _Sample(NamedTuple):
+class Sample(NamedTuple):
     """Frames of a recording less their background.
 
     Attributes
     ----------
     frames : numpy.ndarray
-        (frames, rows, columns).
+        (frames, rows, columns), or (frames, strips, 2) of a PSD.
     numbers : numpy.ndarray
         Their numbers in the recording, (frames,).
     length : int
@@ -55,6 +59,27 @@ class _Sample(NamedTuple):
     frames: Array
     numbers: npt.NDArray[np.int64]
     length: int
+
+
+class TriedReadouts(NamedTuple):
+    """Readouts that were tried on a sample of a recording.
+
+    Attributes
+    ----------
+    sensor : Sensor
+        The sensor, with the estimated threshold if its file asks for one.
+    sample : Sample
+        Frames that the readouts read.
+    trials : tuple of ReadoutTrial
+        The readouts with errors and times, fastest first.
+    device : Device
+        Device of the times.
+    """
+
+    sensor: Sensor
+    sample: Sample
+    trials: tuple[ReadoutTrial, ...]
+    device: Device
 
 
 def plan_scan(
@@ -68,18 +93,20 @@ def plan_scan(
     limits: ScanPlanLimits = ScanPlanLimits(),
     progress: Progress = lambda done, of: None,
 ) -> ScanPlan:
-    """Choose the fastest line readout whose predicted error of the heights meets a tolerance.
+    """Choose the fastest readout whose predicted error of the heights meets a tolerance.
 
-    Methods ``"windowed"``, ``"gauss3"``, ``"fir"`` and ``"ml"`` are tried with windows that suit the width of the line,
-    and the readout of the sensor. All other settings are the sensor's. ``"centroid"`` is tried only if the sensor has
-    it: no error model covers light beside the line.
+    Of a camera the methods ``"windowed"``, ``"gauss3"``, ``"fir"`` and ``"ml"`` are tried with windows that suit the
+    width of the line, and the readout of the sensor. All other settings are the sensor's. ``"centroid"`` is tried only
+    if the sensor has it: no error model covers light beside the line. A PSD has one readout: only its precision and
+    its stream are planned.
 
     Parameters
     ----------
     recording : str, Path or numpy.ndarray
-        Camera recording (`open_recording`), or frames (frames, rows, columns). It is read to its end for a sample.
+        Recording (`open_recording`), or frames (frames, rows, columns) of a camera, (frames, strips, 2) of a PSD. It is
+        read to its end for a sample.
     sensor : Sensor
-        Sensor of the recording, with the noise of its camera.
+        Sensor of the recording, with its noise.
     tolerance : float
         Largest error of the heights z [m], root mean square over the samples of the recording: random errors, the phase
         of the line in its pixel, and the calibration where its covariance is known.
@@ -105,8 +132,8 @@ def plan_scan(
     RecordingError
         The recording cannot be read.
     ValueError
-        The sensor is no camera, its file gives no noise, the tolerance is not above 0, a latency has no rate, or the
-        recording has no line.
+        The sensor is neither a camera nor a PSD, its file gives no noise, the tolerance is not above 0, a latency has
+        no rate, or the recording has no line.
 
     Notes
     -----
@@ -123,10 +150,61 @@ def plan_scan(
     R. B. Fisher and D. K. Naidu, A comparison of algorithms for subpixel peak detection, in Image Technology, Springer
     1996.
     """
-    _check(sensor, tolerance, rate, latency)
+    _check_limits(tolerance, rate, latency)  # before the work
+    tried = try_readouts(recording, sensor, device=device, limits=limits, progress=progress)
+    return choose_readout(tried, tolerance=tolerance, rate=rate, latency=latency, limits=limits)
+
+
+def try_readouts(
+    recording: str | Path | Array,
+    sensor: Sensor,
+    *,
+    device: Device | None = None,
+    limits: ScanPlanLimits = ScanPlanLimits(),
+    progress: Progress = lambda done, of: None,
+) -> TriedReadouts:
+    """Try readouts on a sample of a recording, for `choose_readout`.
+
+    Parameters
+    ----------
+    recording, sensor, device, limits, progress
+        As in `plan_scan`.
+
+    Raises
+    ------
+    RecordingError, ValueError
+        As `plan_scan`.
+    """
+    _check_sensor(sensor)
     device = Device.best() if device is None else device
     sensor, sample = _sampled(recording, sensor)
-    trials = _try_readouts(sensor, sample, device, limits, progress)
+    return TriedReadouts(sensor, sample, _try_readouts(sensor, sample, device, limits, progress), device)
+
+
+def choose_readout(
+    tried: TriedReadouts,
+    *,
+    tolerance: float,
+    rate: float | None = None,
+    latency: float | None = None,
+    limits: ScanPlanLimits = ScanPlanLimits(),
+) -> ScanPlan:
+    """Choose the fastest of the readouts that were tried, for any tolerance, rate and latency.
+
+    Parameters
+    ----------
+    tried : TriedReadouts
+        Result of `try_readouts`.
+    tolerance, rate, latency, limits
+        As in `plan_scan`.
+
+    Raises
+    ------
+    PlanError, ValueError
+        As `plan_scan`.
+    """
+    _check_limits(tolerance, rate, latency)
+    sensor, sample, trials, device = tried
     chosen = _chosen(trials, tolerance, limits)
     chosen, rounding = _with_precision(chosen, sensor, sample, device, tolerance / limits.margin)
     stream = None
@@ -143,21 +221,25 @@ def plan_scan(
     )
 
 
-def _check(sensor: Sensor, tolerance: float, rate: float | None, latency: float | None) -> None:
+def _check_limits(tolerance: float, rate: float | None, latency: float | None) -> None:
     finite(tolerance, "tolerance", above=0.0)
     if rate is not None:
         finite(rate, "rate", above=0.0)
     elif latency is not None:
         raise ValueError("a latency needs a rate; give the frames per second as well")
-    if sensor.kind != "camera":
+
+
+def _check_sensor(sensor: Sensor) -> None:
+    if not isinstance(sensor.readout, LineReadout | PsdReadout):
         raise ValueError(
-            f"{sensor.name or 'the sensor'} is a {sensor.kind} sensor; only the readout of a camera is planned"
+            f"{sensor.name or 'the sensor'} is a {sensor.kind} sensor; only readouts of cameras and PSDs are planned"
         )
     if not sensor.noise_known:
-        raise ValueError("the sensor file gives no noise to predict errors from; give [line] read_noise and gain")
+        missing = "[line] read_noise and gain" if sensor.kind == "camera" else "[psd.noise]"
+        raise ValueError(f"the sensor file gives no noise to predict errors from; give {missing}")
 
 
-def _sampled(recording: str | Path | Array, sensor: Sensor) -> tuple[Sensor, _Sample]:
+def _sampled(recording: str | Path | Array, sensor: Sensor) -> tuple[Sensor, Sample]:
     """Return the sensor with its threshold, and the sample."""
     opened = open_for_scan(recording, sensor)
     try:
@@ -165,26 +247,31 @@ def _sampled(recording: str | Path | Array, sensor: Sensor) -> tuple[Sensor, _Sa
         length = opened.source.length
     finally:
         opened.source.close()
-    return opened.sensor, _Sample(sample.frames[:, 0], sample.numbers, _UNKNOWN_LENGTH if length is None else length)
+    return opened.sensor, Sample(sample.frames[:, 0], sample.numbers, _UNKNOWN_LENGTH if length is None else length)
 
 
 def _try_readouts(
-    sensor: Sensor, sample: _Sample, device: Device, limits: ScanPlanLimits, progress: Progress
+    sensor: Sensor, sample: Sample, device: Device, limits: ScanPlanLimits, progress: Progress
 ) -> tuple[ReadoutTrial, ...]:
     """Return the readouts with their errors and times on the sample, fastest first."""
-    half = _half_width(sensor, sample, device)
-    readouts = _readouts(sensor, half)
+    readouts: list[LineReadout | PsdReadout]
+    if isinstance(sensor.readout, PsdReadout):
+        half, readouts = 0.0, [sensor.readout]
+    else:
+        half = _half_width(sensor, sample, device)
+        readouts = [*_readouts(sensor, half)]
     trials = []
     for number, readout in enumerate(readouts):
         found = _errors(dataclasses.replace(sensor, readout=readout), sample, device)
-        trials.append(found._replace(error=math.nan) if _is_narrow(readout, half) else found)
+        is_narrow = isinstance(readout, LineReadout) and _is_narrow(readout, half)
+        trials.append(found._replace(error=math.nan) if is_narrow else found)
         progress(number + 1, len(readouts))
     seconds = _times(sensor, readouts, sample, device)
     timed = [each._replace(seconds=one) for each, one in zip(_with_unexplained(trials, limits), seconds, strict=True)]
     return tuple(sorted(timed, key=lambda each: each.seconds))
 
 
-def _times(sensor: Sensor, readouts: Sequence[LineReadout], sample: _Sample, device: Device) -> list[float]:
+def _times(sensor: Sensor, readouts: Sequence[LineReadout | PsdReadout], sample: Sample, device: Device) -> list[float]:
     """Return the time of each readout for a frame of the sample [s]."""
     frames = device.empty(sample.frames.shape, sample.frames.dtype)
     frames.set(sample.frames)
@@ -195,7 +282,7 @@ def _times(sensor: Sensor, readouts: Sequence[LineReadout], sample: _Sample, dev
     return [each / len(sample.frames) for each in median_times(calls, _ROUNDS)]
 
 
-def _half_width(sensor: Sensor, sample: _Sample, device: Device) -> float:
+def _half_width(sensor: Sensor, sample: Sample, device: Device) -> float:
     """Return half the median width of the line above the threshold [px].
 
     Raises
@@ -218,7 +305,7 @@ def _is_narrow(readout: LineReadout, half: float) -> bool:
 def _readouts(sensor: Sensor, half: float) -> list[LineReadout]:
     """Return the readouts to try for a line of this half width [px]: the sensor's first."""
     given = sensor.readout
-    assert isinstance(given, LineReadout)  # `_check` refuses other sensors
+    assert isinstance(given, LineReadout)  # a PSD has no other readouts
     windows = _windows(half)
     changes: list[dict[str, Any]] = [
         {},
@@ -236,10 +323,10 @@ def _windows(half: float) -> list[int]:
     return sorted({next((window for window in _WINDOWS if window >= each), _WINDOWS[-1]) for each in wanted})
 
 
-def _errors(sensor: Sensor, sample: _Sample, device: Device) -> ReadoutTrial:
+def _errors(sensor: Sensor, sample: Sample, device: Device) -> ReadoutTrial:
     """Return the predicted errors of a readout on the sample, without its time."""
     points, errors = _points(sensor, sample, device)
-    assert errors is not None  # `_check` asks for the noise
+    assert errors is not None  # `_check_sensor` asks for the noise
     z = to_numpy(points.z)
     random, phase, systematic = (
         _rms(None if each is None else each.z) for each in (errors.random, errors.phase, errors.systematic)
@@ -280,7 +367,7 @@ def _with_unexplained(trials: Sequence[ReadoutTrial], limits: ScanPlanLimits) ->
     ]
 
 
-def _points(sensor: Sensor, sample: _Sample, device: Device) -> Any:
+def _points(sensor: Sensor, sample: Sample, device: Device) -> Any:
     """Return the points of the sample, and their errors."""
     operation = range_readout(sensor)
     reading = operation(sample.frames, device=device)
@@ -310,7 +397,7 @@ def _chosen(trials: Sequence[ReadoutTrial], tolerance: float, limits: ScanPlanLi
 
 
 def _with_precision(
-    chosen: ReadoutTrial, sensor: Sensor, sample: _Sample, device: Device, largest: float
+    chosen: ReadoutTrial, sensor: Sensor, sample: Sample, device: Device, largest: float
 ) -> tuple[ReadoutTrial, float | None]:
     """Return the readout, in double precision if rounding would exceed the largest error [m], and its rounding [m]."""
     if not device.has_double:
@@ -331,7 +418,7 @@ def _plan_stream(
     chosen: ReadoutTrial,
     trials: Sequence[ReadoutTrial],
     sensor: Sensor,
-    sample: _Sample,
+    sample: Sample,
     device: Device,
     rate: float,
     latency: float | None,
@@ -354,6 +441,7 @@ def _plan_stream(
             rate=rate,
             latency=latency,
             margin=limits.rate_margin,
+            headroom=max(_HEADROOM, limits.rate_margin),
             device=device,
             sample=sample.frames,
         )

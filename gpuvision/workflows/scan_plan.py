@@ -11,6 +11,7 @@ from gpuvision.accuracy.plan import AccuracyLimits, AccuracyPlan
 from gpuvision.accuracy.trial import millionths
 from gpuvision.host import Plan
 from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.validation import finite
 from gpuvision.workflows.plan_files import write_plan
@@ -41,11 +42,11 @@ class ScanPlanLimits(AccuracyLimits):
 
 
 class ReadoutTrial(NamedTuple):
-    """Line readout that was tried on the sample.
+    """Readout that was tried on the sample.
 
     Attributes
     ----------
-    readout : LineReadout
+    readout : LineReadout or PsdReadout
         The readout.
     seconds : float
         Median time of the kernel for a frame [s].
@@ -60,7 +61,7 @@ class ReadoutTrial(NamedTuple):
         Fraction of the samples without a point.
     """
 
-    readout: LineReadout
+    readout: LineReadout | PsdReadout
     seconds: float
     error: float
     random: float
@@ -71,10 +72,13 @@ class ReadoutTrial(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Method with its window or filter length, and the precision if it is double."""
-        readout = self.readout
-        size = {"fir": f" {readout.fir_length}", "windowed": f" {readout.window}", "ml": f" {readout.window}"}
-        return f"{readout.method}{size.get(readout.method, '')}{' double' if readout.precision == 'double' else ''}"
+        """Method of a line readout with its window or filter length, and the precision if it is double."""
+        precision = " double" if self.readout.precision == "double" else ""
+        if isinstance(self.readout, PsdReadout):
+            return f"psd{precision}"
+        method, window = self.readout.method, self.readout.window
+        size = {"fir": self.readout.fir_length, "windowed": window, "ml": window}.get(method)
+        return f"{method}{'' if size is None else f' {size}'}{precision}"
 
     @property
     def error_parts(self) -> dict[str, float]:

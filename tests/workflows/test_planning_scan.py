@@ -16,7 +16,9 @@ from gpuvision.accuracy.trial import at_least
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.planning import PlanLimits, plan_stream
 from gpuvision.host.sources import ArraySource
+from gpuvision.ranging.focus_stack import FocusStack, StageFocus
 from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.psd import PsdNoise
 from gpuvision.reference.line import pixel_gaussian
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows import planning_scan, scanning
@@ -268,12 +270,45 @@ def test_predicted_errors_of_all_readouts_are_the_scatter(device: Device, rng: n
         assert each.lost == 0.0
 
 
+def test_a_psd_has_one_readout_whose_error_is_the_scatter(device: Device, rng: np.random.Generator) -> None:
+    """Spots at one place, with the noise of the amplifiers alone; the sensor file also counts its electrons."""
+    sensor = Sensor.load("psd_line")
+    given: Any = sensor.readout
+    silent = PsdNoise(independent=1e-9, spot=given.noise.spot)
+    sensor = dataclasses.replace(sensor, readout=dataclasses.replace(given, noise=silent))
+    shares = np.linspace(0.3, 0.7, 96)
+    currents = 1e-6 * np.stack([1.0 - shares, shares], axis=-1) + 1e-9 * rng.standard_normal((48, 96, 2))
+    frames = np.rint((currents + np.array(given.dark)) / given.ampere).astype(np.uint16)
+    plan = plan_scan(frames, sensor, tolerance=1.0, rate=10.0, device=device)
+    (found,) = plan.trials
+    assert (plan.chosen, found.name, found.phase, found.lost) == (found, "psd", 0.0, 0.0)
+    # 48 x 96 values determine the scatter to 1 %.
+    assert found.error == pytest.approx(scatter(frames, plan, device), rel=0.04)
+    assert plan.stream is not None
+    assert plan.stream.ring == 7
+    assert plan.rounding is None or plan.rounding < 0.01 * found.error
+    double = found._replace(readout=dataclasses.replace(found.readout, precision="double"))
+    assert double.name == "psd double"
+    with pytest.raises(PlanError, match="the most accurate, psd, is predicted"):
+        plan_scan(frames, sensor, tolerance=found.error, device=device)
+
+
+def test_readouts_that_were_tried_give_plans_for_several_tolerances() -> None:
+    device: Any = SimpleNamespace(has_double=False)  # nothing is read for the rounding
+    nothing: Any = None
+    tried = planning_scan.TriedReadouts(noisy_camera(), nothing, TRIALS, device)
+    chosen = [planning_scan.choose_readout(tried, tolerance=each).chosen for each in (6.0, 10.0)]
+    assert chosen == [TRIALS[1], TRIALS[0]]
+    with pytest.raises(ValueError, match=r"tolerance is 0\.0, expected"):
+        planning_scan.choose_readout(tried, tolerance=0.0)
+
+
 @pytest.mark.slow
 def test_a_window_that_noise_moves_off_the_line_is_seen(device: Device, rng: np.random.Generator) -> None:
     """Its predicted noise is far below its scatter: a plan by the noise alone would choose it."""
     frames = recording(rng)
     sensor = noisy_camera(window=3)
-    sample = planning_scan._Sample(frames, np.arange(len(frames)), len(frames))
+    sample = planning_scan.Sample(frames, np.arange(len(frames)), len(frames))
     narrow = planning_scan._errors(sensor, sample, device)
     found = scatter(frames, dataclasses.replace(plan_of(TRIALS[0]), sensor=sensor), device)
     assert found > 2.0 * narrow.random
@@ -334,7 +369,7 @@ def test_rounding_beyond_the_tolerance_takes_double_precision(device: Device, rn
         pytest.skip("the device has no double precision")
     frames, sensor = recording(rng, 3), noisy_camera()
     plan = plan_scan(frames, sensor, tolerance=1.0, device=device)
-    sample = planning_scan._Sample(frames, np.arange(3), 3)
+    sample = planning_scan.Sample(frames, np.arange(3), 3)
     assert plan.rounding is not None
     assert plan.rounding > 0.0
     tight = math.hypot(plan.chosen.error, 0.5 * plan.rounding)
@@ -395,6 +430,7 @@ def test_a_rate_that_only_a_coarser_readout_keeps_up_with(
         plan_scan(frames, sensor, tolerance=1.12 * ml.error, rate=10.0, device=device)
 
 
+@pytest.mark.parametrize("limits", [ScanPlanLimits(), ScanPlanLimits(rate_margin=2.5)])
 @pytest.mark.parametrize(
     ("fits", "message"),
     [
@@ -404,7 +440,7 @@ def test_a_rate_that_only_a_coarser_readout_keeps_up_with(
     ],
 )
 def test_a_plan_that_is_too_slow_names_the_most_accurate_faster_readout(
-    fits: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
+    fits: tuple[str, ...], message: str, limits: ScanPlanLimits, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Readouts that are slower or as slow are not tried: fir of 1 s and windowed of 2 s are faster than 3 s."""
     tried: list[str] = []
@@ -413,7 +449,8 @@ def test_a_plan_that_is_too_slow_names_the_most_accurate_faster_readout(
 
     def planned(source: Any, operation: LineReadout, **options: Any) -> str:
         assert (source.length, options.pop("sample") is frames) == (7, True)
-        assert options == {"rate": 20.0, "latency": 0.1, "margin": ScanPlanLimits().rate_margin, "device": device}
+        margins = {"margin": limits.rate_margin, "headroom": max(2.0, limits.rate_margin)}
+        assert options == {"rate": 20.0, "latency": 0.1, "device": device, **margins}
         tried.append(operation.method)
         if operation.method in fits:
             return "a plan"
@@ -421,9 +458,9 @@ def test_a_plan_that_is_too_slow_names_the_most_accurate_faster_readout(
 
     monkeypatch.setattr(planning_scan, "plan_stream", planned)
     monkeypatch.setattr(planning_scan, "range_readout", lambda sensor: sensor.readout)
-    sample = planning_scan._Sample(frames, np.arange(3), 7)
+    sample = planning_scan.Sample(frames, np.arange(3), 7)
     trials = (*TRIALS, trial("centroid", 3.0, 1.0), trial("centroid", 0.5, 2.0, lost=0.5))
-    request: Any = (trials, Sensor.load("camera_line"), sample, device, 20.0, 0.1, ScanPlanLimits())
+    request: Any = (trials, Sensor.load("camera_line"), sample, device, 20.0, 0.1, limits)
     with pytest.raises(PlanError, match=re.escape(message)) as refused:
         planning_scan._plan_stream(TRIALS[2], *request)
     assert str(refused.value).startswith("gauss3 ")
@@ -449,8 +486,19 @@ def test_a_dark_recording_is_refused(device: Device) -> None:
         (noisy_camera(), {"tolerance": math.nan}, "tolerance must be finite, got nan"),
         (noisy_camera(), {"tolerance": 1.0, "rate": 0.0}, "rate is 0.0, expected"),
         (noisy_camera(), {"tolerance": 1.0, "latency": 0.1}, "a latency needs a rate"),
-        (Sensor.load("psd_line"), {"tolerance": 1.0}, "is a psd sensor; only the readout of a camera is planned"),
-        (Sensor.load("camera_line"), {"tolerance": 1.0}, "gives no noise to predict errors from"),
+        (Sensor.load("camera_line"), {"tolerance": 1.0}, r"gives no noise .* give \[line\] read_noise and gain"),
+        (
+            dataclasses.replace(Sensor.load("psd_line"), noise_known=False),
+            {"tolerance": 1.0},
+            r"gives no noise .* give \[psd\.noise\]",
+        ),
+        (
+            dataclasses.replace(
+                noisy_camera(), readout=FocusStack(geometry=StageFocus(start=0.0, step=1e-5, pixel_size=1e-6))
+            ),
+            {"tolerance": 1.0},
+            "is a focus sensor; only readouts of cameras and PSDs are planned",
+        ),
     ],
 )
 def test_wrong_arguments_are_refused(sensor: Sensor, options: dict[str, float], message: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from types import SimpleNamespace
 from typing import Any
@@ -10,9 +11,12 @@ import numpy as np
 import pytest
 
 from gpuvision.accuracy.plan import PlanError
-from gpuvision.profiling import location_plans, placement_plans, scan_plans, simulation_plans
+from gpuvision.host import Device
+from gpuvision.profiling import location_plans, placement_plans, scan_jobs, scan_plans, simulation_plans
 from gpuvision.profiling.location_plans import Measured
 from gpuvision.profiling.plan_outcomes import Outcome, cost_of, room_of, summary
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.workflows import planning_scan
 
 
 def plan_of(seconds: float) -> Any:
@@ -58,42 +62,109 @@ SETTINGS = {"fast": (1.0, 4.0, 3.0), "middle": (2.0, 2.0, 1.9), "slow": (4.0, 1.
 
 
 @pytest.mark.parametrize(
-    ("tolerance", "chosen", "error", "cost", "room"),
-    [(4.5, "fast", 3.0, 1.0, 2.0), (2.2, "middle", 1.9, 1.0, 2.2 / 1.9), (1.95, "slow", 1.2, 2.0, 1.95 / 1.9)],
+    ("tolerance", "rate", "chosen", "cost", "room"),
+    [
+        (4.5, 0.25, "fast", 1.0, math.nan),
+        (2.2, 0.25, "middle", 1.0, math.nan),
+        (1.95, 0.25, "slow", 2.0, math.nan),
+        (1.95, 0.3, None, math.nan, 1.95 / 1.9),
+        (1.05, 0.25, None, math.nan, 0.0),
+    ],
 )
 def test_outcome_of_a_scan(
-    monkeypatch: pytest.MonkeyPatch, tolerance: float, chosen: str, error: float, cost: float, room: float
+    monkeypatch: pytest.MonkeyPatch, tolerance: float, rate: float, chosen: str | None, cost: float, room: float
 ) -> None:
-    """The least true error is 1.2; the tolerance of the job is a multiple of it."""
-    trials = [SimpleNamespace(readout=name, seconds=each[0], error=each[1]) for name, each in SETTINGS.items()]
+    """The least true error is 1.2, and the rate of the fastest 1 / s; those of the job are multiples of them.
+
+    The lossy readout would be the fastest and most accurate. Streams reach the rate of the kernel.
+    """
+    settings = {"lossy": (0.5, 0.1, 0.1)} | SETTINGS
+    trials: Any = tuple(
+        SimpleNamespace(readout=name, seconds=each[0], error=each[1]) for name, each in settings.items()
+    )
     asked: list[Any] = []
 
-    def plan_scan(frames: Any, sensor: Any, **options: Any) -> Any:
-        asked.append(options)
-        fits = [each for each in trials if 1.1 * each.error <= options["tolerance"]]
-        return SimpleNamespace(trials=trials, chosen=fits[0] if fits else trials[-1])
+    def choose(tried: Any, *, tolerance: float, rate: float, limits: Any) -> Any:
+        asked.append((tried.sample.length, tolerance, rate))
+        fits = [each for each in tried.trials[1:] if 1.1 * each.error <= tolerance]
+        if not fits or fits[0].seconds * rate > 1.0:
+            raise PlanError("none", (), ())
+        return SimpleNamespace(trials=tried.trials, chosen=fits[0])
 
-    job: Any = SimpleNamespace(frames=None, sensor=None, tolerance=tolerance / 1.2, rate=0.25)
+    def error(job: Any, trial: Any, heights: Any, device: Any) -> tuple[float, float]:
+        return settings[trial.readout][2], 0.02 * (trial.readout == "lossy")
+
+    job: Any = SimpleNamespace(frames=None, sensor=None, tolerance=tolerance / 1.2, rate=rate)
+    nothing: Any = None
+    sample = planning_scan.Sample(np.empty(0), np.empty(0, np.int64), 48)
+    tried = planning_scan.TriedReadouts(nothing, sample, trials, nothing)
     monkeypatch.setattr(scan_plans, "random_job", lambda rng: job)
-    monkeypatch.setattr(scan_plans, "plan_scan", plan_scan)
-    monkeypatch.setattr(scan_plans, "usable_trials", lambda trials, limits: trials)
-    monkeypatch.setattr(scan_plans, "true_error", lambda job, readout, device: SETTINGS[readout][2])
-    monkeypatch.setattr(scan_plans, "_lost", lambda job, plan, rate: 3)
-    device: Any = None
-    found = scan_plans.judge(np.random.default_rng(1), device)
+    monkeypatch.setattr(scan_plans, "try_readouts", lambda *_, **__: tried)
+    monkeypatch.setattr(scan_plans, "choose_readout", choose)
+    monkeypatch.setattr(scan_plans, "true_heights", lambda job, device: None)
+    monkeypatch.setattr(scan_plans, "true_error", error)
+    monkeypatch.setattr(scan_plans, "throughput", lambda job, trial, device: 1.0 / trial.seconds)
+    monkeypatch.setattr(scan_plans, "keeps_up", lambda job, plan, rate: False)
+    found = scan_plans.judge(np.random.default_rng(1), nothing)
+    assert found.tolerance == pytest.approx(tolerance)
+    assert found.room == pytest.approx(room, nan_ok=True)
+    assert found.possible == (tolerance > 1.2)
+    ((length, *values),) = asked
+    assert length > 1e9  # frames: the ring does not hold the recording
+    assert values == pytest.approx([tolerance, rate])
+    if chosen is None:
+        assert found.plan is None
+        return
     assert found.plan is not None
     assert found.plan.chosen.readout == chosen
-    assert (found.error, found.cost, found.keeps_up) == (error, cost, False)
-    assert (found.tolerance, found.room) == pytest.approx((tolerance, room))
-    assert (asked[1]["tolerance"], asked[1]["rate"]) == pytest.approx((tolerance, 0.25))
+    assert (found.error, found.cost, found.keeps_up) == (SETTINGS[chosen][2], cost, False)
 
-    def refuse(frames: Any, sensor: Any, **options: Any) -> Any:
-        if options["tolerance"] == 1.0:  # the first plan
-            return SimpleNamespace(trials=trials)
-        raise PlanError("none", (), ())
 
-    monkeypatch.setattr(scan_plans, "plan_scan", refuse)
-    assert scan_plans.judge(np.random.default_rng(1), device)[:1] == (None,)
+class FakeStream:
+    """Pipeline whose source is late and whose stream takes some time."""
+
+    late, seconds = 0, 0.0
+
+    def __init__(self, source: Any, operation: Any, **options: Any) -> None:
+        assert (source.rate, source.length, options) == (100.0, 200, {"batch": 1, "ring": 52, "policy": "block"})
+        source.late = self.late
+
+    def __class_getitem__(cls, item: Any) -> type[FakeStream]:
+        return cls
+
+    def run(self) -> Any:
+        return SimpleNamespace(seconds=self.seconds)
+
+
+@pytest.mark.parametrize(
+    ("late", "seconds", "kept"),
+    [(500_000_000, 2.09, True), (500_000_001, 2.0, False), (0, 2.11, False)],
+)
+def test_a_stream_that_would_lose_frames_or_ends_late_does_not_keep_up(
+    monkeypatch: pytest.MonkeyPatch, late: int, seconds: float, kept: bool
+) -> None:
+    """Two seconds of 100 frames/s; the planned ring holds the frames of 0.5 s."""
+    monkeypatch.setattr(FakeStream, "late", late)
+    monkeypatch.setattr(FakeStream, "seconds", seconds)
+    monkeypatch.setattr(scan_plans, "Pipeline", FakeStream)
+    job: Any = SimpleNamespace(frames=np.zeros((4, 8, 64), np.uint8))
+    stream = SimpleNamespace(settings={"batch": 1, "ring": 52}, ring=52, stall=0.5)
+    plan: Any = SimpleNamespace(sensor=Sensor.load("camera_line"), stream=stream)
+    assert scan_plans.keeps_up(job, plan, 100.0) == kept
+
+
+@pytest.mark.parametrize("kind", ["camera", "psd"])
+def test_a_recording_shows_its_true_heights(kind: str, monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
+    """The readout of the sensor finds the heights; a wrong sign or origin would be millimetres off."""
+    monkeypatch.setattr(scan_jobs, "_PSD_SHARE", float(kind == "psd"))
+    job = scan_jobs.random_job(np.random.default_rng(1))
+    assert job.sensor.kind == kind
+    assert 0.7 <= job.tolerance <= 6.0
+    assert 0.03 <= job.rate <= 0.95
+    trial: Any = SimpleNamespace(readout=dataclasses.replace(job.sensor.readout))
+    error, lost = scan_plans.true_error(job, trial, scan_plans.true_heights(job, device), device)
+    assert 0.0 < error < 300e-6
+    assert lost < 0.02
 
 
 @pytest.mark.parametrize(

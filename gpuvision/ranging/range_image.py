@@ -130,5 +130,7 @@ class RangeImage(VisionOperation[RangePoints]):
             outputs=build.outputs({"x": shape, "y": shape, "z": shape, "status": shape}),
             defines={**self.geometry.defines(build.real), **type_defines("INPUT", dtype, 16)},
             arguments=[self.packed(build.real), np.uint32(samples)],
-            streams=True,
+            # Only rows that are aligned to a vector bypass the caches. Where half of the rows do, a launch takes 1.4
+            # times as long as where none does (measured: 4000 x 1000 samples).
+            streams=samples % _LANES == 0,
         )

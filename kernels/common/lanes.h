@@ -137,15 +137,26 @@ static inline int lowest_lane(ints v) {
 
 #ifdef PAST_CACHES
 // Stores that bypass the caches: a cache line that is written as a whole need not be read first. Only vectors at an
-// aligned address can bypass them.
+// aligned address can bypass them. The other addresses take two stores of halves: Intel's compiler would merge two
+// stores of one vector to one common store behind the branches, which does not bypass the caches.
+typedef real8 half_reals_at __attribute__((aligned(sizeof(real))));
+typedef uchar8 half_bytes_at __attribute__((aligned(1)));
 static inline int aligned_to(size_t size, global const void *to) { return ((size_t)to & (size - 1)) == 0; }
 static inline void store_reals(reals value, global real *to) {
-    if (aligned_to(sizeof(reals), to)) __builtin_nontemporal_store(value, (global reals *)to);
-    else *(global reals_at *)to = value;
+    if (aligned_to(sizeof(reals), to)) {
+        __builtin_nontemporal_store(value, (global reals *)to);
+    } else {
+        *(global half_reals_at *)to = value.lo;
+        *(global half_reals_at *)(to + LANES / 2) = value.hi;
+    }
 }
 static inline void store_bytes(bytes value, global uchar *to) {
-    if (aligned_to(sizeof(bytes), to)) __builtin_nontemporal_store(value, (global bytes *)to);
-    else *(global bytes_at *)to = value;
+    if (aligned_to(sizeof(bytes), to)) {
+        __builtin_nontemporal_store(value, (global bytes *)to);
+    } else {
+        *(global half_bytes_at *)to = value.lo;
+        *(global half_bytes_at *)(to + LANES / 2) = value.hi;
+    }
 }
 #else
 static inline void store_reals(reals value, global real *to) { *(global reals_at *)to = value; }

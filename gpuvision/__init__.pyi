@@ -273,6 +273,12 @@ from .matching.pose.registration import (
 from .plots.simulation import (
     PictureScale as PictureScale,
 )
+from .ranging.height_map import (
+    Grid as Grid,
+)
+from .ranging.height_map import (
+    HeightMap as HeightMap,
+)
 from .ranging.line import (
     LineReadout as LineReadout,
 )
@@ -305,12 +311,6 @@ from .ranging.range_image import (
 )
 from .ranging.range_image import (
     RangePoints as RangePoints,
-)
-from .ranging.regrid import (
-    Grid as Grid,
-)
-from .ranging.regrid import (
-    HeightMap as HeightMap,
 )
 from .ranging.regrid import (
     Regrid as Regrid,

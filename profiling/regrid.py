@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.profiling.harness import Case
-from gpuvision.ranging.regrid import Grid, Regrid
+from gpuvision.ranging.height_map import Grid
+from gpuvision.ranging.regrid import Regrid
 
 Array = NDArray[Any]
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gpuvision.inspection.apertures import Aperture, BoardPlacement, make_aperture
 from gpuvision.matching.artwork.shapes import Shape, disk
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 Array = npt.NDArray[np.float64]
 

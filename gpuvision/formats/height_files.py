@@ -19,7 +19,7 @@ from gpuvision.formats.range_image import HeightFile, read_npz, read_png16, read
 from gpuvision.host.errors import ReadError
 from gpuvision.host.image_files import read_image
 from gpuvision.host.reading import check_pixels, reading
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 from gpuvision.validation import finite
 
 _MILLIMETRE = 1e-3

@@ -34,7 +34,7 @@ from gpuvision.host.image_files import read_image
 from gpuvision.host.reading import check_archive, reading
 from gpuvision.host.text import printable
 from gpuvision.host.tiff_files import check_tiff_page
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 _GRID_KEYS = ("left", "top", "cell_x", "cell_y")
 _NO_DATA_TAG = 42113  # GDAL_NODATA: value that image and geographic tools read as missing

@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from gpuvision.formats.range_image import Values, height_array
 from gpuvision.host.files import atomic_write
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 SurfaceFormat = Literal["x3p", "sur", "sdf", "sdf-ascii"]
 

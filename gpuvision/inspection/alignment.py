@@ -17,7 +17,7 @@ from gpuvision.inspection.apertures import Aperture, BoardPlacement
 from gpuvision.inspection.coverage import covered
 from gpuvision.inspection.paste import Deposits, PasteSettings, measure_deposits
 from gpuvision.matching.artwork.shapes import Float64
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 from gpuvision.validation import finite
 
 _CELLS_ACROSS = 4.0  # coarse cells across the median aperture. Chosen

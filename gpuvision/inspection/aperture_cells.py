@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from gpuvision.inspection.apertures import Aperture
 from gpuvision.inspection.coverage import covered
 from gpuvision.matching.artwork.shapes import Float64
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 Bools = npt.NDArray[np.bool_]
 

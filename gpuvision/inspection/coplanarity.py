@@ -22,7 +22,7 @@ from gpuvision.inspection.phase_sigmas import common_sigma, complete_phase
 from gpuvision.inspection.top_height import top_height
 from gpuvision.matching.artwork.shapes import Float64
 from gpuvision.normal_distribution import MAD_TO_SIGMA
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 from gpuvision.validation import finite
 
 _TOP_PATCH = 0.15  # half width of the patch of a top, in square roots of the area of the region. Chosen

@@ -18,7 +18,7 @@ from gpuvision.inspection.aperture_cells import Window
 from gpuvision.inspection.reference_surface import ReferenceSurface
 from gpuvision.matching.artwork.shapes import Float64
 from gpuvision.operation import VisionOperation
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 from gpuvision.validation import finite, integer
 
 TERMS = 6

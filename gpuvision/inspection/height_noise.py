@@ -11,7 +11,7 @@ import numpy as np
 from gpuvision.inspection.aperture_cells import Bools, Window
 from gpuvision.inspection.reference_surface import ReferenceSurface
 from gpuvision.matching.artwork.shapes import Float64
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 _LAGS = 4  # cells up to which the noise is taken for correlated; regridding correlates neighbours. Chosen
 _SIGNIFICANT = 3.0  # standard deviations of a correlation that counts

@@ -23,7 +23,7 @@ from gpuvision.inspection.phase_sigmas import complete_phase, phase_sigmas
 from gpuvision.inspection.reference_surface import MAX_ORDER, ReferenceSurface, fit_reference
 from gpuvision.inspection.top_height import top_height
 from gpuvision.matching.artwork.shapes import Float64
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 from gpuvision.status import Status
 from gpuvision.validation import finite, integer
 

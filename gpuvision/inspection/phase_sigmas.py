@@ -15,7 +15,7 @@ from gpuvision.inspection.aperture_cells import Bools, Window
 from gpuvision.inspection.apertures import BoardPlacement
 from gpuvision.inspection.height_noise import complete_sigmas
 from gpuvision.matching.artwork.shapes import Float64
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 # A height above the board is a difference: the phase of the deposit and the phase of the board are independent.
 _DIFFERENCE = math.sqrt(2.0)

@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize
 from gpuvision.inspection.apertures import Aperture
 from gpuvision.plots.figure import new_figure, write_png
 from gpuvision.plots.range_image import height_span, length_unit
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 _MM = 1e3
 _MOST_PIXELS = 2000  # along a side of the drawn height map; larger maps are thinned out

@@ -23,7 +23,7 @@ from matplotlib.patches import Rectangle
 
 from gpuvision.host import to_numpy
 from gpuvision.plots.figure import DPI, new_figure, write_png
-from gpuvision.ranging.regrid import Grid, HeightMap
+from gpuvision.ranging.height_map import Grid, HeightMap
 from gpuvision.status import Status
 
 Style = Literal["colour", "shaded"]

@@ -28,7 +28,7 @@ from gpuvision.host import (
     type_defines,
 )
 from gpuvision.operation import VisionOperation
-from gpuvision.ranging.regrid import MAX_MAP_CELLS, Grid, HeightMap
+from gpuvision.ranging.height_map import MAX_MAP_CELLS, Grid, HeightMap
 from gpuvision.status import Status
 from gpuvision.validation import finite
 

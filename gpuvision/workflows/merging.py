@@ -21,6 +21,7 @@ from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
 from gpuvision.normal_distribution import MAD_TO_SIGMA
 from gpuvision.plots.range_image import draw_height_map
+from gpuvision.ranging.height_map import Grid, HeightMap
 from gpuvision.ranging.merge_heights import (
     DISAGREES,
     FIRST,
@@ -31,7 +32,6 @@ from gpuvision.ranging.merge_heights import (
     common_differences,
     merge_height_maps,
 )
-from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.status import Status
 
 MERGE_FILES = ("range_image.tiff", "range_image.png", "range_image.npz", "picture.png", "sources.png", "report.json")

@@ -21,9 +21,9 @@ from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
 from gpuvision.host.report import StreamReport
 from gpuvision.plots.range_image import draw_height_map, draw_scan, height_span
+from gpuvision.ranging.height_map import MAX_MAP_CELLS, Grid, HeightMap
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.range_image import RangePoints
-from gpuvision.ranging.regrid import MAX_MAP_CELLS, Grid, HeightMap
 from gpuvision.ranging.sheet_motion import RotatingSheet
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import SAMPLE_FLAGS, Status
@@ -85,7 +85,7 @@ class ScanLimits:
         Delay of a frame [s] from which on the summary says that the replay did not hold the requested rate. Chosen.
         Default 0.01.
     max_cells : int
-        Largest number of cells of a height map, default `gpuvision.ranging.regrid.MAX_MAP_CELLS`, 2^26.
+        Largest number of cells of a height map, default `gpuvision.ranging.height_map.MAX_MAP_CELLS`, 2^26.
     """
 
     max_delay: float = 0.01

@@ -21,10 +21,11 @@ from gpuvision.host.pipeline import Pipeline, Policy
 from gpuvision.host.planning import Plan, plan_stream
 from gpuvision.host.sources import PacedSource, Source
 from gpuvision.ranging.focus_stack import FocusStack
+from gpuvision.ranging.height_map import Grid, HeightMap
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.ranging.range_image import RangeImage, RangePoints
-from gpuvision.ranging.regrid import Direction, Grid, HeightMap, Regrid
+from gpuvision.ranging.regrid import Direction, Regrid
 from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import SAMPLE_FLAGS, Status

@@ -18,8 +18,8 @@ from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
 from gpuvision.plots.range_image import draw_height_map
 from gpuvision.plots.simulation import PictureScale, draw_causes, draw_errors
+from gpuvision.ranging.height_map import Grid, HeightMap
 from gpuvision.ranging.range_image import RangePoints
-from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution
 from gpuvision.simulation.sensors.masks import MaskOptimisation
 from gpuvision.simulation.sensors.readings import PATHS, Reading

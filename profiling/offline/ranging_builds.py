@@ -14,12 +14,13 @@ from gpuvision.camera.undistort_image import UndistortImage
 from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.inspection.deposits import MeasureDeposits
 from gpuvision.profiling.offline.builds import Example
+from gpuvision.ranging.height_map import Grid
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.line_parameters import LineReading
 from gpuvision.ranging.merge_heights import MergeHeights
 from gpuvision.ranging.psd import PsdNoise, PsdReading, PsdReadout
 from gpuvision.ranging.range_image import RangeImage
-from gpuvision.ranging.regrid import Grid, Regrid
+from gpuvision.ranging.regrid import Regrid
 from gpuvision.ranging.sheet import BentSheet
 from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport
 from gpuvision.ranging.triangulation import Triangulation

@@ -9,7 +9,7 @@ import tifffile
 
 from gpuvision.formats.height_files import HeightMapFile, ImageScale, read_gocator, read_heights
 from gpuvision.formats.range_image import read_tiff, write_npz, write_png16, write_tiff
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 GRID = Grid(left=-2e-3, top=5e-3, cell_x=20e-6, cell_y=30e-6, columns=4, rows=3)
 HEAD = """Info

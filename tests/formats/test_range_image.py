@@ -14,7 +14,7 @@ import trimesh
 from hypothesis.extra import numpy as hnp
 
 from gpuvision.formats import range_image as export
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 GRID = Grid(left=-0.25, top=1.5, cell_x=0.001, cell_y=0.002, columns=7, rows=5)
 

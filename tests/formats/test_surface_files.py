@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gpuvision.formats.surface_files import SURFACE_WRITERS, write_sdf, write_sur, write_x3p
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 GRID = Grid(left=-2e-3, top=5e-3, cell_x=20e-6, cell_y=30e-6, columns=7, rows=5)
 METRES = {"m": 1.0, "mm": 1e-3, "µm": 1e-6}

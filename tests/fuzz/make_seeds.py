@@ -21,7 +21,7 @@ from gpuvision.formats.range_image import write_npz, write_ply, write_png16, wri
 from gpuvision.host.outputs import MANIFEST
 from gpuvision.host.tuned_settings import TunedEntry, TunedSettings
 from gpuvision.profiling.harness import Probe, Row, Run
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 _HEAD = "%FSLAX46Y46*%\n%MOMM*%\n%TF.FileFunction,Copper,L1,Top*%\n%LPD*%\nG01*\n"
 _COPPER = """%TA.AperFunction,ComponentPad*%

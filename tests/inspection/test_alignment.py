@@ -20,7 +20,7 @@ from gpuvision.inspection.alignment import (
 )
 from gpuvision.inspection.apertures import BoardPlacement
 from gpuvision.inspection.paste import PasteSettings
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 from paste_maps import Cap, board_grid, circle, paste_map, rectangle
 
 SETTINGS = PasteSettings(stencil=120e-6)

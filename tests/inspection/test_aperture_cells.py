@@ -10,7 +10,7 @@ import pytest
 from gpuvision.inspection.aperture_cells import aperture_windows, cells_of, owner_map
 from gpuvision.inspection.apertures import Aperture
 from gpuvision.matching.artwork.shapes import Shape
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 GRID = Grid(left=-1e-3, top=2e-3, cell_x=20e-6, cell_y=30e-6, columns=90, rows=70)
 MARGIN = 130e-6

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from gpuvision.inspection.aperture_cells import Window
 from gpuvision.inspection.height_noise import Ring, correlation_area
 from gpuvision.inspection.reference_surface import ReferenceSurface
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 
 GRID = Grid(left=1e-3, top=5e-3, cell_x=2e-5, cell_y=3e-5, columns=42, rows=36)
 NONE: Any = np.zeros((0, 0), bool)

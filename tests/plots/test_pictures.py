@@ -25,7 +25,7 @@ from gpuvision.plots.inspection import draw_regions
 from gpuvision.plots.line_frames import LineFrame, draw_line_frames
 from gpuvision.plots.plan import PlannedSetting, draw_plan
 from gpuvision.plots.sensor_calibration import SensorPicture, draw_sensor_calibration
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 from gpuvision.status import Status
 
 

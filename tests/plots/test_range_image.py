@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 
 from gpuvision import Status
 from gpuvision.plots import range_image as picture
-from gpuvision.ranging.regrid import Grid, HeightMap
+from gpuvision.ranging.height_map import Grid, HeightMap
 
 GRID = Grid(left=0.0, top=0.4, cell_x=0.002, cell_y=0.002, columns=250, rows=200)
 

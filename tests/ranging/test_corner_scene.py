@@ -11,10 +11,11 @@ import scipy.optimize
 
 from conftest import DATA
 from gpuvision import Status
+from gpuvision.ranging.height_map import Grid
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.line_parameters import LineReading
 from gpuvision.ranging.range_image import RangeImage, RangePoints
-from gpuvision.ranging.regrid import Grid, Regrid
+from gpuvision.ranging.regrid import Regrid
 from gpuvision.ranging.sheet_motion import RotatingSheet
 
 pytestmark = [pytest.mark.realdata, pytest.mark.slow]

@@ -11,6 +11,7 @@ import pytest
 
 from canary import Guarded
 from gpuvision.host import Device, to_numpy
+from gpuvision.ranging.height_map import Grid, HeightMap
 from gpuvision.ranging.merge_heights import (
     DISAGREEMENTS,
     DISAGREES,
@@ -21,7 +22,6 @@ from gpuvision.ranging.merge_heights import (
     common_differences,
     merge_height_maps,
 )
-from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.reference.merge_heights import merge_heights as reference
 from gpuvision.status import Status
 

@@ -12,11 +12,11 @@ import pytest
 
 import gpuvision as gv
 from gpuvision.ranging.focus import DepthFromFocus
+from gpuvision.ranging.height_map import Grid
 from gpuvision.ranging.line_launch import LONGEST_PROFILE
 from gpuvision.ranging.line_parameters import WIDEST_WINDOW
 from gpuvision.ranging.polygon import PolygonMirror, shear_profile
 from gpuvision.ranging.psd import clipping_bias
-from gpuvision.ranging.regrid import Grid
 from gpuvision.ranging.sheet_motion import RotatingSheet
 
 PSD = gv.PsdReadout(strip_length=6e-3)

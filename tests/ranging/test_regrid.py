@@ -13,7 +13,8 @@ from hypothesis.extra import numpy as hnp
 
 from gpuvision import Device, Status
 from gpuvision.profiling.offline.builds import GpuModel
-from gpuvision.ranging.regrid import Grid, HeightMap, Regrid, RegridCounts
+from gpuvision.ranging.height_map import Grid, HeightMap
+from gpuvision.ranging.regrid import Regrid, RegridCounts
 from gpuvision.reference import regrid as reference
 
 DTYPES = (np.float32, np.float64)

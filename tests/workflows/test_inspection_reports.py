@@ -15,7 +15,7 @@ from gpuvision.inspection.alignment import Alignment
 from gpuvision.inspection.apertures import BoardPlacement
 from gpuvision.inspection.coplanarity import Coplanarity
 from gpuvision.inspection.paste import Deposits, PasteSettings
-from gpuvision.ranging.regrid import Grid
+from gpuvision.ranging.height_map import Grid
 from gpuvision.workflows.inspecting_leads import LeadInspection
 from gpuvision.workflows.inspecting_paste import PasteInspection, ScaleSigma, VolumeLimits
 

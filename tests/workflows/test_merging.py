@@ -18,8 +18,8 @@ import pytest
 from gpuvision.cli import main as cli
 from gpuvision.formats.range_image import read_npz, read_tiff, write_npz, write_tiff
 from gpuvision.host.errors import ReadError
+from gpuvision.ranging.height_map import Grid
 from gpuvision.ranging.merge_heights import DISAGREES, FIRST, SECOND, UNCONFIRMED
-from gpuvision.ranging.regrid import Grid
 from gpuvision.status import Status
 from gpuvision.workflows import merging
 from gpuvision.workflows.merging import MERGE_FILES, SIGMA_FILE, HeightMapMerge, merge_scans, read_height_map

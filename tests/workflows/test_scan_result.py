@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gpuvision.ranging.height_map import Grid, HeightMap
 from gpuvision.ranging.range_image import RangePoints
-from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.status import Status
 from gpuvision.workflows.scan_errors import PointSigma, ScanErrors
 from gpuvision.workflows.scan_result import Scan

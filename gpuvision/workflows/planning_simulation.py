@@ -21,7 +21,7 @@ from gpuvision.simulation.sensors.readings import PATHS
 from gpuvision.validation import finite
 from gpuvision.workflows.light_cache import SimulationTask
 from gpuvision.workflows.simulating import prepare_simulation
-from gpuvision.workflows.simulation_errors import SLOW_ORDER, ErrorPart, PartEstimate, scene_paths, total_error
+from gpuvision.workflows.simulation_errors import ErrorPart, PartEstimate, scene_paths, total_error
 from gpuvision.workflows.simulation_options import LightOptions, Option, light_of_options
 from gpuvision.workflows.simulation_plan import (
     SettingsTrial,
@@ -30,7 +30,7 @@ from gpuvision.workflows.simulation_plan import (
     largest_part,
     usable_settings,
 )
-from gpuvision.workflows.simulation_sample import Difference, ProfileSample, SimulationSettings
+from gpuvision.workflows.simulation_sample import Difference, ProfileSample
 
 Progress = Callable[[int, int | None], object]
 
@@ -58,7 +58,7 @@ def plan_simulation(
     """Choose the fastest light paths and discretisations of a simulation whose predicted error meets a tolerance.
 
     Light paths are left out, and slabs of the sheet, rays per bin, patches and the tolerance of clustered pairs are
-    tried, from 1 slab to twice the slabs and rays per bin of the sensor file.
+    tried, from 1 slab to twice the slabs of the sensor file, and from its rays per bin to eight times as many along v.
 
     Parameters
     ----------
@@ -97,12 +97,12 @@ def plan_simulation(
 
     Notes
     -----
-    The noiseless readings of each setting are compared with those of the finest one: the range error is the distance of
-    the readings on the sensor times the derivative dH/du of the height. The error of the finest setting is part of the
-    error of every setting. It is estimated from the change by its last refinement; that of the rays per bin of diffuse
-    light, which is often the largest, from a further one, as in
-    `gpuvision.workflows.simulation_errors.estimate_errors`. Estimates add up as squares, except the change by fewer
-    rays and the error of the finest rays, which have the same sign. Proven bounds add up linearly: that of clustered
+    The noiseless readings of each setting are compared with those of a reference: the range error is the distance of
+    the readings on the sensor times the derivative dH/du of the height. The reference has the finest options, but the
+    diffuse light of twice the rays along u and along v. The error of the reference is part of the error of every
+    setting. It is estimated from the change by the last refinement; that of the rays per bin, which is often the
+    largest, as `Combinations.ray_error` says. Estimates add up as squares, except the change and the error of the
+    reference's rays, which may have the same sign. Proven bounds add up linearly: that of clustered
     pairs, and that of multi-bounce light, which is left out for a PSD if its bound in the sample is a tenth of the
     tolerance or less. The mean square error over the profiles is raised by twice its standard error. The
     chosen setting is compared with the finest one on other profiles, with all light computed as the simulation does; a
@@ -203,7 +203,7 @@ class Combinations:
         self._max_moved = max_moved
         self._options, self._axes, self._sample = options, options.axes, options.sample
         finest = [axis[-1] for axis in self._axes]
-        self._estimate = PartEstimate(self._sample, options.settings_of(finest), light_of_options(finest))
+        self._estimate = PartEstimate(self._sample, options.settings_of(finest), options.reference())
         self._checked = self._sample.reader.read(options.checks) if len(self._sample.others) else None
         self.finest = self._finest_errors()
 
@@ -230,12 +230,12 @@ class Combinations:
         """Read a combination of options."""
         reader = self._sample.reader
         difference = reader.compare(reader.read(light_of_options(options)), self._estimate.reading)
-        pairs, settings = sum(each.pairs for each in options), self._options.settings_of(options)
+        pairs = sum(each.pairs for each in options)
         bound = ErrorPart(pairs, math.nan, is_bound=True)
         return SettingsTrial(
-            settings=settings,
+            settings=self._options.settings_of(options),
             seconds=self._options.seconds_of(options),
-            error=total_error([*self._with_finest(difference, settings), bound]),
+            error=total_error([*self._with_finest(difference), bound]),
             change=difference.error,
             pairs=pairs,
             finest=total_error(self.finest.values()),
@@ -252,20 +252,18 @@ class Combinations:
         if self._checked is None:
             return math.nan, 0.0
         reader = self._sample.reader
-        found = reader.read(self._sample.light(trial.settings, self._sample.others).exposures)
+        found = reader.read(self._sample.light(trial.settings, self._sample.others, runs=1).exposures)
         difference = reader.compare(found, self._checked)
-        return total_error(self._with_finest(difference, trial.settings)), difference.changed
+        return total_error(self._with_finest(difference)), difference.changed
 
-    def _with_finest(self, difference: Difference, settings: SimulationSettings) -> list[ErrorPart]:
-        """Return the errors of settings: the difference from the finest ones, and the errors of the finest ones.
+    def _with_finest(self, difference: Difference) -> list[ErrorPart]:
+        """Return the errors of settings: the difference from the reference, and the errors of the reference.
 
-        Fewer rays per bin, or no diffuse light, have errors of the same sign as the finest rays: these add up linearly.
+        The error of the reference's rays may have the sign of the difference: these add up linearly.
         """
-        finest, error = dict(self.finest), difference.error
-        has_finest_rays = "diffuse-diffuse" in settings.paths and settings.nodes == self._estimate.settings.nodes
-        if "nodes" in finest and not has_finest_rays:
-            error += finest.pop("nodes").error
-        return [*finest.values(), ErrorPart(error, difference.signal)]
+        finest = dict(self.finest)
+        rays = finest.pop("nodes", ErrorPart(0.0, 0.0))
+        return [*finest.values(), ErrorPart(difference.error + rays.error, difference.signal)]
 
     def _errors_of(self, axis: Sequence[Option]) -> Iterator[tuple[Option, Difference]]:
         """Yield the change of the reading by each option of an axis, with the finest options of the others."""
@@ -276,21 +274,33 @@ class Combinations:
             yield each, reader.compare(reading, self._estimate.reading)
 
     def _finest_errors(self) -> dict[str, ErrorPart]:
-        """Return the errors of the finest options: of first order, the change by the last refinement at most."""
+        """Return the errors of the reference: of first order, the change by the last refinement at most."""
         found = dict(self._options.proven)
-        for name, part in (
-            ("sub_sheets", "slabs"),
-            ("nodes", "nodes of multi-bounce light"),
-            ("patch_size", "patches"),
+        for name, part, factor in (
+            ("sub_sheets", "slabs", 1.0),
+            ("nodes", "nodes of multi-bounce light", 1.0 / 3.0),  # a quarter of the rays
+            ("patch_size", "patches", 1.0),
         ):
             light = light_of_options([each for axis in self._axes for each in _last_coarser(axis, name)])
             light.pop("diffuse-diffuse", None)
             if light:
-                found[part] = self._estimate.change(light, 1.0)
-        if "diffuse-diffuse" in self._estimate.exposures:
-            u, v = self._estimate.settings.nodes
-            found["nodes"] = self._estimate.refined(("diffuse-diffuse",), factor=SLOW_ORDER, nodes=(2 * u, 2 * v))
+                found[part] = self._estimate.change(light, factor)
+        if self._options.rays:
+            found["nodes"] = self.ray_error()
         return found | self._estimate.others()
+
+    def ray_error(self) -> ErrorPart:
+        """Return the error by the reference's rays per bin.
+
+        The rays at an edge of a surface converge with order 1: the error after a doubling is the change by it, or half
+        the change by the doubling before. One of the changes may be small by chance, so the larger result counts.
+        """
+        last = self._estimate.change({"diffuse-diffuse": self._options.rays[-2]}, 1.0)
+        reader = self._sample.reader
+        before = reader.compare(
+            *(reader.read(self._estimate.exposures | {"diffuse-diffuse": each}) for each in self._options.rays[-3:-1])
+        )
+        return max(last, ErrorPart(0.5 * before.error, 0.5 * before.signal))
 
 
 def _last_coarser(axis: Sequence[Option], name: str) -> list[Option]:

@@ -154,7 +154,7 @@ def estimate_errors(task: SimulationTask, *, profiles: int = 6, device: Device |
 
 def light_by_path(sample: ProfileSample, settings: SimulationSettings) -> tuple[dict[str, Exposure], dict[str, float]]:
     """Return the exposures of all light paths of a scene at some settings, and their statistics."""
-    light = sample.light(replace(settings, paths=scene_paths(sample.task)))
+    light = sample.light(replace(settings, paths=scene_paths(sample.task)), runs=1)
     return light.exposures, light.statistics
 
 
@@ -209,7 +209,7 @@ class PartEstimate:
     ) -> ErrorPart:
         """Return the error of a discretisation, from the light of some paths with a finer one."""
         settings = replace(self.settings, paths=tuple(dict.fromkeys(("direct", *paths))), **changes)
-        light = self.sample.light(settings, **(limits or {})).exposures
+        light = self.sample.light(settings, runs=1, **(limits or {})).exposures
         return self.change({name: light[name] for name in paths if name in light and name in self.exposures}, factor)
 
     def others(self) -> dict[str, ErrorPart]:

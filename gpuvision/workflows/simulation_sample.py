@@ -26,7 +26,7 @@ Float64 = npt.NDArray[np.float64]
 _STANDARD_ERRORS = 2.0
 # Runs of a light whose shortest time counts, and the time [s] after which it is not repeated. Chosen: pauses of a busy
 # machine hit one run or a few.
-_RUNS, _LEAST_TIME = 5, 0.4
+RUNS, _LEAST_TIME = 5, 0.4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +115,9 @@ class SampledLight(NamedTuple):
     setup: float
 
 
-def sample_light(task: SimulationTask, places: Float64, device: Device, **changes: Any) -> SampledLight:
+def sample_light(
+    task: SimulationTask, places: Float64, device: Device, *, runs: int = RUNS, **changes: Any
+) -> SampledLight:
     """Compute the light of a task at some transports.
 
     Parameters
@@ -126,6 +128,8 @@ def sample_light(task: SimulationTask, places: Float64, device: Device, **change
         (profiles,): transports [m].
     device : Device
         Device of the kernels.
+    runs : int
+        Largest number of runs, 1 or more; the shortest time counts. Default 5.
     **changes
         Other parameters of `LightPaths`.
     """
@@ -134,7 +138,7 @@ def sample_light(task: SimulationTask, places: Float64, device: Device, **change
     paths.profile(float(places[0]))
     first = time.perf_counter() - start  # with the preparation
     taken: list[float] = []
-    while not taken or (len(taken) < _RUNS and sum(taken) < _LEAST_TIME):
+    while not taken or (len(taken) < runs and sum(taken) < _LEAST_TIME):
         start = time.perf_counter()
         profiles = paths.profiles(places)
         taken.append(time.perf_counter() - start)
@@ -321,7 +325,7 @@ class ProfileSample:
     def light(self, settings: SimulationSettings, places: Float64 | None = None, **changes: Any) -> SampledLight:
         """Compute the light of settings, on other places than those of the sample if given.
 
-        ``changes`` are other parameters of `LightPaths`.
+        ``changes`` are other parameters of `LightPaths`, or ``runs`` of `sample_light`.
         """
         return sample_light(
             settings.applied(self.task), self.places if places is None else places, self.device, **changes

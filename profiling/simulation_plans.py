@@ -1,9 +1,9 @@
 """Plans of simulations against truth: random parts and sensors: ``python -m gpuvision.profiling.simulation_plans``.
 
 Each job is a part of boxes and a cylinder under a PSD or a camera, with a tolerance and a rate. Truth is an
-independent, finer computation of profiles at random positions: eight times the rays of the finest setting of the plan
-along v, along which they converge slowly, and four times along u (multi-bounce light: twice as many), twice its slabs,
-half its bins, patches, steps in mirrors and parts of lobes. A plan holds if the root mean square difference of
+independent, finer computation of profiles at random positions: 16 times the rays of the finest setting of the plan,
+spread over the samples (multi-bounce light: four times as many), twice its slabs, half its bins, patches, steps in
+mirrors and parts of lobes. A plan holds if the root mean square difference of
 the simulated heights is at most the tolerance, and if the time of a profile keeps up with the rate. Its cost is its
 time over the time of the fastest combination of options that truly meets the tolerance (exhaustive search).
 """
@@ -189,15 +189,15 @@ class Truth:
             settings,
             paths=tuple(each for each in task.paths if each != "multi-bounce"),
             sub_sheets=2 * (2 * settings.sub_sheets + 1),
-            nodes=(2 * u, 64 * v),  # in bins of half the size
+            nodes=(4 * u, 16 * v),  # in bins of half the size: eight rays along u
         )
         limits = {"direct_limits": DirectLimits(lobe_turn=0.5 * DirectLimits.lobe_turn), "mirror_steps": 4.0}
-        light = divided_light(finer.applied(task), self.sample.places, device, 2, **limits)
+        light = divided_light(finer.applied(task), self.sample.places, device, 2, spreads_rays=True, **limits)
         if "multi-bounce" in task.paths:
             smaller = dataclasses.replace(
                 settings,
                 paths=("direct", "multi-bounce"),
-                nodes=(2 * u, 8 * v),  # in the same bins
+                nodes=(4 * u, 4 * v),  # in the same bins
                 patch_size=0.5 * settings.patch_size,
             )
             light["multi-bounce"] = self.sample.light(smaller).exposures["multi-bounce"]

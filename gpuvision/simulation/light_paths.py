@@ -70,6 +70,8 @@ class LightPaths:
         which varies slowly. Default 0.0.
     nodes : pair of ints
         Of `ViewRays`. Default ``(1, 1)``.
+    spreads_rays : bool
+        Of `ViewRays`: for readings that add up all bins. Default False.
     end_bins : int
         Number of bins beyond either end of the samples in which direct light is imaged and blurred too, 0 or more: the
         light that the ends cut off is then known (`BEYOND_ENDS`), and the true points beyond the ends. Default 0.
@@ -123,6 +125,7 @@ class LightPaths:
     sub_sheets: int = 1
     blur: float = 0.0
     nodes: tuple[int, int] = (1, 1)
+    spreads_rays: bool = False
     end_bins: int = 0
     patch_size: float | None = None
     tolerance: float = 0.0
@@ -144,7 +147,12 @@ class LightPaths:
         device = Device.best() if self.device is None else self.device
         object.__setattr__(self, "device", device)
         view_rays = ViewRays(
-            view=self.view, scene=self.scene, materials=self.materials, nodes=self.nodes, device=device
+            view=self.view,
+            scene=self.scene,
+            materials=self.materials,
+            nodes=self.nodes,
+            spreads_rays=self.spreads_rays,
+            device=device,
         )
         if self.end_bins < 0:
             raise ValueError(f"LightPaths.end_bins is {self.end_bins}, expected 0 or more")

@@ -223,6 +223,7 @@ def compute_missing_blocks(
 def make_light_paths(task: SimulationTask, device: Device) -> LightPaths:
     """Return the `LightPaths` of a task."""
     light = require_light(task.sensor)
+    is_psd = isinstance(task.sensor.readout, PsdReadout)
     return LightPaths(
         view=make_sensor_view(task.sensor),
         sheet=make_light_sheet(task.sensor),
@@ -232,7 +233,8 @@ def make_light_paths(task: SimulationTask, device: Device) -> LightPaths:
         sub_sheets=light.sub_sheets,
         blur=light.blur,
         nodes=light.nodes,
-        end_bins=math.ceil(_END_FRACTION * light.bins) if isinstance(task.sensor.readout, PsdReadout) else 0,
+        spreads_rays=is_psd,  # a strip adds up its bins; a pixel is read alone
+        end_bins=math.ceil(_END_FRACTION * light.bins) if is_psd else 0,
         patch_size=task.patch_size,
         tolerance=task.tolerance,
         min_power=minimum_sample_power(task.sensor),

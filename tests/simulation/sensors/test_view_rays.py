@@ -21,10 +21,11 @@ def floor(z: float = 0.0, size: float = 0.2) -> trimesh.Trimesh:
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
 
 
+@pytest.mark.parametrize("spreads_rays", [False, True])
 @pytest.mark.parametrize("nodes", [(1, 1), (2, 3)])
-def test_elements_lie_on_what_is_seen_where_its_image_is(device, nodes):
-    one = sensor_view(tilt=0.1)
-    lines = ViewRays(view=one, scene=Scene.of(floor(1e-3)), materials=[GREY], nodes=nodes, device=device)
+def test_elements_lie_on_what_is_seen_where_its_image_is(device, nodes, spreads_rays):
+    one, more = sensor_view(tilt=0.1), {"nodes": nodes, "spreads_rays": spreads_rays}
+    lines = ViewRays(view=one, scene=Scene.of(floor(1e-3)), materials=[GREY], device=device, **more)
     seen = lines.visible_surface(0.02)
     assert seen.receivers.shape == (one.samples, one.bins * nodes[0] * nodes[1], 6)
     np.testing.assert_allclose(seen.receivers[..., 2], 1e-3, atol=1e-15)
@@ -36,9 +37,10 @@ def test_elements_lie_on_what_is_seen_where_its_image_is(device, nodes):
     np.testing.assert_array_equal(one.sample_of(uv[..., 1]), np.broadcast_to(np.arange(7)[:, None], uv.shape[:-1]))
 
 
-def test_uniform_light_gives_the_etendue_and_its_moment(device):
-    one = sensor_view()
-    lines = ViewRays(view=one, scene=Scene.of(floor()), materials=[GREY], nodes=(4, 4), device=device)
+@pytest.mark.parametrize("spreads_rays", [False, True])
+def test_uniform_light_gives_the_etendue_and_its_moment(device, spreads_rays):
+    one, more = sensor_view(), {"nodes": (4, 4), "spreads_rays": spreads_rays}
+    lines = ViewRays(view=one, scene=Scene.of(floor()), materials=[GREY], device=device, **more)
     seen = lines.visible_surface(0.0)
     got = lines.exposure(seen, np.full(seen.weights.shape, 3.0))
     # Radiance 3 * 0.5 / pi everywhere: an independent sum over a fine grid of the sensor.
@@ -48,6 +50,39 @@ def test_uniform_light_gives_the_etendue_and_its_moment(device):
     held = fine.reshape(7, 120, 600)
     np.testing.assert_allclose(got.total(), held.sum(axis=(1, 2)), rtol=1e-5)
     np.testing.assert_allclose(got.first_moment(one.u_edges), (held * u).sum(axis=(1, 2)), rtol=1e-3, atol=1e-22)
+
+
+@pytest.mark.parametrize("nodes", [(1, 1), (2, 4), (1, 8)])
+def test_spread_rays_lie_one_in_each_cell_and_evenly_over_a_sample(device, nodes):
+    """No gap along v between neighbours is more than 2.7 times the mean one: the three gaps of the golden ratio."""
+    one = sensor_view()
+    lines = ViewRays(view=one, scene=Scene.of(floor()), materials=[GREY], nodes=nodes, spreads_rays=True, device=device)
+    v = one.project(lines.visible_surface(0.0).receivers[..., :3])[..., 1]
+    cells = one.v_edges[:-1, None] + np.diff(one.v_edges)[0] * np.append(0.0, 0.5 * _weights(nodes[1]).cumsum())
+    by_cell = (
+        v.reshape(one.samples, one.bins, nodes[1], nodes[0]).transpose(0, 2, 1, 3).reshape(*cells[:, 1:].shape, -1)
+    )
+    assert np.all((by_cell > cells[:, :-1, None]) & (by_cell < cells[:, 1:, None]))
+    gaps = np.diff(np.sort(by_cell, axis=-1)) / (cells[:, 1:] - cells[:, :-1])[..., None]
+    assert gaps.max() < 2.7 / by_cell.shape[-1]
+
+
+def _weights(count):
+    return np.polynomial.legendre.leggauss(count)[1]
+
+
+def test_the_error_at_an_edge_falls_where_rays_are_spread(device):
+    """Half of a sample is white floor: a single ray per bin tells 0 or 1, spread rays tell the half within 2 bins."""
+    one = sensor_view()
+    edge = one.points_in_sheet(0.0, one.v_centres[3])[0] + 1e-9
+    scene = Scene.of(floor().slice_plane([edge, 0.0, 0.0], [1.0, 0.0, 0.0]))
+    shares = []
+    for spreads_rays in (False, True):
+        of = {"materials": [WHITE], "spreads_rays": spreads_rays, "device": device}
+        whole, half = (ViewRays(view=one, scene=each, **of).visible_surface(0.0) for each in (Scene.of(floor()), scene))
+        shares.append(half.weights[3].sum() / whole.weights[3].sum())
+    assert shares[0] in (pytest.approx(0.0), pytest.approx(1.0))
+    assert shares[1] == pytest.approx(0.5, abs=2.0 / one.bins)
 
 
 def test_the_side_that_the_lens_sees_counts_and_the_nearer_surface(device):

@@ -58,7 +58,7 @@ def plan_simulation(
     """Choose the fastest light paths and discretisations of a simulation whose predicted error meets a tolerance.
 
     Light paths are left out, and slabs of the sheet, rays per bin, patches and the tolerance of clustered pairs are
-    tried, from 1 slab to twice the slabs of the sensor file, and from its rays per bin to eight times as many along v.
+    tried, from 1 slab to twice the slabs of the sensor file, and from its rays per bin to eight times as many.
 
     Parameters
     ----------
@@ -99,13 +99,13 @@ def plan_simulation(
     -----
     The noiseless readings of each setting are compared with those of a reference: the range error is the distance of
     the readings on the sensor times the derivative dH/du of the height. The reference has the finest options, but the
-    diffuse light of twice the rays along u and along v. The error of the reference is part of the error of every
-    setting. It is estimated from the change by the last refinement; that of the rays per bin, which is often the
+    diffuse light of four times the rays, spread as `ViewRays` says. The error of the reference is part of the error of
+    every setting. It is estimated from the change by the last refinement; that of the rays per bin, which is often the
     largest, as `Combinations.ray_error` says. Estimates add up as squares, except the change and the error of the
-    reference's rays, which may have the same sign. Proven bounds add up linearly: that of clustered
-    pairs, and that of multi-bounce light, which is left out for a PSD if its bound in the sample is a tenth of the
-    tolerance or less. The mean square error over the profiles is raised by twice its standard error. The
-    chosen setting is compared with the finest one on other profiles, with all light computed as the simulation does; a
+    reference's rays, which may have the same sign. Proven bounds add up linearly: that of clustered pairs, and that of
+    multi-bounce light, which is left out for a PSD if its bound in the sample is a tenth of the tolerance or less. The
+    mean square error over the profiles is raised by twice its standard error. The chosen setting is compared with the
+    reference on other profiles, with all light computed as the simulation does; a
     setting whose error there exceeds the tolerance, or that reads other lines there, is not chosen. Not covered:
     samples that are flagged as ambiguous, light paths that are not in ``paths`` or not modelled, and edges that no
     sampled profile meets.
@@ -266,11 +266,11 @@ class Combinations:
         return [*finest.values(), ErrorPart(difference.error + rays.error, difference.signal)]
 
     def _errors_of(self, axis: Sequence[Option]) -> Iterator[tuple[Option, Difference]]:
-        """Yield the change of the reading by each option of an axis, with the finest options of the others."""
-        others = [each[-1] for each in self._axes if each is not axis]
-        reader = self._sample.reader
+        """Yield the change of the reading by each option of an axis, with the reference's light of the others."""
+        paths, reader = axis[-1].exposures, self._sample.reader
+        others = {name: each for name, each in self._options.reference().items() if name not in paths}
         for each in axis:
-            reading = reader.read(light_of_options([*others, each]))
+            reading = reader.read(others | each.exposures)
             yield each, reader.compare(reading, self._estimate.reading)
 
     def _finest_errors(self) -> dict[str, ErrorPart]:
@@ -292,15 +292,13 @@ class Combinations:
     def ray_error(self) -> ErrorPart:
         """Return the error by the reference's rays per bin.
 
-        The rays at an edge of a surface converge with order 1: the error after a doubling is the change by it, or half
-        the change by the doubling before. One of the changes may be small by chance, so the larger result counts.
+        It is half of the smaller change from the two finest options. Errors of spread rays are independent: then the
+        reference, with four times the rays of the finest option and half of its error (measured: a half to a quarter),
+        has 0.45 of that change. A change from an option is large also if one of its rays lies beside a lit line; so the
+        smaller change counts.
         """
-        last = self._estimate.change({"diffuse-diffuse": self._options.rays[-2]}, 1.0)
-        reader = self._sample.reader
-        before = reader.compare(
-            *(reader.read(self._estimate.exposures | {"diffuse-diffuse": each}) for each in self._options.rays[-3:-1])
-        )
-        return max(last, ErrorPart(0.5 * before.error, 0.5 * before.signal))
+        changes = [self._estimate.change({"diffuse-diffuse": each}, 0.5) for each in self._options.rays[-3:-1]]
+        return min(changes)
 
 
 def _last_coarser(axis: Sequence[Option], name: str) -> list[Option]:

@@ -150,8 +150,8 @@ class LightOptions:
             self._bound_of_bounces = light.statistics.get(BOUNCES_BOUND, math.inf)
             options += [*self._clustered(light, exact, given), exact]
             self.rays.append(light.exposures[name])
-        given = {"paths": ("direct", name), "nodes": self._reference}
-        reference = self._light(is_finest=True, is_reference=True, **given)
+        paths = ("direct", name)
+        reference = self._light(is_finest=True, is_reference=True, paths=paths, nodes=self._reference)
         self.rays.append(reference.exposures[name])
         return options
 

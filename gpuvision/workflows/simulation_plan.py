@@ -15,9 +15,9 @@ from gpuvision.workflows.plan_files import write_plan
 from gpuvision.workflows.simulation_errors import ErrorPart
 from gpuvision.workflows.simulation_sample import SimulationSettings
 
-_LEGEND = """errors of the range in um; change: from the finest setting, estimate; pairs: bound of clustered pairs;
-finest: error of the finest setting, estimate; signal: change of the signal; moved: samples that read another line
-- is not chosen: it reads other lines than the finest setting"""
+_LEGEND = """errors of the range in um; change: from the reference, estimate; pairs: bound of clustered pairs;
+finest: error of the reference, estimate; signal: change of the signal; moved: samples that read another line
+- is not chosen: it reads other lines than the reference"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class SimulationPlanLimits(AccuracyLimits):
     Attributes
     ----------
     max_moved : float
-        Largest fraction of the samples that may read another line than with the finest setting, 0 to 1. Chosen. Default
+        Largest fraction of the samples that may read another line than with the reference, 0 to 1. Chosen. Default
         0.005.
     profiles : int
         Number of profiles on which settings are tried, 2 or more. Default 6.
@@ -57,20 +57,20 @@ class SettingsTrial(NamedTuple):
         Time of a profile, with its share of the preparation [s].
     error : float
         Error of the range [m] by ``change``, ``pairs`` and ``finest``: the sum of bounds, and the root of the sum of
-        squares of estimates. Without the finest rays per bin, ``change`` and the part of the rays in ``finest`` add up
-        before they are squared.
+        squares of estimates. ``change`` and the part of the rays in ``finest`` add up before they are squared.
     change : float
-        Root mean square difference of the readings from those of the finest setting, with all pairs [m].
+        Root mean square difference of the readings from those of the reference, with all pairs [m]. The reference has
+        the finest options, with more rays per bin of diffuse light.
     pairs : float
         Proven bound of the error by clustered and omitted pairs [m]; only PSDs have such pairs.
     finest : float
-        Estimated error of the finest setting [m].
+        Estimated error of the reference [m].
     worst : float
-        Largest difference from the finest setting [m].
+        Largest difference from the reference [m].
     signal : float
         Root mean square difference of the signal, as a fraction of the signal.
     moved : float
-        Fraction of the samples that read another line than with the finest setting, or none.
+        Fraction of the samples that read another line than with the reference, or none.
     """
 
     settings: SimulationSettings
@@ -125,7 +125,7 @@ class SimulationPlan(AccuracyPlan[SettingsTrial]):
     task : SimulationTask
         The task with the chosen settings.
     finest : dict of str to ErrorPart
-        Parts of the error of the finest setting.
+        Parts of the error of the reference.
     checked : float
         Error of the chosen setting on profiles that did not take part in the choice [m]; NaN if there are none.
     seconds : float
@@ -187,12 +187,12 @@ class SimulationPlan(AccuracyPlan[SettingsTrial]):
 
 
 def largest_part(trial: SettingsTrial, finest: dict[str, ErrorPart]) -> str:
-    """Return the largest part of the error of a trial in words, such as "nodes of the finest setting"."""
-    parts = {"the difference from the finest setting": trial.change, "the bound of clustered pairs": trial.pairs}
-    parts |= {f"{name} of the finest setting": each.error for name, each in finest.items()}
+    """Return the largest part of the error of a trial in words, such as "nodes of the reference"."""
+    parts = {"the difference from the reference": trial.change, "the bound of clustered pairs": trial.pairs}
+    parts |= {f"{name} of the reference": each.error for name, each in finest.items()}
     return max(parts, key=lambda name: parts[name])
 
 
 def usable_settings(trials: Sequence[SettingsTrial], limits: SimulationPlanLimits) -> list[SettingsTrial]:
-    """Return the settings that read the lines of the finest setting."""
+    """Return the settings that read the lines of the reference."""
     return [each for each in trials if each.error > 0.0 and each.moved <= limits.max_moved]

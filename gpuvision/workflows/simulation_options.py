@@ -144,7 +144,7 @@ class LightOptions:
             return []
         options = [Option({}, {}, 0.0)]
         for nodes in self._nodes:
-            given = {"paths": ("direct", name), "nodes": nodes}
+            given: dict[str, Any] = {"paths": ("direct", name), "nodes": nodes}
             light = self._light(is_finest=False, **given)
             exact = self._option(name, light, nodes=nodes)
             self._bound_of_bounces = light.statistics.get(BOUNCES_BOUND, math.inf)

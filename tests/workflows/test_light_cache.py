@@ -128,7 +128,7 @@ def test_a_block_stacks_its_profiles(monkeypatch: pytest.MonkeyPatch, rng: np.ra
 
 @pytest.mark.parametrize(("preset", "end_bins"), [("psd_line", 24), ("camera_line", 0)])
 def test_light_paths_of_a_task(preset: str, end_bins: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A quarter of the 96 bins of a PSD lies beyond each end."""
+    """A quarter of the 96 bins of a PSD lies beyond each end; its rays are spread."""
     made: list[dict[str, Any]] = []
     monkeypatch.setattr(light_cache, "LightPaths", lambda **options: made.append(options) or "paths")
     for name, function in (("view", "make_sensor_view"), ("sheet", "make_light_sheet")):
@@ -148,6 +148,7 @@ def test_light_paths_of_a_task(preset: str, end_bins: int, monkeypatch: pytest.M
         "sub_sheets": light.sub_sheets,
         "blur": light.blur,
         "nodes": light.nodes,
+        "spreads_rays": preset == "psd_line",
         "end_bins": end_bins,
         "patch_size": 2e-3,
         "tolerance": 1e-6,

@@ -9,7 +9,8 @@ import numpy as np
 
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.blob import FindBlobs
-from gpuvision.profiling.blob import NOISE, SEARCH, THRESHOLD, scene
+from gpuvision.profiling.blob import NOISE, THRESHOLD, scene
+from gpuvision.profiling.blob_peers import SEARCH
 from gpuvision.profiling.curves.curve import Errors, Setting, distance
 from gpuvision.profiling.harness import bind_with
 

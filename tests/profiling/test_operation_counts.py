@@ -20,6 +20,7 @@ from gpuvision.matching.robust import sample_subsets
 from gpuvision.profiling import adaptive_shadow_rays as adaptive
 from gpuvision.profiling import (
     blob,
+    blob_peers,
     board_image,
     board_pose,
     deposits,
@@ -84,9 +85,9 @@ def test_pose(count):
 @pytest.mark.parametrize("unknowns", [3, 8])
 def test_normal_equations(unknowns):
     matrix, right = np.eye(unknowns, dtype=F), np.ones(unknowns, F)
-    if unknowns == blob._UNKNOWNS:
-        agree(pose.factor_flops(unknowns), operations_of(blob._factor, matrix), 0.1)
-        agree(pose.solve_flops(unknowns), operations_of(blob._solve, matrix, right, right.copy()), 0.01)
+    if unknowns == blob_peers.UNKNOWNS:
+        agree(pose.factor_flops(unknowns), operations_of(blob_peers.factor, matrix), 0.1)
+        agree(pose.solve_flops(unknowns), operations_of(blob_peers.solve, matrix, right, right.copy()), 0.01)
     lower = sum(unknowns - k for k in range(unknowns))
     assert pose.add_flops(unknowns) == unknowns + 2 * (lower + unknowns)  # products with the weight; sums
 
@@ -174,13 +175,15 @@ def test_deposits(shift):
 
 def test_blob():
     image, places, _ = blob.scene(1)
-    taps = np.arange(1, blob.REACH + 1) * np.exp(-0.5 * (np.arange(1, blob.REACH + 1) / 1.5) ** 2)
-    taps /= 2.0 * np.sum(taps * np.arange(1, blob.REACH + 1))
+    taps = np.arange(1, blob_peers.REACH + 1) * np.exp(-0.5 * (np.arange(1, blob_peers.REACH + 1) / 1.5) ** 2)
+    taps /= 2.0 * np.sum(taps * np.arange(1, blob_peers.REACH + 1))
     numbers = np.array([blob.THRESHOLD / 5.0, 2.25, 1.0, *taps], F)
-    angle = np.arange(blob.SPOKES) * 2.0 * math.pi / blob.SPOKES
+    angle = np.arange(blob_peers.SPOKES) * 2.0 * math.pi / blob_peers.SPOKES
     directions = np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(F)
     out = np.empty((1, 13), F), np.empty((1, 3, 3), F), np.empty(1, np.uint8)
-    found = operations_of(blob._find_triples, image, places, numbers, directions, F(2.0), *out)
+    found = operations_of(
+        blob_peers.find_form(blob_peers.start, True), image, places, numbers, directions, F(2.0), *out
+    )
     agree(blob.blob_flops(), found)
 
 

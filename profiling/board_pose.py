@@ -23,8 +23,8 @@ from gpuvision.matching.pose.board_pose import BoardPoseEstimator, place_rulers
 from gpuvision.matching.pose.pose import SolvePose
 from gpuvision.matching.robust import sample_subsets
 from gpuvision.profiling import pose as of_pose
+from gpuvision.profiling import pose_lanes, ruler_peers
 from gpuvision.profiling import ruler as of_ruler
-from gpuvision.profiling import ruler_peers
 from gpuvision.profiling.harness import Case, Peer, traffic_of
 from gpuvision.profiling.line_fit import EFFICIENCY, STEPS, TRIALS, fit_line
 from gpuvision.profiling.line_fit import fit_flops as line_flops
@@ -225,7 +225,11 @@ def _fused_pose(device: Device) -> Case:
     for name, measure in ruler_peers.expert_forms(len(flat)).items():
         fused = _fused_form(measure, parallel=not name.endswith("-serial"))
         forms[name] = functools.partial(fused, *given, found, status, pose, covariance)
-        forms[name]()
+        fused = pose_lanes.fused_form(measure, LINES, EACH, TRIALS)
+        forms[f"{name}-lanes"] = functools.partial(fused, *given, found, status, pose, covariance, _PLACE)
+    for name, form in forms.items():
+        found[...], status[...], pose[...], covariance[...] = np.nan, 255, np.nan, np.nan
+        form()
         results.append((f"numba {name}", pose.copy(), covariance.copy()))
     (exact, exact_covariance), (rounded, _) = by_numpy.exact(), by_numpy()
     ours = np.array([*to_numpy(result.placement), to_numpy(result.pose)[2]])

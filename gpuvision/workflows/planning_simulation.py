@@ -35,8 +35,8 @@ from gpuvision.workflows.simulation_sample import Difference, ProfileSample
 Progress = Callable[[int, int | None], object]
 
 # Profiles of a part up to which planning takes longer than it saves, with and without multi-bounce light. Measured on
-# PoCL: planning took the time of 26 profiles with it, and of 190 to 480 profiles without it (four parts).
-_WORTH_BOUNCES, _WORTH = 30, 300
+# PoCL: planning took the time of 115 profiles with it (one part), and of 279 to 402 profiles without it (two parts).
+_WORTH_BOUNCES, _WORTH = 120, 300
 
 
 def plan_simulation(

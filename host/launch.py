@@ -49,8 +49,9 @@ class Launch:
         another reason. Small launches of such kernels run in the calling thread, because waking a worker thread takes
         longer than the work. Default False.
     streams : bool
-        Whether the time of the kernel follows from the bytes that it moves: it computes little for each of them.
-        Default False.
+        Whether the time of the kernel follows from the bytes that it moves: it computes little for each of them. Then
+        large launches write past the caches, and short ones of several work-groups run in the calling thread on a
+        runtime that gains by it, if the caller waits. Default False.
     problem_per_group : bool
         Whether each work-group of the work-item variant solves one problem, with results that do not depend on the
         size of the group. A device without registers for the groups then runs the same number of smaller groups.

@@ -275,6 +275,9 @@ def plan_stream(
         raise ValueError(f"rate is {rate}, expected the sensor's frames per second, > 0")
     if not 0.0 <= stall < math.inf:
         raise ValueError(f"stall is {stall}, expected seconds >= 0")
+    headroom = margin if headroom is None else headroom
+    if not margin <= headroom < math.inf:
+        raise ValueError(f"headroom is {headroom}, expected a number of the margin {margin} or more")
     sample = np.zeros((1, *source.shape), source.dtype) if sample is None else sample
     _check_sample(sample, source)
     plan = functools.partial(
@@ -284,7 +287,7 @@ def plan_stream(
         rate=rate,
         latency=latency,
         margin=margin,
-        headroom=margin if headroom is None else headroom,
+        headroom=headroom,
         stall=stall,
         inline=inline,
         zero_copy=zero_copy,

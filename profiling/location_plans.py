@@ -29,6 +29,7 @@ from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.profiling.plan_outcomes import Outcome, cost_of, room_of, run_jobs
 from gpuvision.simulation.board_image.board_image import RenderBoard
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
+from gpuvision.status import Status
 from gpuvision.workflows.location_plan import LocationPlan, LocationPlanLimits
 from gpuvision.workflows.planning_location import choose_features, plan_location
 
@@ -215,7 +216,7 @@ def measure(job: Job, plan: LocationPlan, features: FeatureSet, points: Float64,
         start = time.perf_counter()
         found = bound(frame, job.options["initial_pose"])
         times.append(time.perf_counter() - start)
-        if int(to_numpy(found.status)):
+        if int(to_numpy(found.status)) not in (Status.OK, Status.NOT_CONVERGED):
             continue
         true, measured = (_view(job, each) for each in (pose, np.asarray(to_numpy(found.pose), np.float64)))
         away = measured.to_plane(true.to_pixels(points)) - points

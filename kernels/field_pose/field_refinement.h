@@ -112,7 +112,7 @@ static inline float3 damped_step(const normal_equations undamped, float damping,
                     (c.xt * of.x + c.yt * of.y + c.tt * of.t) * scale * lever);
 }
 
-// Pose to this length [m] and angle [rad] by rounding, in a field of 20 m.
+// Rounding error of a pose [m], [rad] in a field of 20 m.
 #define POSE_ROUNDING 3e-5f
 
 // Return whether a pose has not converged: the Newton step from it exceeds the rounding, and a tenth of a standard

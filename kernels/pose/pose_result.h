@@ -107,10 +107,10 @@ static inline void store_pose(GROUP_SPACE const solved_pose *fit, pose_rows all,
     const int bad = few || refused || away || !all_finite;
     store_rows(fit, all, frame.size, bad, count, to.residuals + item * count, to.weights + item * count);
     if (GROUP_ITEM) return;
-    to.status[item] = !all_finite ? STATUS_NOT_FINITE
-                      : few       ? STATUS_NO_DATA
-                      : refused   ? STATUS_AMBIGUOUS
-                      : away      ? STATUS_OUT_OF_RANGE
+    to.status[item] = !all_finite    ? STATUS_NOT_FINITE
+                      : few          ? STATUS_NO_DATA
+                      : refused      ? STATUS_AMBIGUOUS
+                      : away         ? STATUS_OUT_OF_RANGE
                       : fit->is_open ? STATUS_NOT_CONVERGED
                                      : STATUS_OK;
     to.pose[3 * item] = bad ? REAL_NAN : move_x - ((axx - 1) * frame.x + axy * frame.y);

@@ -56,7 +56,7 @@ def _errors(device: Device, places: Floats, rng: np.random.Generator) -> Floats:
         found = operation(points, start[None].astype(np.float32), device=device)
         exact = _least_cost(normals, pose, points.astype(np.float64))
         error = np.linalg.norm(to_numpy(found.poses)[0, :2] - away - exact[:2]) / _RANGE
-        errors[number] = error if to_numpy(found.status)[0] == Status.OK else np.nan
+        errors[number] = error if to_numpy(found.status)[0] in (Status.OK, Status.NOT_CONVERGED) else np.nan
     return errors
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -39,6 +40,12 @@ def planned(cost: Any, *, frames: int = 200, **options: Any) -> Plan:
 def test_a_batch_with_exactly_the_margin_keeps_up(rate: float, batch: int) -> None:
     chosen = planned(lambda size, inline: Cost(rate * size, 1e-4, 1e-5))
     assert chosen.batch == batch
+
+
+@pytest.mark.parametrize("headroom", [math.nan, math.inf, 1.2, -1.0])
+def test_a_headroom_below_the_margin_or_not_finite_is_refused(headroom: float) -> None:
+    with pytest.raises(ValueError, match=r"expected a number of the margin 1\.25 or more"):
+        planned(lambda size, inline: Cost(1e5, 1e-4, 1e-5), headroom=headroom)
 
 
 @pytest.mark.parametrize(

@@ -54,8 +54,8 @@ class BoardPose(NamedTuple):
     Attributes
     ----------
     pose : float, (..., 3)
-        x, y [m] of the artwork's origin, and theta [rad]. Where the status is not OK, all fields are NaN unless their
-        description says otherwise.
+        x, y [m] of the artwork's origin, and theta [rad]. Where the status is neither OK nor NOT_CONVERGED, all fields
+        are NaN unless their description says otherwise.
     deformation : float, (..., 3)
         Scales along the artwork's axes less 1, and shear: I + D = R(theta) ((1 + kx, shear), (0, 1 + ky)).
     placement : float, (..., 2)

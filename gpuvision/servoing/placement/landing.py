@@ -81,5 +81,5 @@ def refused_starts(
     )
     render = board_renderer(board, camera, noise=False)
     images = to_numpy(render(poses[:, None], np.zeros(len(poses), np.uint32), device=device).image)
-    found = [landing(image, device=device).status for image in images]
+    found = [landing(image, device=device).status & ~Status.NOT_CONVERGED for image in images]
     return [Status(each) for each in found if each]

@@ -19,6 +19,7 @@ from gpuvision.servoing.placement.board_renderer import board_renderer
 from gpuvision.servoing.placement.machine import Machine
 from gpuvision.servoing.placement.plan import PlacementPlan
 from gpuvision.simulation.board_image.reflectance_map import ReflectanceMap
+from gpuvision.status import Status
 
 Float64 = npt.NDArray[np.float64]
 
@@ -205,7 +206,7 @@ class BoardPoseSensor:
             image = to_numpy(self._undistort(image, device=self._device).image)
         found = self._plan.landing(image, device=self._device)
         self._ready = frame.arrived + self._landing_time
-        self._has_landed = found.status == 0
+        self._has_landed = not found.status & ~Status.NOT_CONVERGED  # the pose only has to be near
         if self._has_landed:
             self._last = np.array(move_view(self._view, found.pose).pose)
             return None

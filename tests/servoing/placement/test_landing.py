@@ -12,7 +12,7 @@ from gpuvision.servoing.frames import compose_poses
 from gpuvision.servoing.placement import landing
 from gpuvision.status import Status
 
-STATUSES = [Status.OK, Status.AMBIGUOUS, Status.OK, Status.LOW_SIGNAL, Status.OK]
+STATUSES = [Status.OK, Status.AMBIGUOUS, Status.NOT_CONVERGED, Status.LOW_SIGNAL, Status.OK]
 
 
 class Search:

@@ -6,7 +6,7 @@ if a run is invalid because the machine changed its speed, and 2 if a file is no
 
 Two ratios agree if their logarithms differ by at most the half-widths of their 95 % confidence intervals, added as
 squares. The intervals hold the spread within a run and the spread between runs, `rounds.BETWEEN_RUNS`. About 95 % of
-the rows of two runs of the same code agree.
+the rows of two runs of the same code should agree.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ _CALLS_PER_TURN = 3
 _LONG_CALL, _LONGEST_WARMED_CALL = 0.01, 0.1  # [s]
 CONFIDENCE = 0.95  # least confidence of an interval that is shown
 # Half of the 95 % interval of a ratio between runs of the same code, relative: arrays at other places in memory, other
-# frequency, other work of the machine. Measured: in two runs of 19 minutes on an idle machine, 96 % of 262 ratios
+# frequency, other work of the machine. Fitted to 262 ratios of two runs of 19 minutes on an idle machine: 96 % of them
 # differ by less than this and the rounds within the runs explain; half of them by less than 2 %.
 BETWEEN_RUNS = 0.08
 

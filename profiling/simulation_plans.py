@@ -61,7 +61,7 @@ class Job(NamedTuple):
     tolerance : float
         Largest error of the range [m].
     rate : float
-        Rate, as a fraction of the largest rate that the planner would accept.
+        Rate, as a fraction of that of the fastest light that truly meets the tolerance.
     """
 
     task: SimulationTask
@@ -155,18 +155,19 @@ def judge(rng: np.random.Generator, device: Device, limits: SimulationPlanLimits
     for each in options.combinations():
         if truth.error(light_of_options(each), limits.max_moved) <= job.tolerance:
             meeting[options.settings_of(each)] = options.seconds_of(each)
+    # A fraction of the largest rate of the fastest accurate light.
+    rate = job.rate / min(meeting.values()) if meeting else None
     try:
-        plan = plan_task(job.task, tolerance=job.tolerance, device=device, limits=limits)
+        plan = plan_task(job.task, tolerance=job.tolerance, rate=rate, device=device, limits=limits)
     except PlanError:
         return Outcome(None, job.tolerance, possible=bool(meeting))
     chosen = plan.chosen
     light = truth.sample.light(chosen.settings)
     error = truth.error(light.exposures, limits.max_moved)
     seconds = light.seconds + (light.setup / _PROFILES if "multi-bounce" in chosen.settings.paths else 0.0)
-    rate = job.rate / (limits.rate_margin * chosen.seconds)
     times = {options.settings_of(each): options.seconds_of(each) for each in options.combinations()}
     cost = times.get(chosen.settings, chosen.seconds) / min(meeting.values(), default=math.nan)
-    return Outcome(plan, job.tolerance, error, bool(meeting), cost, seconds * rate <= 1.0)
+    return Outcome(plan, job.tolerance, error, bool(meeting), cost, rate is None or seconds * rate <= 1.0)
 
 
 class Truth:

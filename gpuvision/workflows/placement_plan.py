@@ -75,7 +75,7 @@ class PlacementTrial(NamedTuple):
         without images and of the rendered ones. NaN if no run without images releases the part.
     error : float
         Error of the placement [m], root mean square: ``fixed`` with the larger one of ``vision`` and ``loop``. With
-        rendered images it is at least ``fixed`` with ``images``, and at most two standard errors above. NaN if no run
+        rendered images it is at least ``fixed`` with ``images``, and at most three standard errors above. NaN if no run
         without images releases the part.
     fixed : float
         Error by calibration, drift and etch bias [m].

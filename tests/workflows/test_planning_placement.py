@@ -215,15 +215,18 @@ def test_images_may_show_that_a_setting_is_more_accurate_than_predicted() -> Non
     assert len(refused) == 6
 
 
+@pytest.mark.parametrize("images", [0.5, 0.95, 1.2])
 @pytest.mark.parametrize(
-    ("images", "error"),
-    # Runs of 0.2 and 1.8 times the mean square: two standard errors are 0.8 / 6 of the root, without a common error.
-    [(0.5, 0.5 * (1.0 + 0.8 / math.sqrt(35.0))), (0.95, 1.0), (1.2, 1.2)],
+    ("squares", "sigma"),
+    # Mean squares of 1. Equal ones count as those of normal errors, which scatter by the root of 2.
+    [((0.0, 0.0, 0.0, 4.0), 0.5 * math.sqrt(3.0 / 35.0)), ((1.0, 1.0, 1.0, 1.0), 0.5 * math.sqrt(2.0 / 36.0))],
 )
-def test_images_limit_the_prediction(images: float, error: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The prediction is 1 um: the error is at least that in images, and at most two standard errors above."""
+def test_images_limit_the_prediction(
+    images: float, squares: tuple[float, ...], sigma: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The prediction is 1 um: the error is at least that in images, and at most three standard errors above."""
     released = SimpleNamespace(released=True, record=SimpleNamespace(time=np.array([0.0, 2.0])))
-    away = images * 1e-6 * np.sqrt(np.tile([0.2, 1.8], 18))
+    away = images * 1e-6 * np.sqrt(np.tile(squares, 9))
     sources = {"vision and servo": np.column_stack([away, np.zeros(36), np.zeros(36)])}
     result = SimpleNamespace(placements=[released] * 36, sources=sources)
     monkeypatch.setattr(planning_placement, "simulate_placements", lambda *_, **__: result)
@@ -232,8 +235,8 @@ def test_images_limit_the_prediction(images: float, error: float, monkeypatch: p
     nothing: Any = None
     found = planning_placement.check_with_images(given, nothing, RADIUS, 36, nothing, seed=1)
     assert found.images == pytest.approx(images * 1e-6)
-    assert found.images_sigma == pytest.approx(images * 1e-6 * 0.4 / math.sqrt(35.0))
-    assert found.error == pytest.approx(error * 1e-6)
+    assert found.images_sigma == pytest.approx(images * 1e-6 * sigma)
+    assert found.error == pytest.approx(1e-6 * max(images, min(1.0, images * (1.0 + 3.0 * sigma))))
 
 
 @pytest.mark.usefixtures("few_settings")

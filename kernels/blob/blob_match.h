@@ -70,6 +70,68 @@ static inline masks hidden_at(GROUP_SPACE const blob_hidden *hidden, reals dx, r
 #define MATCH_PIXELS (MATCH_SQUARE + 3)
 #define MATCH_SUMS (MATCH_SQUARE + 4)
 
+// Equations of a vector of pixels; a batch has up to MATCH_BATCH of them.
+typedef struct {
+    reals row[UNKNOWNS], residual, weight;
+} match_equation;
+#ifdef VECTOR_VARIANT
+#define MATCH_BATCH 16
+#define MATCH_SPLIT 3 // the products with the first three unknowns are half of the products
+
+// Add the products with the unknowns `first` to `end` - 1 to the normal equations. A CPU has too few registers for the
+// sums of all products, and would read and write each sum for each vector of pixels. Half of them stay in registers over
+// a batch; the order of the additions to a sum is the same.
+INLINE void match_added(private const match_equation *batch, int count, const int first, const int end,
+                        private reals *sums) {
+    reals held[MATCH_SQUARE];
+#pragma unroll
+    for (int i = first; i < UNKNOWNS; i++) {
+        if (i < end) held[MATCH_RIGHT + i] = sums[MATCH_RIGHT + i];
+#pragma unroll
+        for (int j = first; j < end; j++)
+            if (j <= i) held[CELL(i, j)] = sums[CELL(i, j)];
+    }
+    for (int n = 0; n < count; n++) {
+        private const match_equation *const of = batch + n;
+#pragma unroll
+        for (int i = first; i < UNKNOWNS; i++) {
+            const reals weighted = of->weight * of->row[i];
+            if (i < end) held[MATCH_RIGHT + i] += weighted * of->residual;
+#pragma unroll
+            for (int j = first; j < end; j++)
+                if (j <= i) held[CELL(i, j)] += weighted * of->row[j];
+        }
+    }
+#pragma unroll
+    for (int i = first; i < UNKNOWNS; i++) {
+        if (i < end) sums[MATCH_RIGHT + i] = held[MATCH_RIGHT + i];
+#pragma unroll
+        for (int j = first; j < end; j++)
+            if (j <= i) sums[CELL(i, j)] = held[CELL(i, j)];
+    }
+}
+
+// Add the products of a batch. Inlined, constants of the caller's loops would take its registers.
+static __attribute__((noinline)) void match_batch_added(private const match_equation *batch, int count,
+                                                        private reals *sums) {
+    match_added(batch, count, 0, MATCH_SPLIT, sums);
+    match_added(batch, count, MATCH_SPLIT, UNKNOWNS, sums);
+}
+#else
+#define MATCH_BATCH 1
+
+// Add the products of one vector of pixels.
+static inline void match_batch_added(private const match_equation *of, int count, private reals *sums) {
+#pragma unroll
+    for (int i = 0; i < UNKNOWNS; i++) {
+        const reals weighted = of->weight * of->row[i];
+        sums[MATCH_RIGHT + i] += weighted * of->residual;
+#pragma unroll
+        for (int j = 0; j <= i; j++) sums[CELL(i, j)] += weighted * of->row[j];
+    }
+}
+#endif
+
 // Add up the normal equations of a part of the pixels of the fiducial and its background around (x, y), in units of the
 // contrast.
 static inline void match_summed(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
@@ -78,7 +140,10 @@ static inline void match_summed(global const CODE *image, int rows, int columns,
     const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale, per_size = 1 / shape.size;
     const real per_contrast = 1 / grey.contrast;
     const int top = max((int)ceil(y - reach), 0), bottom = min((int)(y + reach), rows - 1);
-    for (int i = 0; i < MATCH_SUMS; i++) sums[i] = 0;
+    match_equation batch[MATCH_BATCH];
+    int count = 0;
+    reals pixels = 0, squares = 0, weights = 0, used = 0;
+    for (int i = 0; i < MATCH_SQUARE; i++) sums[i] = 0;
     for (int row = top + PART_ROW(part); row <= bottom; row += PART_ROWS) {
         const real dy = row - y, half_chord = sqrt(fmax(reach * reach - dy * dy, (real)0));
         const int left = max((int)ceil(x - half_chord), 0), right = min((int)(x + half_chord), columns - 1);
@@ -89,32 +154,34 @@ static inline void match_summed(global const CODE *image, int rows, int columns,
             if (hidden->count) in &= ~hidden_at(hidden, dx, (reals)dy);
             const blob_model model = model_at(dx, (reals)dy, shape, cosine, sine, grey.blur);
             const reals pixel = (PIXELS(image + row * columns + from) - (reals)grey.background) * (reals)per_contrast;
-            reals equation[UNKNOWNS];
-            for (int i = 0; i < FREEDOMS + 1; i++) equation[i] = model.row[i];
-            equation[FREEDOMS + 1] = model.level;
-            equation[FREEDOMS + 2] = 1;
-            equation[FREEDOMS + 3] = dx * per_size;
-            equation[FREEDOMS + 4] = (reals)(dy * per_size);
-            reals residual =
-                pixel - model.level - slope_x * equation[FREEDOMS + 3] - slope_y * equation[FREEDOMS + 4];
+            private match_equation *const equation = batch + (MATCH_BATCH > 1 ? count : 0);
+            count++;
+            for (int i = 0; i < FREEDOMS + 1; i++) equation->row[i] = model.row[i];
+            equation->row[FREEDOMS + 1] = model.level;
+            equation->row[FREEDOMS + 2] = 1;
+            equation->row[FREEDOMS + 3] = dx * per_size;
+            equation->row[FREEDOMS + 4] = (reals)(dy * per_size);
+            reals residual = pixel - model.level - slope_x * equation->row[FREEDOMS + 3] -
+                             slope_y * equation->row[FREEDOMS + 4];
 #ifdef CODE_float
             in &= ~LANED(not_finite)(residual);
 #endif
             residual = kept_where(in, residual);
             const reals weight = kept_where(in, loss_weight(residual * (reals)per_scale));
-#pragma unroll
-            for (int i = 0; i < UNKNOWNS; i++) {
-                const reals weighted = weight * equation[i];
-                sums[MATCH_RIGHT + i] += weighted * residual;
-#pragma unroll
-                for (int j = 0; j <= i; j++) sums[CELL(i, j)] += weighted * equation[j];
-            }
-            sums[MATCH_PIXELS] += kept_where(in, (reals)1);
-            sums[MATCH_SQUARE] += weight * residual * residual;
-            sums[MATCH_WEIGHT] += weight;
-            sums[MATCH_COUNT] += kept_where(mask_of(weight > (reals)0), (reals)1);
+            equation->residual = residual;
+            equation->weight = weight;
+            pixels += kept_where(in, (reals)1);
+            squares += weight * residual * residual;
+            weights += weight;
+            used += kept_where(mask_of(weight > (reals)0), (reals)1);
+            if (count < MATCH_BATCH) continue;
+            match_batch_added(batch, count, sums);
+            count = 0;
         }
     }
+    if (count) match_batch_added(batch, count, sums);
+    sums[MATCH_SQUARE] = squares, sums[MATCH_WEIGHT] = weights;
+    sums[MATCH_COUNT] = used, sums[MATCH_PIXELS] = pixels;
 }
 
 // State of the match; in a group item 0 changes it.

@@ -339,7 +339,7 @@ def test_a_setting_that_drops_a_part_is_no_accurate_one(monkeypatch: pytest.Monk
 def test_outcome_of_a_simulation(
     monkeypatch: pytest.MonkeyPatch, tolerance: float, rate: float, chosen: str | None, keeps_up: bool
 ) -> None:
-    """The run of a chosen setting takes 1.5 times the planned time: 0.5 of the largest planned rate is kept."""
+    """The run of a chosen setting takes 1.5 times the planned time: half of the rate of the fastest one is kept."""
     names = list(SETTINGS)
 
     class Options:
@@ -348,7 +348,10 @@ def test_outcome_of_a_simulation(
             self.settings_of = lambda options: options[0]
             self.seconds_of = lambda options: SETTINGS[options[0]][0]
 
-    def planned(task: Any, *, tolerance: float, device: Any, limits: Any) -> Any:
+    asked: list[float | None] = []
+
+    def planned(task: Any, *, tolerance: float, rate: float | None, device: Any, limits: Any) -> Any:
+        asked.append(rate)
         fits = [name for name, each in SETTINGS.items() if 1.1 * each[1] <= tolerance]
         if not fits:
             raise PlanError("none", (), ())
@@ -368,6 +371,7 @@ def test_outcome_of_a_simulation(
     device: Any = None
     found = simulation_plans.judge(np.random.default_rng(1), device)
     assert found.possible == (tolerance > 1.2)
+    assert asked == [None if chosen is None else rate / SETTINGS[chosen][0]]
     if chosen is None:
         assert found.plan is None
         return

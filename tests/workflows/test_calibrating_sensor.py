@@ -177,7 +177,7 @@ def test_views_that_scatter_are_named(ratio: float, factor: str | None) -> None:
         (ratio, 1.0, "the laser lines scatter {} times as much from view to view as readings and poses predict"),
         (1.0, ratio, "the transport views scatter {} times as much about a straight uniform motion"),
     ):
-        sheet = SimpleNamespace(residuals=(few, many), view_ratio=sheet_ratio)
+        sheet = SimpleNamespace(residuals=(few, many), view_ratio=sheet_ratio, converged=True)
         geometry: Any = SimpleNamespace(sheet=sheet, transport=SimpleNamespace(view_ratio=transport_ratio))
         found = _warnings(geometry, lines)
         assert found[:2] == [
@@ -185,6 +185,10 @@ def test_views_that_scatter_are_named(ratio: float, factor: str | None) -> None:
             "b.png: the sheet rejects 11 of 20 readings; check that the target did not move between its two images",
         ]
         assert [each.startswith(words.format(factor)) for each in found[2:]] == ([] if factor is None else [True])
+    geometry.sheet.converged = False
+    assert any(
+        each.startswith("the fit of the sheet stopped before it converged") for each in _warnings(geometry, lines)
+    )
     geometry.transport = None
     assert _warnings(geometry, lines)[-1].startswith("no transport views: the part is assumed to move along -(g x h)")
 
@@ -640,6 +644,6 @@ def test_unused_short_line_is_named() -> None:
     transport = SimpleNamespace(view_ratio=1.0)
     lines = [SimpleNamespace(image=Path("pose1_laser.png"), note="")]
     for residual, count in ((np.full(10, np.nan), 1), (np.zeros(10), 0)):
-        sheet = SimpleNamespace(residuals=(residual,), view_ratio=1.0)
+        sheet = SimpleNamespace(residuals=(residual,), view_ratio=1.0, converged=True)
         found = _warnings(SimpleNamespace(sheet=sheet, transport=transport), lines)
         assert found == ["pose1_laser.png: the line has 10 readings, the sheet uses lines of 16 or more"][:count]

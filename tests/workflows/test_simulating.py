@@ -24,6 +24,7 @@ from gpuvision.host.errors import RecordingError
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.sheet import BentSheet
 from gpuvision.sensor.sensor import Sensor
+from gpuvision.sensor.simulated import require_light
 from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
@@ -349,7 +350,14 @@ def test_all_paths_by_one_word(part_file: Path, tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.slow
 def test_patches_of_the_default_size_suffice_in_a_groove(device: Device) -> None:
-    """Readings in a V groove of 90 degrees with the default patches, against patches of half the size."""
+    """Readings in a V groove of 90 degrees with the default patches, against patches of half the size.
+
+    Four rays per bin: the light of a single ray beside the edge of the groove changes with the patches there by 7 um in
+    one strip, whose error by so few rays is 62 um.
+    """
+    sensor = Sensor.load("psd_line")
+    light = require_light(sensor)
+    sensor = dataclasses.replace(sensor, light=dataclasses.replace(light, nodes=(2, 2)))
     half, length = 0.02 / np.sqrt(2.0), 0.08
     profile = np.repeat(np.array([(-half, half), (0.0, 0.0), (half, half)]), 2, axis=0)
     corners = np.stack([profile[:, 0], np.tile([-length / 2, length / 2], 3), profile[:, 1]], axis=-1)
@@ -361,7 +369,7 @@ def test_patches_of_the_default_size_suffice_in_a_groove(device: Device) -> None
         task = prepare_simulation(
             scene,
             [Material(diffuse=Lambert(albedo=0.8))],
-            Sensor.load("psd_line"),
+            sensor,
             paths=("direct", "diffuse-diffuse", "multi-bounce"),
             patch_size=patch_size,
             transports=[0.0],
@@ -379,7 +387,7 @@ def test_patches_of_the_default_size_suffice_in_a_groove(device: Device) -> None
     (one_bounce, default), estimate = readings[0]
     error = np.abs(default - readings[1][0][1]).max()
     assert np.abs(default - one_bounce).max() > 300e-6
-    # Measured: 1.0 um; even patches are wrong by 10 um.
+    # Measured: 1.4 um; even patches are wrong by 10 um.
     assert error < 2e-6
     assert error < estimate
 

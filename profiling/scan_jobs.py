@@ -77,7 +77,7 @@ def _camera(rng: np.random.Generator) -> tuple[Sensor, npt.NDArray[Any], Float64
     true = rng.uniform(29.0, 33.0) + _surface(rng, columns, 13.0)
     dim = 1.0 - rng.uniform(0.0, 0.5) * np.sin(np.arange(columns) / rng.uniform(10.0, 100.0)) ** 2  # of the reflectance
     place = true + speckle * rng.standard_normal(true.shape)
-    line: Any = pixel_gaussian(np.arange(_ROWS)[:, None], np.asarray(place[:, None, :]), sigma, 1.0, 0.0)  # type: ignore[arg-type]
+    line = pixel_gaussian(np.arange(_ROWS)[:, None], place[:, None, :], sigma, 1.0, 0.0)
     light = _BACKGROUND + peak * dim * line
     noisy = rng.poisson(light / gain) * gain + read_noise * rng.standard_normal(light.shape)
     given: Any = sensor.readout

@@ -390,7 +390,7 @@ def _warnings(geometry: SensorGeometry, lines: Sequence[LineImage]) -> list[str]
         )
     if not sheet.converged:
         warnings.append(
-            "the fit of the sheet stopped before it converged; its uncertainties are those of its last step"
+            "the fit of the sheet stopped before it converged; its uncertainties are computed at the last iteration"
         )
     if transport is None:
         warnings.append(

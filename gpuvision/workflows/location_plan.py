@@ -24,7 +24,7 @@ FEATURES_FILE = "features.toml"
 
 @dataclass(frozen=True, kw_only=True)
 class LocationPlanLimits(AccuracyLimits):
-    """Limits of `gpuvision.workflows.planning_location.plan_location`, with those of `AccuracyLimits`.
+    """Limits of `gpuvision.workflows.planning_location.plan_location`; extends `AccuracyLimits`.
 
     The ``margin`` covers the scatter of 128 poses in two directions, which has a standard deviation of 4.4 %.
 

@@ -28,7 +28,7 @@ loop: vision and servo in runs without images; images: vision and servo in rende
 
 @dataclass(frozen=True, kw_only=True)
 class PlacementPlanLimits(AccuracyLimits):
-    """Limits of `gpuvision.workflows.planning_placement.plan_placement_settings`, with those of `AccuracyLimits`.
+    """Limits of `gpuvision.workflows.planning_placement.plan_placement_settings`; extends `AccuracyLimits`.
 
     Attributes
     ----------

@@ -191,7 +191,10 @@ class PlacementSettings:
         return tolerance.plant_gain >= self._limits.plant_gain and tolerance.longer_delay >= longer
 
     def _planned(self, machine: Machine, budget: int, wide: PlacementPlan | None = None) -> PlacementPlan | None:
-        """Return the features for a machine, None if they are refused; `wide`: those of a larger release tolerance."""
+        """Return the plan of features for a machine; None if no features suffice.
+
+        ``wide`` is the plan for a larger release tolerance. It is returned if it is precise enough.
+        """
         if wide is not None and wide.landing is None and _is_precise(wide, machine):
             return wide
         imaging = tracking_imaging(machine)

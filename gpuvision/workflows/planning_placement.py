@@ -41,8 +41,9 @@ _TRIED = 24  # settings that run without images: the best by theory (chosen: a f
 # Least ratio of the error in images to the predicted one (measured: 0.4 where few rulers have most of the sampling).
 _LEAST = 0.4
 _CHECKED = 6  # settings that run with images before a refusal (chosen: a few seconds)
-# Standard errors by which the error in images limits the predicted one. Chosen for six tries of 24 placements; a true
-# error is larger in 1.5 % of the tries with normal errors in one direction (simulated).
+# The predicted error is at most the error in images plus this number of its standard errors. Chosen: up to six settings
+# run, with 24 placements each. The true error exceeds that limit in 1.5 % of the runs (simulated, normal errors in one
+# direction).
 _SURE = 3.0
 _NO_RELEASE = (
     "no setting releases the part in each run; raise tolerance.max_time, or give a more precise camera or axes that "
@@ -287,7 +288,7 @@ def rehearse(setting: Setting, part_radius: float, runs: int) -> PlacementTrial:
     fixed, vision = setting.fixed, setting.vision
     try:
         check_resonances(machine)
-        if machine.settling.rule == "vibration":  # each loop swings with its own frequencies
+        if machine.settling.rule == "vibration":  # the frequencies depend on the control loop
             machine = identify_vibration(machine, plan)
     except ValueError:  # a resonance swings up
         return PlacementTrial(machine, setting.budget, plan, math.nan, math.nan, fixed, vision, math.nan, math.nan, 1.0)

@@ -97,16 +97,17 @@ def plan_simulation(
 
     Notes
     -----
-    The noiseless readings of each setting are compared with those of a reference: the range error is the distance of
-    the readings on the sensor times the derivative dH/du of the height. The reference has the finest options, but the
-    diffuse light of four times the rays, spread as `ViewRays` says. The error of the reference is part of the error of
-    every setting. It is estimated from the change by the last refinement; that of the rays per bin, which is often the
-    largest, as `Combinations.ray_error` says. Estimates add up as squares, except the change and the error of the
-    reference's rays, which may have the same sign. Proven bounds add up linearly: that of clustered pairs, and that of
-    multi-bounce light, which is left out for a PSD if its bound in the sample is a tenth of the tolerance or less. The
-    mean square error over the profiles is raised by twice its standard error. The chosen setting is compared with the
-    reference on other profiles, with all light computed as the simulation does; a
-    setting whose error there exceeds the tolerance, or that reads other lines there, is not chosen. Not covered:
+    The noiseless readings of each setting are compared with the readings of a reference. The range error is the
+    distance of the readings on the sensor times the derivative dH/du of the height. The reference has the finest
+    options, and diffuse light with four times as many rays, which are spread (see `ViewRays`). The error of the
+    reference is added to the error of every setting. It is estimated from the change by the last refinement. The error
+    of its rays per bin is often the largest part; `Combinations.ray_error` estimates it. Estimates add up as squares.
+    The change and the error of the reference's rays may have the same sign, and add up linearly.
+    Proven bounds add up linearly: the bound of clustered pairs, and the bound of multi-bounce light, which is left out
+    for a PSD if this bound in the sample is a tenth of the tolerance or less. The mean square error over the profiles
+    is raised by twice its standard error. The chosen setting is compared with the reference on other profiles, with all
+    light computed as the simulation does; a setting whose error there exceeds the tolerance, or that reads other lines
+    there, is not chosen. Not covered:
     samples that are flagged as ambiguous, light paths that are not in ``paths`` or not modelled, and edges that no
     sampled profile meets.
     """
@@ -278,7 +279,7 @@ class Combinations:
         found = dict(self._options.proven)
         for name, part, factor in (
             ("sub_sheets", "slabs", 1.0),
-            # From a quarter of the rays. Measured on four parts: 0.26 to 0.33 of the change.
+            # From a quarter of the rays. Measured on four parts: 0.19 to 0.30 of the change.
             ("nodes", "nodes of multi-bounce light", 0.5),
             ("patch_size", "patches", 1.0),
         ):

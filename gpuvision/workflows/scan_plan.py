@@ -22,7 +22,7 @@ _LEGEND = """errors of the heights in um; other: scatter that the noise does not
 
 @dataclass(frozen=True, kw_only=True)
 class ScanPlanLimits(AccuracyLimits):
-    """Limits of `plan_scan`, with those of `gpuvision.accuracy.plan.AccuracyLimits`.
+    """Limits of `plan_scan`; extends `gpuvision.accuracy.plan.AccuracyLimits`.
 
     Attributes
     ----------

@@ -22,7 +22,7 @@ finest: error of the reference, estimate; signal: change of the signal; moved: s
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationPlanLimits(AccuracyLimits):
-    """Limits of `gpuvision.workflows.planning_simulation.plan_simulation`, with those of `AccuracyLimits`.
+    """Limits of `gpuvision.workflows.planning_simulation.plan_simulation`; extends `AccuracyLimits`.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class SimulationPlanLimits(AccuracyLimits):
         Number of profiles on which settings are tried, 2 or more. Default 6.
     checked : int
         Number of other profiles on which the chosen setting is checked, 1 or more. Default 12: with 4, profiles whose
-        sheet grazes an edge were missed (in one of 35 plans the true error was 3.3 tolerances).
+        sheet grazes an edge were missed (in one of 18 plans the true error was 3.3 tolerances).
     """
 
     max_moved: float = 0.005

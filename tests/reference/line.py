@@ -212,9 +212,9 @@ def fir(x: Float64, at: int, window: int, half: int) -> tuple[float, int]:
     return float(np.mean(nearest)), 0
 
 
-def pixel_gaussian(k: ArrayLike, place: float, sigma: float, amplitude: float, background: float) -> Float64:
+def pixel_gaussian(k: ArrayLike, place: ArrayLike, sigma: float, amplitude: float, background: float) -> Float64:
     """Return the light of a Gaussian line in each pixel ``k``, integrated over the pixel."""
-    k = np.asarray(k)
+    k, place = np.asarray(k), np.asarray(place)
     low, high = ((k + half - place) / (sigma * np.sqrt(2.0)) for half in (-0.5, 0.5))
     return np.asarray(background + amplitude * sigma * np.sqrt(np.pi / 2.0) * (special.erf(high) - special.erf(low)))
 

@@ -1,6 +1,7 @@
 """Line readout compared with Numba (forms of `line_peers`) and with NumPy: position, total and status.
 
-The frames have 512 rows, 1024 columns and 8 bits; the line moves over half the height of the frame.
+The frames have 512 rows, 1024 columns and 8 bits; the line moves over half the height of the frame. A single frame is
+read in an inline queue, which runs in the thread of the caller.
 """
 
 from __future__ import annotations
@@ -232,7 +233,8 @@ def _fused_case(device: Device, method: Method, count: int, name: str, distortio
     )
     settings = {**_SETTINGS, "outputs": (*OUTPUTS, "g", "h")}
     alone, frames = _bound(device, LineReadout(method=method, **_SETTINGS), line_frames(count))
-    fused = LineReadout(method=method, triangulation=sheet, **settings).bind(device, frames.shape, frames.dtype)
+    fusing = LineReadout(method=method, triangulation=sheet, **settings)
+    fused = fusing.bind(device, frames.shape, frames.dtype, queue=alone.queue)
     shared = alone.inputs[0]
     fused(shared).wait()
     expected = sheet(
@@ -248,7 +250,7 @@ def _sigma_case(device: Device, method: Method, count: int) -> Case:
     settings: dict[str, Any] = {**_SETTINGS, "method": method, "gain": GAIN, "read_noise": 3.0}
     alone, frames = _bound(device, LineReadout(**settings), line_frames(count))
     with_sigma = {**settings, "outputs": (*OUTPUTS, "sigma")}
-    predicting = LineReadout(**with_sigma).bind(device, frames.shape, frames.dtype)
+    predicting = LineReadout(**with_sigma).bind(device, frames.shape, frames.dtype, queue=alone.queue)
     shared = alone.inputs[0]
     predicting(shared).wait()
     expected = LineReadout(**with_sigma, precision="double")(frames[:_DISTINCT], device=device).sigma
@@ -259,7 +261,8 @@ def _sigma_case(device: Device, method: Method, count: int) -> Case:
 
 def _bound(device: Device, readout: LineReadout, frames: Frames) -> tuple[Any, Frames]:
     """Return the bound readout with the frames in its input, and the frames in host memory for the peers."""
-    bound = readout.bind(device, frames.shape, frames.dtype)
+    queue = device.new_queue(inline=True) if len(frames) == 1 else None
+    bound = readout.bind(device, frames.shape, frames.dtype, queue=queue)
     if device.shares_memory:
         host_view(bound.inputs[0])[...] = frames
         frames = host_view(bound.inputs[0])

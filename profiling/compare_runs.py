@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from gpuvision.host.errors import ReadError
-from gpuvision.profiling.harness import Row, Run
+from gpuvision.profiling.run import Row, Run
 from gpuvision.profiling.stored_run import read_run
 
 _AGREEING = 0.9  # smallest share of agreeing rows

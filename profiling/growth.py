@@ -32,8 +32,10 @@ from gpuvision.profiling import (
     triangulation,
     undistort_points,
 )
-from gpuvision.profiling.harness import Failure, Probe, bind_with, describe_machine, failure_of, probe_of
+from gpuvision.profiling.harness import bind_with, failure_of, probe_of
+from gpuvision.profiling.machine import describe_machine
 from gpuvision.profiling.rounds import median_interval, take_turns
+from gpuvision.profiling.run import Failure, Probe
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.merge_heights import MergeHeights
 from gpuvision.ranging.psd import PsdReadout
@@ -269,7 +271,7 @@ class Growth:
     caches
         Last-level cache by the label of the device, at least 32 MiB: see `Device.cache_bytes` [bytes].
     machine
-        Description of the machine, see `harness.describe_machine`.
+        Description of the machine, see `machine.describe_machine`.
     failures
         Operations without points, because their measurement raised an exception.
     """

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import jinja2
 
 from gpuvision.host.outputs import Outputs
-from gpuvision.profiling.harness import Row, Run
 from gpuvision.profiling.page_figures import page_figures
+from gpuvision.profiling.run import Row, Run
 
 PAGE_FILE = "profile.html"
 """Name of the file that `write_page` writes."""

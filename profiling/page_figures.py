@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 
 from gpuvision.plots.figure import new_figure
-from gpuvision.profiling.harness import Probe, Row, Run
 from gpuvision.profiling.plots import figures_of
+from gpuvision.profiling.run import Probe, Row, Run
 
 _WIDTH = 8.0  # [in]
 _ROW_HEIGHT = 0.21  # of a line of a strip chart [in]

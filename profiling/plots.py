@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from gpuvision.host.outputs import Outputs
 from gpuvision.plots.figure import new_figure, write_png
-from gpuvision.profiling.harness import Row
 from gpuvision.profiling.roofline import draw_roofline
+from gpuvision.profiling.run import Row
 
 _SIZE = (8.0, 3.6)  # [in]
 _ROOFLINE_SIZE = (8.0, 6.4)  # its legends have a line for each operation
@@ -33,7 +33,7 @@ def draw_plots(
     ``growth.png``: times of the cases ``growth/...`` over the amount of work, relative to the case ``base`` of their
     metadata. ``tolerance.png``: times and errors over the tolerance, of the cases that have one in their metadata.
     ``roofline.png``: rates of the cases that declare operations and traffic, below the limits of the devices in the
-    description of the machine (`harness.describe_machine`).
+    description of the machine (`machine.describe_machine`).
     With `overwrite` they may replace files that no earlier profile wrote.
     """
     figures = figures_of(rows, machine)

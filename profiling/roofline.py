@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gpuvision.profiling.harness import Row
+from gpuvision.profiling.run import Row
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _MARKS = "osD^v"  # of the first six points, of the next six, ...

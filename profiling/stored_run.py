@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from gpuvision.host.errors import ReadError
 from gpuvision.host.reading import reading
-from gpuvision.profiling.harness import Failure, Probe, Row, Run
+from gpuvision.profiling.run import Failure, Probe, Row, Run
 
 T = TypeVar("T", Row, Failure, Probe)
 

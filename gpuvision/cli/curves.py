@@ -71,7 +71,7 @@ def curves(
         return
     from gpuvision.host.outputs import Outputs
     from gpuvision.profiling.curves import curve, plot
-    from gpuvision.profiling.harness import describe_machine
+    from gpuvision.profiling.machine import describe_machine
 
     outputs = Outputs("curves", overwrite=overwrite)
     outputs.claim(as_json)

@@ -17,7 +17,7 @@ def measure_stability(
 ) -> None:
     """Measure the maps, print a line for each one, and draw them."""
     from gpuvision.host.outputs import Outputs
-    from gpuvision.profiling.harness import describe_machine
+    from gpuvision.profiling.machine import describe_machine
     from gpuvision.profiling.maps import picture, stability
 
     outputs = Outputs("curves", overwrite=overwrite)

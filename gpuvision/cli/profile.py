@@ -23,7 +23,7 @@ from gpuvision.host.errors import GpuVisionError
 
 if TYPE_CHECKING:
     from gpuvision.host.outputs import Outputs
-    from gpuvision.profiling.harness import Row, Run
+    from gpuvision.profiling.run import Row, Run
 
 _SECONDS, _QUICK_SECONDS = 2.0, 0.3  # longest time to measure a case [s]
 _MINUTES, _QUICK_MINUTES = 20.0, 3.0

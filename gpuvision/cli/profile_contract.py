@@ -22,6 +22,7 @@ def profile_contract(names: Sequence[str], labels: Sequence[str], as_json: Path 
     from gpuvision.host.outputs import Outputs
     from gpuvision.profiling import harness
     from gpuvision.profiling.contract.agreement import check
+    from gpuvision.profiling.machine import describe_machine
 
     outputs = Outputs("profile", overwrite=overwrite)
     outputs.claim(as_json)
@@ -32,7 +33,7 @@ def profile_contract(names: Sequence[str], labels: Sequence[str], as_json: Path 
     chosen = [each for each, benchmark in harness.MEASURED.items() if benchmark in (names or known)]
     devices = devices_of(labels)
     found = check(chosen, devices, progress=lambda line: echo(line, err=True))
-    report = {"machine": harness.describe_machine(devices), **found.to_dict()}
+    report = {"machine": describe_machine(devices), **found.to_dict()}
     write_report(as_json, report, outputs)
     if not prints_report(as_json):
         _show(found.comparisons)

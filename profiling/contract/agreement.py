@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from gpuvision.host import Device, Operation, to_numpy
 from gpuvision.profiling import harness
+from gpuvision.profiling.run import Failure
 
 REFERENCE = "float64"
 """Name of the reference in the place of a device."""
@@ -166,7 +167,7 @@ class Agreement:
     """
 
     comparisons: Sequence[Comparison]
-    failures: Sequence[harness.Failure]
+    failures: Sequence[Failure]
     without: Sequence[str]
 
     @property
@@ -218,7 +219,7 @@ def check(
     """
     modules = {operation: module_of(operation) for operation in operations}
     comparisons: list[Comparison] = []
-    failures: list[harness.Failure] = []
+    failures: list[Failure] = []
     for operation, module in modules.items():
         for case in () if module is None else cases_of(operation, module):
             progress(f"{operation}: {case.name}")
@@ -232,9 +233,7 @@ def cases_of(operation: str, module: Any) -> Iterator[Case]:
     return (case for case in module.cases() if case.operation == operation)
 
 
-def _run(
-    case: Case, devices: Sequence[Device], failures: list[harness.Failure]
-) -> dict[str, dict[str, npt.NDArray[Any]]]:
+def _run(case: Case, devices: Sequence[Device], failures: list[Failure]) -> dict[str, dict[str, npt.NDArray[Any]]]:
     """Return the outputs by device; a device that raises an exception is added to the failures."""
     results = {}
     for device in devices:

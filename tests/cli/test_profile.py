@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from gpuvision.cli.main import application
 from gpuvision.host import Device, GpuVisionError, NoDeviceError
 from gpuvision.profiling import harness
-from gpuvision.profiling.harness import Failure, Probe, Row, Run
+from gpuvision.profiling.run import Failure, Probe, Row, Run
 
 ROW = Row(
     operation="psd",

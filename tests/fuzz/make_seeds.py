@@ -20,7 +20,7 @@ from gpuvision.formats.camera_file import write_lens
 from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
 from gpuvision.host.outputs import MANIFEST
 from gpuvision.host.tuned_settings import TunedEntry, TunedSettings
-from gpuvision.profiling.harness import Probe, Row, Run
+from gpuvision.profiling.run import Probe, Row, Run
 from gpuvision.ranging.height_map import Grid
 
 _HEAD = "%FSLAX46Y46*%\n%MOMM*%\n%TF.FileFunction,Copper,L1,Top*%\n%LPD*%\nG01*\n"

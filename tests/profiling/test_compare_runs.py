@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gpuvision.profiling import compare_runs
-from gpuvision.profiling.harness import Row, Run
+from gpuvision.profiling.run import Row, Run
 
 
 def run(*rows: Row, valid: bool = True) -> Run:

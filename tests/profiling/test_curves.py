@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from gpuvision.cli import curves as command
 from gpuvision.cli.main import application
 from gpuvision.host.errors import GpuVisionError
-from gpuvision.profiling import curves, harness
+from gpuvision.profiling import curves, machine
 from gpuvision.profiling.curves import (
     board_image,
     curve,
@@ -233,7 +233,7 @@ def test_the_command_shows_or_prints_what_was_measured(written, tmp_path, monkey
         return points_of(SETTINGS)
 
     monkeypatch.setattr(curve, "measure_curves", measure)
-    monkeypatch.setattr(harness, "describe_machine", lambda devices: {"devices": devices})
+    monkeypatch.setattr(machine, "describe_machine", lambda devices: {"devices": devices})
     monkeypatch.setattr(command, "devices_of", lambda labels: labels or ["all"])
     monkeypatch.setattr(plot, "write_png", lambda figure, path: path.touch())
     plots = tmp_path / "plots"

@@ -16,8 +16,9 @@ from typer.testing import CliRunner
 
 from gpuvision.cli import profile_growth
 from gpuvision.cli.main import application
-from gpuvision.profiling import growth, growth_plot, harness
+from gpuvision.profiling import growth, growth_plot
 from gpuvision.profiling.growth_plot import draw_growth
+from gpuvision.profiling.run import Failure, Probe
 
 
 def curve(*times: float, each: int = 16) -> list[growth.Point]:
@@ -167,8 +168,8 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         calls.update(operations=operations, devices=devices, memory=memory)
         return calls["growth"]
 
-    probes = [harness.Probe("psd", "pocl", 1.0, 1.0, True), harness.Probe("line", "pocl", 1.0, 0.5, False)]
-    failures = [harness.Failure("pose", "pocl", "no memory", "")]
+    probes = [Probe("psd", "pocl", 1.0, 1.0, True), Probe("line", "pocl", 1.0, 0.5, False)]
+    failures = [Failure("pose", "pocl", "no memory", "")]
     calls["growth"] = growth.Growth(curve(1.0, 4.0), probes, {"pocl": 160}, {}, failures)
     monkeypatch.setattr(growth, "measure_growth", measure)
     monkeypatch.setattr(profile_growth, "devices_of", lambda labels: list(labels))

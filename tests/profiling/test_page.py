@@ -21,8 +21,8 @@ from typer.testing import CliRunner
 from gpuvision.cli.main import application
 from gpuvision.host.errors import ReadError
 from gpuvision.profiling import harness
-from gpuvision.profiling.harness import Failure, Probe, Row, Run
 from gpuvision.profiling.page import digits, duration, page, summaries, write_page
+from gpuvision.profiling.run import Failure, Probe, Row, Run
 from gpuvision.profiling.stored_run import read_run
 
 RESULTS = Path(__file__).resolve().parents[2] / "profiling" / "results"

@@ -3,8 +3,8 @@ from __future__ import annotations
 import cv2
 from matplotlib.figure import Figure
 
-from gpuvision.profiling.harness import Row
 from gpuvision.profiling.plots import draw_plots
+from gpuvision.profiling.run import Row
 
 
 def row(case: str, seconds: float, **metadata: object) -> Row:

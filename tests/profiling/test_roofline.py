@@ -9,9 +9,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from gpuvision.profiling import ceiling
-from gpuvision.profiling.harness import Row
 from gpuvision.profiling.plots import draw_plots
 from gpuvision.profiling.roofline import points, roof, share
+from gpuvision.profiling.run import Row
 
 DEVICES = {"pocl": {"gflops": 100.0, "bandwidths": {str(1 << 20): 50e9, str(192 << 20): 10e9}}}
 

@@ -44,19 +44,33 @@ def expected(pairs):
     return (right - left) / (right + left)
 
 
-def test_numpy_goes_in_and_comes_out(memory, pairs):
+# A call of 1000 samples copies its arrays, a call of 40 000 samples reads and writes them in place on PoCL.
+@pytest.mark.parametrize("count", [1000, 40_000])
+def test_numpy_goes_in_and_comes_out(memory, rng, count):
+    pairs = rng.uniform(0.1, 1.0, (count, 2)).astype(np.float32)
     position = READOUT(pairs, device=memory).position
     assert isinstance(position, np.ndarray)
     np.testing.assert_allclose(position, expected(pairs), atol=5e-7)
 
 
-def test_out_is_written_and_returned(memory, pairs):
+@pytest.mark.parametrize("count", [1000, 40_000])
+def test_out_is_written_and_returned(memory, rng, count):
+    pairs = rng.uniform(0.1, 1.0, (count, 2)).astype(np.float32)
     first = READOUT(pairs, device=memory)
     addresses = [array.ctypes.data for array in first if array is not None]
     again = READOUT(pairs[::-1].copy(), device=memory, out=first)
     assert again is first
     assert [array.ctypes.data for array in again if array is not None] == addresses
     np.testing.assert_allclose(again.position, expected(pairs[::-1]), atol=5e-7)
+
+
+def test_numpy_arrays_leave_the_inputs_of_the_caller(device, pairs):
+    """Where memory is shared: elsewhere NumPy arrays go through the inputs of the instance."""
+    given = device.empty(pairs.shape, pairs.dtype)
+    given.set(pairs)
+    bound = READOUT.bind(device, pairs.shape, pairs.dtype, inputs=(given,))
+    np.testing.assert_allclose(bound.on_host([pairs[::-1].copy()]).position, expected(pairs[::-1]), atol=5e-7)
+    assert np.array_equal(given.get(), pairs) == device.shares_memory
 
 
 def test_a_read_only_input_is_fine(memory, pairs):

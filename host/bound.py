@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import functools
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, NoReturn, TypeVar
@@ -32,11 +33,11 @@ _SHORT_BYTES = 1 << 20
 # (`Bound.run`). A caller that does not wait gives them to the workers, which run beside it. Measured on two cores for a
 # PSD readout that moves 130 kB: 4 us in the calling thread, 5.5 us by the workers; about equal for 500 kB.
 _SHORT_RUN_BYTES = 512 << 10
-# Calls that move fewer bytes copy NumPy arrays to and from the arrays of the instance. Others read and write them in
-# place, but not with Intel's runtime, which takes long to map memory of the host. Measured on two cores beside other
-# work, in place and copied, for PSD readouts that move 0.17, 0.5, 1.7 and 17 MB: 33 and 22, 38 and 32, 101 and 110,
-# 340 and 800 us with PoCL; 85 and 25, 165 and 35, 470 and 80, 4200 and 1000 us with Intel's runtime.
-_COPIED_BYTES = 256 << 10
+# Calls copy NumPy arrays of this size or less to and from the arrays of the instance, and read and write others in
+# place; with Intel's runtime, which takes long to map memory of the host, they copy all. Measured on two cores beside
+# other work, all arrays in place and all copied, for PSD readouts that move 0.17, 0.5, 1.7 and 17 MB: 33 and 22, 38 and
+# 32, 101 and 110, 340 and 800 us with PoCL; 85 and 25, 165 and 35, 470 and 80, 4200 and 1000 us with Intel's runtime.
+_COPIED_BYTES = 64 << 10
 # Limit for launches whose tuned settings ask for the calling thread (`Launch.inline`). Chosen: half the bytes of the
 # default batch of a stream, because the host work of a stream should overlap with the kernels.
 MAX_INLINE_BYTES = 2 << 20
@@ -105,8 +106,8 @@ class Bound(Generic[R]):
         self._places = [*range(len(launch.inputs)), *(place for place, spec in after_inputs if spec is not None)]
         self._own_outputs = self._computed(self.outputs)
         self._own = (*self.inputs, *self._own_outputs)
-        # Arrays of the caller keep their values.
-        self._copies_arrays = not inputs and (device.kind == "intel" or launch.nbytes <= _COPIED_BYTES)
+        # Largest NumPy array that calls copy [bytes]; none, where `inputs` are arrays of the caller.
+        self._copied_bytes = 0 if inputs else sys.maxsize if device.kind == "intel" else _COPIED_BYTES
         self._array_specs = (*launch.inputs, *self._computed_specs.values())
         self._inline_site: _Site | None = None
         self._calls_inline = False  # whether a call that does not wait uses the inline site
@@ -304,49 +305,51 @@ class Bound(Generic[R]):
         if self._empty:
             return out
         try:
-            if not self.device.shares_memory:
-                self._run_with_copies(frames, targets)
-            elif self._copies_arrays:
-                self._run_copied(frames, targets)
+            if self.device.shares_memory:
+                self._run_shared(frames, targets)
             else:
-                self._run_in_place(frames, targets)
+                self._run_with_copies(frames, targets)
         except cl.Error as error:
             self._raise(error)
         return out
 
-    def _run_copied(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
-        """Copy to the inputs in shared memory, run, wait, and copy from the outputs."""
+    def _run_shared(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> Any:
+        """Run in shared memory, wait, and return the event of the kernel: large arrays in place, others copied."""
+        site, count = self._run_site, len(frames)
         self.queue.finish()  # an earlier call may still read the inputs
+        if site.given is not self._own:
+            self._set_arrays(site, self._own)
         for array, frame in zip(self.inputs, frames, strict=True):
-            if frame.size:
+            if 0 < frame.nbytes <= self._copied_bytes:
                 host_view(array)[...] = frame
-        self.run()
-        for array, target in zip(self._computed(self.outputs), targets, strict=True):
-            if target.size:
-                target[...] = host_view(array)
-
-    def _run_in_place(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> Any:
-        """Run in the memory of the arrays, wait, and return the event of the kernel."""
-        flags, context = cl.mem_flags, self.device.context
-        read = [cl.Buffer(context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in frames]
-        write = [cl.Buffer(context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in targets]
-        site = self._run_site
-        if site is self._inline_site:
-            self._finish_queue()
-        site.given = (None,) * len(self._own)
-        for index, memory in zip(self._places, (*read, *write), strict=True):
-            site.kernel.set_arg(index, memory)
+        memory = {
+            number: self._buffer_in_place(array, is_input=number < count)
+            for number, array in enumerate((*frames, *targets))
+            if array.nbytes > self._copied_bytes
+        }
+        site.given = tuple([None if number in memory else array for number, array in enumerate(self._own)])
+        for number, buffer in memory.items():
+            site.kernel.set_arg(self._places[number], buffer)
         event = cl.enqueue_nd_range_kernel(*site.arguments)
-        for memory, array in zip(write, targets, strict=True):
-            # Mapping makes the kernel's writes visible to the host; the address stays the same.
-            mapped, _ = cl.enqueue_map_buffer(
-                site.queue, memory, cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=False
-            )
-            mapped.base.release(site.queue)
+        for number, array in enumerate(targets, count):
+            if number in memory:
+                # Mapping makes the kernel's writes visible to the host; the address stays the same.
+                mapped, _ = cl.enqueue_map_buffer(
+                    site.queue, memory[number], cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=False
+                )
+                mapped.base.release(site.queue)
         site.queue.finish()
         # Replace the temporary buffers before they are freed: kernel arguments must never dangle.
         self._set_arrays(site, self._own)
+        for array, target in zip(self._own_outputs, targets, strict=True):
+            if 0 < target.nbytes <= self._copied_bytes:
+                target[...] = host_view(array)
         return event
+
+    def _buffer_in_place(self, array: HostArray, *, is_input: bool) -> Any:
+        flags = cl.mem_flags
+        access = flags.READ_ONLY if is_input else flags.WRITE_ONLY
+        return cl.Buffer(self.device.context, access | flags.USE_HOST_PTR, hostbuf=array)
 
     def _run_with_copies(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
         self._upload_frames(frames)

@@ -14,7 +14,7 @@ import numpy as np
 import pyopencl as cl
 
 from gpuvision.host import stages
-from gpuvision.host.arrays import DeviceArray, HostArray
+from gpuvision.host.arrays import DeviceArray, HostArray, host_view
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
 from gpuvision.host.launch import Spec, Specs, check_shape, nbytes_of
@@ -132,7 +132,6 @@ class BoundSequence(Bound[R]):
         self.operation, self.device = operation, device
         self.queue = device.queue if queue is None else queue
         self._empty = False
-        self._copies_arrays = True  # stages keep the arrays to which they are bound
         self._layout = layout
         self._set_specs(specs.inputs, specs.outputs)
         self.inputs = tuple(inputs) or self._new_inputs(specs.inputs)
@@ -198,6 +197,16 @@ class BoundSequence(Bound[R]):
         except cl.Error as error:
             self._raise(error)
         return self.outputs if out is None else out
+
+    def _run_shared(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> Any:
+        """Copy to the inputs, run, and copy from the outputs: stages keep the arrays to which they are bound."""
+        for array, frame in zip(self.inputs, frames, strict=True):
+            host_view(array)[...] = frame
+        event = self()
+        self.device.wait(event)
+        for array, target in zip(self._computed(self.outputs), targets, strict=True):
+            target[...] = host_view(array)
+        return event
 
 
 class TracedSequence(BoundSequence[R]):

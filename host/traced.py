@@ -43,9 +43,9 @@ class TracedBound(Bound[R]):
         with stage("run", _name(self)):
             return super().on_host(frames, out)
 
-    def _run_in_place(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> Any:
+    def _run_shared(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> Any:
         before = time.perf_counter_ns()
-        event = super()._run_in_place(frames, targets)
+        event = super()._run_shared(frames, targets)
         self._record("launch and wait", "compute", [event], before)
         return event
 

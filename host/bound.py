@@ -319,9 +319,9 @@ class Bound(Generic[R]):
         self.queue.finish()  # an earlier call may still read the inputs
         if site.given is not self._own:
             self._set_arrays(site, self._own)
-        for array, frame in zip(self.inputs, frames, strict=True):
+        for own, frame in zip(self.inputs, frames, strict=True):
             if 0 < frame.nbytes <= self._copied_bytes:
-                host_view(array)[...] = frame
+                host_view(own)[...] = frame
         memory = {
             number: self._buffer_in_place(array, is_input=number < count)
             for number, array in enumerate((*frames, *targets))
@@ -341,9 +341,9 @@ class Bound(Generic[R]):
         site.queue.finish()
         # Replace the temporary buffers before they are freed: kernel arguments must never dangle.
         self._set_arrays(site, self._own)
-        for array, target in zip(self._own_outputs, targets, strict=True):
+        for own, target in zip(self._own_outputs, targets, strict=True):
             if 0 < target.nbytes <= self._copied_bytes:
-                target[...] = host_view(array)
+                target[...] = host_view(own)
         return event
 
     def _buffer_in_place(self, array: HostArray, *, is_input: bool) -> Any:

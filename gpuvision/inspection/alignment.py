@@ -25,8 +25,8 @@ _MOST_COARSE = 1024  # coarse cells along a side. Chosen: a correlation takes 0.
 _BACKGROUND = 5.0  # width of the median filter that finds the board, in aperture sizes
 _MOST_FITTED = 200  # apertures of the least-squares fit. Chosen: they determine the place to a tenth of one offset
 _ROUNDS = 6  # of the least-squares fit
-_CONVERGED = 1e-8  # shift of a round [m]
-_CONVERGED_SIGMAS = 0.1  # or [standard deviations]. Derived: it adds 0.5 % to the root-mean-square error
+_CONVERGED = 1e-8  # motion of a deposit in a round [m]
+_CONVERGED_SIGMAS = 0.1  # or of the place [standard deviations]. Derived: it adds 0.5 % to the root-mean-square error
 _TUKEY = 4.685
 _SECOND_PEAK = 0.95  # a second place whose correlation reaches this share of the best one is as good. Chosen
 
@@ -52,7 +52,8 @@ class Alignment:
     second_correlation : float
         Correlation of the second best place, more than half an aperture away.
     converged : bool
-        Whether the last round of the fit moved the centre by at most a tenth of its standard deviation. Default True.
+        Whether the last round of the fit moved the place, shift and rotation together, by at most a tenth of its
+        standard deviation, or no deposit by more than 10 nm. Default True.
     """
 
     placement: BoardPlacement
@@ -133,14 +134,25 @@ def align_apertures(
 
 
 class _RigidFit(NamedTuple):
-    """Fitted place of a board, and the number of fitted deposits; see the attributes of `Alignment`."""
+    """Fitted place of a board, and the number of fitted deposits; see the attributes of `Alignment`.
+
+    ``motion`` (3,) is the shift of the centre [m] and the rotation [rad] by this round, ``moved`` [m] the largest
+    distance by which it moved a deposit.
+    """
 
     placement: BoardPlacement
     covariance: Float64
     residual_scale: float
     deposits: int
     centre: Float64
-    converged: bool = True
+    motion: Float64
+    moved: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether this round hardly moved the place; see `Alignment`."""
+        distance = float(self.motion @ np.linalg.pinv(self.covariance) @ self.motion)
+        return self.moved <= _CONVERGED or distance <= _CONVERGED_SIGMAS**2
 
 
 def _fit_deposits(
@@ -155,7 +167,6 @@ def _fit_deposits(
 
     The first round looks farther: the correlation is right to about a coarse cell.
     """
-    middle = np.mean([each.centroid for each in apertures], axis=0)
     fitted = list(apertures)[:: max(len(apertures) // _MOST_FITTED, 1)]
     rounds = [reach] + [settings.margin] * (_ROUNDS - 1)
     for margin in rounds:
@@ -163,12 +174,10 @@ def _fit_deposits(
             z, grid, fitted, placement, dataclasses.replace(settings, margin=margin), correlation_area=1.0
         )
         fit = _fit_rigid(found, placement)
-        before, placement = placement, fit.placement
-        moved = float(np.hypot(*(placement.to_map(middle) - before.to_map(middle))))
-        if margin == settings.margin and moved < _CONVERGED:
+        placement = fit.placement
+        if margin == settings.margin and fit.moved <= _CONVERGED:
             break
-    sigma = math.sqrt(float(np.trace(fit.covariance[:2, :2])))
-    return fit._replace(converged=moved <= max(_CONVERGED, _CONVERGED_SIGMAS * sigma))
+    return fit
 
 
 def _coarse_heights(z: Float64, grid: Grid, apertures: Sequence[Aperture]) -> tuple[Grid, Float64]:
@@ -310,4 +319,5 @@ def _fit_rigid(found: Deposits, placement: BoardPlacement) -> _RigidFit:
     coordinates = 2.0 * float(weights.sum())
     covariance = scale**2 * coordinates / (coordinates - 3.0) * np.linalg.pinv(normal)
     turned = dataclasses.replace(turned, x=float(moved[0]), y=float(moved[1]))
-    return _RigidFit(turned, covariance, scale, int(np.count_nonzero(weights > 0)), centre)
+    moved_by = float(np.max(np.hypot(*(design @ motion).T)))
+    return _RigidFit(turned, covariance, scale, int(np.count_nonzero(weights > 0)), centre, motion, moved_by)

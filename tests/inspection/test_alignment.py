@@ -112,6 +112,28 @@ def test_the_covariance_of_equal_residuals_has_a_closed_form(count):
     )
 
 
+@pytest.mark.parametrize(("part", "converged"), [(0.09, True), (0.11, False)])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_round_that_moves_the_place_by_a_tenth_of_a_sigma_has_not_converged(axis, part, converged):
+    """A shift along x or y, or a rotation about the centre, on the offsets of the last test."""
+    here, radius, length, count = BoardPlacement(x=0.0, y=0.0, theta=0.0), 1e-3, 3e-6, 12
+    angle = 2 * math.pi * np.arange(count) / count
+    outward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    apart = length * (-1.0) ** np.arange(count)[:, None] * outward
+    rest = _fit_rigid(SimpleNamespace(offset=apart, centre=radius * outward), here)
+    assert rest.converged
+    assert rest.moved < 1e-12
+    motion = np.zeros(3)
+    motion[axis] = part * math.sqrt(rest.covariance[axis, axis])
+    across = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
+    offset = apart + motion[:2] + motion[2] * radius * across
+    fit = _fit_rigid(SimpleNamespace(offset=offset, centre=radius * outward), here)
+    np.testing.assert_allclose(fit.motion, motion, atol=1e-3 * np.abs(motion).max())
+    assert fit.moved == pytest.approx(np.abs(motion * [1.0, 1.0, radius]).max(), rel=1e-3)
+    assert fit.moved > 1e-8
+    assert fit.converged == converged
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [4, 12])
 def test_the_covariance_of_few_deposits_is_their_variance(rng, count):
@@ -121,7 +143,7 @@ def test_the_covariance_of_few_deposits_is_their_variance(rng, count):
     centre = 1e-3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     errors, variances = [], []
     for _ in range(250):
-        found, covariance, _, _, middle, _ = _fit_rigid(
+        found, covariance, _, _, middle, *_ = _fit_rigid(
             SimpleNamespace(offset=rng.normal(0, 1e-6, (count, 2)), centre=centre), here
         )
         shift = found.to_map(middle) - middle

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.camera.magnification import largest_magnification
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.features.candidates import FeatureCandidates, find_ruler_candidates, pixel_hint
@@ -89,6 +90,32 @@ def find_features_in_view(
     fiducials = select_fiducials(artwork, view.bounds, placement, imaging, _MAX_FIDUCIALS)
     reach = fiducials.radius + search_distance(fiducials.point, placement, imaging)
     return rulers, fiducials.subset(view.contains(fiducials.point, reach / imaging.pixel))
+
+
+def features_in_view(features: FeatureSet, view: BoardView) -> FeatureSet:
+    """Return the features whose samples all lie in the image of a camera; others are not measured.
+
+    All rulers have the length of the longest one (`FeatureSet.ruler_length`). ``covariance``, ``condition`` and
+    ``region`` remain those of all features.
+
+    Parameters
+    ----------
+    features
+        Rulers and fiducials.
+    view
+        Camera over the board.
+    """
+    imaging = features.imaging
+    magnification = 1.0 if view.model is None else largest_magnification(view.model, view.shape)
+    samples = features.ruler_length(view.scale, imaging.blur_px, magnification=magnification)
+    along = features.normal * 0.5 * (samples - 1) * view.scale
+    across = along[:, ::-1] * [-1.0, 1.0] * (imaging.width_px - 1) / (samples - 1)
+    corners = [features.point + one * along + other * across for one in (-1.0, 1.0) for other in (-1.0, 1.0)]
+    seen = view.contains(np.stack(corners), 0.0).all(axis=0)
+    marks = features.fiducials
+    reach = marks.radius + search_distance(marks.point, features.placement, imaging)
+    rulers = {name: getattr(features, name)[seen] for name in ("point", "normal", "spacing", "length", "sigma")}
+    return replace(features, **rulers, fiducials=marks.subset(view.contains(marks.point, reach / view.scale)))
 
 
 def _windows(

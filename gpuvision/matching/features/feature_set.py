@@ -242,7 +242,7 @@ class FeatureSet:
             features=camera,
             ruler=RulerEdges(
                 per_ruler=True,
-                length=self._ruler_length(scale, blur, search_px, magnification),
+                length=self.ruler_length(scale, blur, search_px, magnification),
                 width=self.imaging.width_px,
                 smoothing_px=self.imaging.smoothing_ratio * blur,
                 **levels,
@@ -307,8 +307,18 @@ class FeatureSet:
             model=model,
         )
 
-    def _ruler_length(self, scale: float, blur_px: float, search_px: float | None, magnification: float) -> int:
-        """Return the number of samples of all rulers: a multiple of 16, so that few lengths are built."""
+    def ruler_length(
+        self, scale: float, blur_px: float, search_px: float | None = None, magnification: float = 1.0
+    ) -> int:
+        """Return the number of samples of all rulers: a multiple of 16, so that few lengths are built.
+
+        Parameters
+        ----------
+        scale, blur_px, search_px
+            As ``pixel_size``, ``blur_px`` and ``search_px`` of `bind`.
+        magnification : float
+            Largest magnification of the lens in the image. Default 1.
+        """
         smoothing = self.imaging.smoothing_ratio * blur_px
         if search_px is None:
             lengths = self.length / scale * magnification

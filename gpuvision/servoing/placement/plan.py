@@ -8,6 +8,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.artwork.board_reflectance import BoardReflectance
-from gpuvision.matching.board.view_features import select_features_in_view
+from gpuvision.matching.board.view_features import features_in_view, select_features_in_view
 from gpuvision.matching.features.exposure import sensor_imaging
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.fiducials import FiducialLimits
@@ -38,8 +39,15 @@ Float64 = npt.NDArray[np.float64]
 _THRESHOLD = 0.5
 # Largest distance of an edge from the coarse pose [px]: the default of `CoarseRegistration`.
 _TOLERANCE_PX = 1.0
+# Starts at which the features in view must determine the pose, as parts of the landing zone in x, y and theta (chosen):
+# its corners, the middles of its sides, and the target.
+_VIEWED = np.stack(np.meshgrid(*3 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(-1, 3)
 # Error of a predicted motion as a part of the motion (chosen): the plant's gain is calibrated far better.
 _MOTION_ERROR = 0.1
+_MIN_ROWS = 3  # as many as unknowns of a pose
+# Least eigenvalue of the information, scaled to a diagonal of 1, of rows that determine the pose (chosen):
+# `SolvePose.max_condition` is far above, rounding far below.
+_SINGULAR = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,8 +140,9 @@ def plan_placement(
     Raises
     ------
     ValueError
-        The machine is over the other side, the camera sees too few edges at the target, or the coarse registration is
-        ambiguous. The message names the nearest targets and the window that work, where there are any.
+        The machine is over the other side, the camera sees too few edges at the target or from a start in the landing
+        zone, or the coarse registration is ambiguous. The message names the nearest targets and the window that work,
+        where there are any.
 
     Notes
     -----
@@ -141,7 +150,8 @@ def plan_placement(
     is worse than the tolerance (3 standard deviations of a frame), a coarse registration finds the pose of the first
     frame and rulers with a search range of `tracking_imaging` follow it. The registration is tried on ideal images from
     the target and from four corners of the landing zone, see `refused_starts`: a repeated pattern, such as equal traces
-    at a pitch below twice the landing zone, makes it ambiguous.
+    at a pitch below twice the landing zone, makes it ambiguous. From 27 starts in the landing zone, its corners among
+    them, the camera must see enough features: from a corner it does not see those at the border of the window.
     """
     if machine.camera.mirrored != (artwork.side == "bottom"):
         raise ValueError(f"the artwork shows the {artwork.side} side; use machine.for_side({artwork.side!r})")
@@ -237,6 +247,7 @@ class _Guidance:
         view, machine = self.machine.camera.view(camera_pose), self.machine
         try:
             wide = self._select(view, placement_imaging(machine, self.reflectance))
+            self._check_views([camera_pose], wide)  # the rulers of the first frame are placed at the target
         except ValueError:
             wide = None
         if wide is not None and _is_precise(wide, camera_pose, machine):
@@ -255,6 +266,7 @@ class _Guidance:
         machine = self.machine
         view = machine.camera.view(camera_pose)
         features = self._select(view, tracking_imaging(machine, self.reflectance))
+        self._check_views(self._starts(camera_pose), features)
         landing = prepare_board_registration(
             self.artwork,
             view.matrix,
@@ -268,6 +280,26 @@ class _Guidance:
         if len(landing.rulers.point) < landing.limits.min_rulers:
             raise ValueError(f"{len(landing.rulers.point)} places on edges have room for the coarse registration")
         return features, landing
+
+    def _starts(self, camera_pose: Float64) -> Float64:
+        """Return poses (n, 3) of the camera at starts in the landing zone."""
+        calibrated, tolerance = self.machine.pipette_in_camera.pose, self.machine.tolerance
+        zone = np.array([tolerance.landing_zone] * 2 + [tolerance.landing_angle])
+        nozzle = compose_poses(camera_pose, calibrated) + zone * _VIEWED
+        return compose_poses(nozzle, invert_pose(calibrated))
+
+    def _check_views(self, poses: Iterable[Float64], features: FeatureSet) -> None:
+        """Raise a `ValueError` where the features that a camera at some poses (3,) sees do not determine the pose.
+
+        At the border of the landing zone the camera does not see all features of the target. If the pose depends on one
+        of the others alone, each frame is refused, and the head never moves.
+        """
+        seen = [features_in_view(features, self.machine.camera.view(each)) for each in poses]
+        blind = sum(_largest_leverage(each) > SolvePose.max_leverage for each in seen)
+        if blind:
+            raise ValueError(
+                f"the features in view of {blind} of {len(seen)} starts in the landing zone do not determine the pose"
+            )
 
     def _check(self, camera_pose: Float64, landing: CoarseRegistration) -> None:
         """Raise a `ValueError` where the registration refuses a start in the landing zone."""
@@ -347,8 +379,14 @@ def _sampling_and_reported(features: FeatureSet) -> tuple[Float64, Float64]:
 
 
 def _largest_leverage(features: FeatureSet) -> float:
-    """Return the largest leverage of a row, as `BoardPose.leverage`: 1 where an unknown depends on this row alone."""
+    """Return the largest leverage of a row, as `BoardPose.leverage`: 1 where an unknown depends on this row alone.
+
+    1, too, where the rows do not determine an unknown.
+    """
     rows, prior = _weighted_rows(features)
+    scale = np.sqrt(np.sum(rows**2, axis=0) + np.diag(prior))
+    if len(rows) < _MIN_ROWS or not np.linalg.eigvalsh((rows.T @ rows + prior) / np.outer(scale, scale))[0] > _SINGULAR:
+        return 1.0
     covariance = np.linalg.inv(rows.T @ rows + prior)
     return float(np.max(np.einsum("ij,jk,ik->i", rows, covariance, rows)))
 

@@ -11,7 +11,9 @@ import pytest
 
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.matching.board import view_features
+from gpuvision.matching.board.view_features import features_in_view
 from gpuvision.matching.features.candidates import FeatureCandidates
+from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.features.fiducials import Fiducials
 from gpuvision.matching.features.imaging import Imaging
 
@@ -99,6 +101,42 @@ def test_a_ruler_has_fewer_samples_than_the_longest(monkeypatch: pytest.MonkeyPa
     rulers, fiducials = view_features.find_features_in_view(artwork, view, IMAGING, PLACEMENT)
     assert len(fiducials.radius) == 0
     np.testing.assert_array_equal(rulers.length, length[:2])
+
+
+@pytest.mark.parametrize("turn", [0.0, np.pi / 2])
+def test_features_in_view_have_all_their_samples_in_the_image(turn: float) -> None:
+    """Rulers of 16 samples and 5 lines, and fiducials of 4 px with a search of 14.1 px, at the border of the image."""
+    pixel = 20e-6
+    imaging = Imaging(pixel=pixel, blur_px=0.5, smoothing_ratio=1.0, width_px=5, shift=10 * pixel, angle=0.0)
+    # The image spans -49.5 to 49.5 px about its centre.
+    along = [(41.99, 0.0), (42.01, 0.0), (0.0, 47.49), (0.0, 47.51), (-42.01, 0.0), (0.0, 0.0)]
+    marks = [(31.35, 0.0), (31.37, 0.0)]
+    c, s = np.cos(turn), np.sin(turn)
+    turned = np.array([[c, s], [-s, c]])
+    here = np.array([1e-3, 2e-3])
+    count = len(along)
+    found = FeatureSet(
+        side="top",
+        placement=here,
+        point=here + pixel * np.array(along) @ turned,
+        normal=np.tile(turned[0], (count, 1)),
+        spacing=np.zeros(count),
+        length=pixel * np.array([9.0, 9.0, 9.0, 9.0, 9.0, 15.9]),
+        sigma=np.arange(count) * 1e-6,
+        imaging=imaging,
+        covariance=np.eye(3),
+        condition=2.0,
+        region=np.zeros((2, 2)),
+        fiducials=Fiducials(
+            here + pixel * np.array(marks) @ turned, np.full(2, 4 * pixel), np.zeros(2), np.array([1e-6, 2e-6])
+        ),
+    )
+    view = BoardView(scale=pixel, shape=(100, 100), pose=(*here.tolist(), 0.0))
+    seen = features_in_view(found, view)
+    np.testing.assert_array_equal(seen.sigma, np.array([0.0, 2.0, 5.0]) * 1e-6)
+    np.testing.assert_array_equal(seen.point, found.point[[0, 2, 5]])
+    np.testing.assert_array_equal(seen.fiducials.sigma, [1e-6])
+    assert features_in_view(seen, view).point.shape == (3, 2)
 
 
 def test_many_edges_are_looked_for_in_five_windows() -> None:

@@ -26,6 +26,7 @@ from gpuvision.status import Status
 PRESET = read_machine("look_while_place")
 PIXEL = PRESET.camera.pixel
 PLACEMENT = np.array([3e-3, -2e-3])
+ROWS = ("point", "normal", "spacing", "length", "sigma")  # of the rulers of a feature set
 
 
 def features(etch_bias_sigma: float = 8e-6) -> FeatureSet:
@@ -181,6 +182,11 @@ class Guidance(plan._Guidance):
     def _near(self, camera_pose: Any) -> Any:
         return _outcome(NEAR), "landing"
 
+    def _check_views(self, poses: Any, features: Any) -> None:
+        np.testing.assert_array_equal(poses, np.zeros((1, 3)))  # at the target only
+        if features == "blind":
+            raise ValueError(features)
+
     def _check(self, camera_pose: Any, landing: Any) -> None:
         assert landing == "landing"
         _outcome(LANDS)
@@ -205,6 +211,8 @@ def _outcome(of: list[Any]) -> Any:
         ("coarse", ValueError("near"), True, ("coarse", None)),
         ("coarse", "near", ValueError("lands"), ("coarse", None)),
         (ValueError("wide"), "near", True, ("near", "landing")),
+        ("blind", "near", True, ("near", "landing")),
+        ("blind", ValueError("near"), True, "near"),
         (ValueError("wide"), ValueError("near"), True, "near"),
         (ValueError("wide"), "near", ValueError("lands"), "lands"),
     ],
@@ -266,8 +274,54 @@ def test_refused_starts_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     guidance._check(np.zeros(3), nothing)
 
 
+def test_rows_that_do_not_determine_the_pose_have_the_largest_leverage() -> None:
+    """Two rulers, parallel rulers, and a third direction by a single one."""
+    found = features()
+    nothing = found.fiducials.subset(np.zeros(3, bool))
+    rows = {name: getattr(found, name)[:2] for name in ROWS}
+    assert plan._largest_leverage(dataclasses.replace(found, **rows, fiducials=nothing)) == 1.0
+    parallel = np.tile([0.6, 0.8], (7, 1))
+    assert plan._largest_leverage(dataclasses.replace(found, normal=parallel, fiducials=nothing)) == 1.0
+    parallel[3] = [0.8, -0.6]
+    single = dataclasses.replace(found, normal=parallel, fiducials=nothing)
+    assert plan._largest_leverage(single) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("column", "message"), [(30, ""), (31, "in view of 18 of 27 starts in the landing zone")])
+def test_features_must_be_in_view_from_each_start(column: int, message: str) -> None:
+    """Two rulers of 32 samples fix x: they end 10.5 or 9.5 px from the border of the window; the zone is 10 px."""
+    camera = dataclasses.replace(PRESET.camera, window=(113, 113))
+    still = dataclasses.replace(PRESET.tolerance, landing_angle=1e-6)
+    nothing: Any = None
+    guidance = plan._Guidance(
+        artwork=nothing,
+        machine=dataclasses.replace(PRESET, camera=camera, tolerance=still),
+        reflectance=nothing,
+        budget=60,
+        threshold=1.0,
+        device=None,
+    )
+    places = [(column, 3), (-column, -3), (-20, 20), (20, 20), (-20, -20), (20, -20)]
+    found = dataclasses.replace(
+        features(),
+        placement=np.zeros(2),
+        point=PIXEL * np.array(places, float),
+        normal=np.array(2 * [(1.0, 0.0)] + 4 * [(0.0, 1.0)]),
+        spacing=np.full(6, 3.0 * PIXEL),
+        length=np.full(6, 15.0 * PIXEL),
+        sigma=np.full(6, 1e-6),
+        fiducials=features().fiducials.subset(np.zeros(3, bool)),
+    )
+    if message:
+        with pytest.raises(ValueError, match=message):
+            guidance._check_views(guidance._starts(np.zeros(3)), found)
+    else:
+        guidance._check_views(guidance._starts(np.zeros(3)), found)
+
+
 def test_the_registration_needs_its_least_number_of_rulers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plan._Guidance, "_select", lambda *_: "features")
+    monkeypatch.setattr(plan._Guidance, "_check_views", lambda *_: None)
     asked: list[Any] = []
     for count, is_refused in ((11, True), (12, False)):
         landing = SimpleNamespace(

@@ -194,7 +194,8 @@ class RobotFilter:
         time : float
             Middle of the exposure [s].
         candidates : sequence of PoseCandidate
-            Candidates of the view; none for a view that was refused.
+            Candidates of the view; none for a view that was refused. A candidate that is NOT_CONVERGED is left out: its
+            covariance holds for the pose of least cost.
 
         Returns
         -------
@@ -214,6 +215,7 @@ class RobotFilter:
         self._seen = time
         self._advance(*self._split(time))
         self._time = time
+        candidates = [each for each in candidates if not each.status & Status.NOT_CONVERGED]
         known = [each for each in candidates if not each.status & Status.AMBIGUOUS]
         if known:
             self._hypotheses = self._reduced(self._children(known))

@@ -189,6 +189,25 @@ def test_refused_views_and_single_lines(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(robot.state().pose, np.add(START.pose, (0.0, 0.1, 0.0)), atol=1e-3)
 
 
+def test_poses_that_have_not_converged_are_left_out() -> None:
+    """A candidate whose refinement is open is no view, also one that determines a part; beside others it is missing."""
+    away = np.add(START.pose, (0.06, -0.02, 0.01))
+    with_open, without = RobotFilter(FIELD, START), RobotFilter(FIELD, START)
+    open_one = candidate(away, status=Status.NOT_CONVERGED)
+    assert with_open.see(0.0, [open_one])
+    np.testing.assert_array_equal(with_open.state().pose, START.pose)
+    for robot in (with_open, without):
+        robot.move(0.1, np.zeros(3), STEP)
+    partly = candidate(away, status=Status.NOT_CONVERGED | Status.AMBIGUOUS)
+    assert with_open.see(0.1, [open_one, partly])
+    np.testing.assert_array_equal(with_open.state().pose, without.state().pose)
+    for robot, views in ((with_open, [open_one, candidate(away)]), (without, [candidate(away)])):
+        robot.move(0.2, np.zeros(3), STEP)
+        robot.see(0.2, views)
+    for ours, theirs in zip(with_open.state()[1:4], without.state()[1:4], strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 def test_wrong_times_are_refused() -> None:
     robot = RobotFilter(FIELD, START)
     robot.move(0.1, np.zeros(3), STEP)

@@ -34,6 +34,8 @@ class Outcome(NamedTuple):
     room : float
         Largest factor by which a setting is truly more accurate than the tolerance and faster than the rate; NaN if
         unknown.
+    note : str
+        Measured numbers for the line of the job. Default: none.
     """
 
     plan: AccuracyPlan[Any] | None
@@ -43,6 +45,7 @@ class Outcome(NamedTuple):
     cost: float = math.nan
     keeps_up: bool = True
     room: float = math.nan
+    note: str = ""
 
 
 def room_of(errors: Sequence[float], times: Sequence[float], tolerance: float, rate: float) -> float:
@@ -126,4 +129,6 @@ def _line(outcome: Outcome) -> str:
         factor = "" if math.isnan(outcome.room) else f" by a factor of {outcome.room:.2f}"
         return f"refused {asked}{f', which is possible{factor}' if outcome.possible else ''}"
     times = f"cost {outcome.cost:.2f}, {'kept up' if outcome.keeps_up else 'too slow'}"
+    if outcome.note:
+        times += f", {outcome.note}"
     return f"{outcome.plan.chosen.name}, {1e6 * outcome.error:.3g} of {asked}, {times}"

@@ -56,6 +56,32 @@ class Measured(NamedTuple):
     lost: float
 
 
+class Service(NamedTuple):
+    """Service of a stream whose frames arrive at a rate.
+
+    Attributes
+    ----------
+    share : float
+        Rate of the results over the rate of the frames.
+    waited : float
+        Longest time for which a frame waited for a free slot [s].
+    longest : float
+        Longest time for which a frame may wait until the planned ring loses a frame [s].
+    """
+
+    share: float
+    waited: float
+    longest: float
+
+    @property
+    def keeps_up(self) -> bool:
+        """Whether the stream gives results at the rate of the frames, and loses none."""
+        return self.waited <= self.longest and self.share >= _KEPT
+
+    def __str__(self) -> str:
+        return f"{self.share:.4g} of the rate, a frame waited {1e3 * self.waited:.3g} of {1e3 * self.longest:.3g} ms"
+
+
 def judge(rng: np.random.Generator, device: Device, limits: ScanPlanLimits = ScanPlanLimits()) -> Outcome:
     """Plan a random job and measure the plan against truth."""
     job = random_job(rng)
@@ -76,7 +102,9 @@ def judge(rng: np.random.Generator, device: Device, limits: ScanPlanLimits = Sca
         room = room_of(errors, [1.0 / each for each in rates], tolerance, rate)
         return Outcome(None, tolerance, possible=room >= 1.0, room=room)
     error, _ = true_error(job, plan.chosen, heights, device)
-    return Outcome(plan, tolerance, error, bool(meeting), cost_of(plan, meeting), keeps_up(job, plan, rate))
+    service = serve(job, plan, rate)
+    cost = cost_of(plan, meeting)
+    return Outcome(plan, tolerance, error, bool(meeting), cost, service.keeps_up, note=str(service))
 
 
 def true_heights(job: Job, device: Device) -> Float64:
@@ -114,8 +142,8 @@ def throughput(job: Job, trial: ReadoutTrial, device: Device) -> float:
     return max(rates)
 
 
-def keeps_up(job: Job, plan: ScanPlan, rate: float) -> bool:
-    """Return whether a stream of a plan would lose no frame at a rate, and gives results at this rate.
+def serve(job: Job, plan: ScanPlan, rate: float) -> Service:
+    """Run the stream of a plan with frames at a rate [frames/s].
 
     Frames wait for a free slot of a ring that may be shorter than the planned one: this one would lose a frame only if
     a frame waits for longer than the missing slots take to fill.
@@ -129,7 +157,7 @@ def keeps_up(job: Job, plan: ScanPlan, rate: float) -> bool:
         batches = [(batch.number + len(batch), batch.arrived[-1], batch.delivered) for batch in stream]
         waited = stream.report().stages["slot"].maximum
     longest = (planned.ring - ring) * planned.batch / rate + _SWITCH
-    return waited <= longest and served_rate(np.array(batches)) >= _KEPT * rate
+    return Service(served_rate(np.array(batches)) / rate, waited, longest)
 
 
 def served_rate(batches: npt.NDArray[np.int64]) -> float:

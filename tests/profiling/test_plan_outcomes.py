@@ -106,7 +106,7 @@ def test_outcome_of_a_scan(
     monkeypatch.setattr(scan_plans, "true_heights", lambda job, device: None)
     monkeypatch.setattr(scan_plans, "true_error", error)
     monkeypatch.setattr(scan_plans, "throughput", lambda job, trial, device: 1.0 / trial.seconds)
-    monkeypatch.setattr(scan_plans, "keeps_up", lambda job, plan, rate: False)
+    monkeypatch.setattr(scan_plans, "serve", lambda job, plan, rate: scan_plans.Service(0.95, 1e-3, 0.5))
     found = scan_plans.judge(np.random.default_rng(1), nothing)
     assert found.tolerance == pytest.approx(tolerance)
     assert found.room == pytest.approx(room, nan_ok=True)
@@ -120,6 +120,7 @@ def test_outcome_of_a_scan(
     assert found.plan is not None
     assert found.plan.chosen.readout == chosen
     assert (found.error, found.cost, found.keeps_up) == (SETTINGS[chosen][2], cost, False)
+    assert found.note == "0.95 of the rate, a frame waited 1 of 500 ms"
 
 
 class FakeStream:
@@ -207,7 +208,7 @@ def kept_by_fake_stream(
     job: Any = SimpleNamespace(frames=np.zeros((4, 8, 64), np.uint8))
     stream = SimpleNamespace(settings={"batch": batch, "ring": ring}, batch=batch, ring=ring)
     plan: Any = SimpleNamespace(sensor=Sensor.load("camera_line"), stream=stream)
-    return scan_plans.keeps_up(job, plan, 100.0)
+    return scan_plans.serve(job, plan, 100.0).keeps_up
 
 
 @pytest.mark.slow
@@ -226,7 +227,7 @@ def test_a_source_that_takes_longer_than_the_time_between_frames(
     job: Any = SimpleNamespace(frames=np.zeros((4, 8, 64), np.uint8))
     stream = SimpleNamespace(settings={"device": device, "batch": 2}, batch=2, ring=27)
     plan: Any = SimpleNamespace(sensor=Sensor.load("camera_line"), stream=stream)
-    assert scan_plans.keeps_up(job, plan, 100.0) == kept
+    assert scan_plans.serve(job, plan, 100.0).keeps_up == kept
 
 
 @pytest.mark.parametrize("kind", ["camera", "psd"])

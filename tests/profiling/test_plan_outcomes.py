@@ -212,22 +212,23 @@ def kept_by_fake_stream(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seconds", "kept"), [(0.005, True), (0.0104, False)])
 def test_a_source_that_takes_longer_than_the_time_between_frames(
-    monkeypatch: pytest.MonkeyPatch, device: Device, seconds: float, kept: bool
+    monkeypatch: pytest.MonkeyPatch, device: Device
 ) -> None:
-    """A stream of 100 frames/s whose frames take 5 ms, or 10.4 ms: 4 % too slow."""
+    """A real stream of 100 frames/s whose frames take 10.4 ms: 4 % too slow, and more on a busy machine."""
 
     class SlowSource(ArraySource):
         def read_into(self, out: Any, arrived: Any) -> int:
-            time.sleep(seconds * len(out))
+            time.sleep(0.0104 * len(out))
             return super().read_into(out, arrived)
 
     monkeypatch.setattr(scan_plans, "ArraySource", SlowSource)
     job: Any = SimpleNamespace(frames=np.zeros((4, 8, 64), np.uint8))
     stream = SimpleNamespace(settings={"device": device, "batch": 2}, batch=2, ring=27)
     plan: Any = SimpleNamespace(sensor=Sensor.load("camera_line"), stream=stream)
-    assert scan_plans.serve(job, plan, 100.0).keeps_up == kept
+    found = scan_plans.serve(job, plan, 100.0)
+    assert found.share < 0.97
+    assert not found.keeps_up
 
 
 @pytest.mark.parametrize("kind", ["camera", "psd"])

@@ -74,7 +74,9 @@ def overlapping_jackknife(
     sums[:, number] = terms
     border = (overlap - 1, overlap - 1)
     padded = np.pad(sums.reshape(-1, cells, cells), ((0, 0), border, border))
-    blocks = np.lib.stride_tricks.sliding_window_view(padded, (overlap, overlap), axis=(1, 2)).sum(axis=(-2, -1))
+    places = cells + overlap - 1
+    corners = np.ndindex(overlap, overlap)
+    blocks = np.asarray(sum(padded[:, row : row + places, column : column + places] for row, column in corners))
     # Blocks whose places differ by whole blocks form one grid.
     has_edges = blocks[-1] > 0.0
     weight = np.zeros(has_edges.shape)

@@ -72,6 +72,11 @@ class _MeasuredRulers(NamedTuple):
     offset_px: Float64
     inside: npt.NDArray[np.bool_]
 
+    def of(self, chosen: npt.NDArray[np.intp]) -> _MeasuredRulers:
+        """Return rulers of each motion by their numbers (k, m)."""
+        motion = np.arange(len(chosen))[:, None]
+        return _MeasuredRulers(*(each[motion, chosen] for each in self))
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CoarseRegistration:
@@ -254,7 +259,10 @@ class CoarseRegistration:
     def _pose_rows(
         self, known: KnownEdges, motions: list[Float64], measured: _MeasuredRulers
     ) -> npt.NDArray[np.float32]:
-        """Return rows for `SolvePose`, (k, n, 7), relative to where each motion has the placement point."""
+        """Return rows for `SolvePose`, (k, n, 7), relative to where each motion has the placement point.
+
+        The known edges are (n, 2) of all motions, or (k, n, 2) of each one.
+        """
         found = self._from_pixels(measured.centre + measured.direction * measured.offset_px[..., None])
         point, normal = move_edges(known, motions, self.placement)
         place = np.stack(motions)[:, None, :, 2]
@@ -268,7 +276,9 @@ class CoarseRegistration:
         known = self._verification_edges
         range_px = self._candidate_error_px
         measured = self._measure_rulers(image, known, starts, np.zeros(len(starts)), self._ruler(range_px), device)
-        rows = np.stack([_select_found(each) for each in self._pose_rows(known, starts, measured)])
+        chosen = _select_found(measured.offset_px)
+        edges = KnownEdges(known.point[chosen], known.normal[chosen])
+        rows = self._pose_rows(edges, starts, measured.of(chosen))
         solver = SolvePose(
             loss="ransac",
             tuning_constant=1.0,
@@ -427,18 +437,17 @@ def _fill_border(level: npt.NDArray[np.uint16], border: int, border_cost: float)
     At the full cost, poses that keep more edges in the image would win over the right pose; on boards with repeated
     patterns they do so even at the mean cost. Below half the mean cost, poses that keep few edges in the image win.
     """
-    inside = (slice(None), slice(border, -border), slice(border, -border))
-    inside_levels = level[inside].copy()
-    level[:] = np.rint(border_cost * inside_levels.mean(axis=(1, 2)))[:, None, None]
-    level[inside] = inside_levels
+    inside = level[:, border:-border, border:-border]
+    cost = np.rint(border_cost * inside.mean(axis=(1, 2)))[:, None, None]
+    level[:, :border] = level[:, -border:] = level[:, :, :border] = level[:, :, -border:] = cost
 
 
-def _select_found(rows: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Return the same number of rows for each start, evenly picked from the rows with an edge.
+def _select_found(offset_px: Float64) -> npt.NDArray[np.intp]:
+    """Return the numbers of `_REFINEMENT_ROWS` rulers of each start, evenly picked from the rulers with an edge.
 
-    Missing rows would waste start candidates of the robust fit.
+    Missing rows would waste start candidates of the robust fit. A start without edges gets a ruler without one.
     """
-    found_rows = np.flatnonzero(np.all(np.isfinite(rows), axis=1))
-    if not len(found_rows):
-        return np.full((_REFINEMENT_ROWS, rows.shape[1]), np.nan, np.float32)
-    return rows[found_rows[np.arange(_REFINEMENT_ROWS) * len(found_rows) // _REFINEMENT_ROWS]]
+    is_found = np.isfinite(offset_px)
+    found_first = np.argsort(~is_found, axis=1, kind="stable")
+    picked = np.arange(_REFINEMENT_ROWS) * np.count_nonzero(is_found, axis=1)[:, None] // _REFINEMENT_ROWS
+    return np.take_along_axis(found_first, picked, axis=1)

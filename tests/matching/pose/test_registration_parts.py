@@ -86,17 +86,17 @@ def test_cost_beyond_the_image_is_a_share_of_the_mean_of_each_direction(rng: np.
 
 
 @pytest.mark.parametrize("count", [1, 3, _REFINEMENT_ROWS, 2 * _REFINEMENT_ROWS + 5])
-def test_each_start_has_the_same_number_of_rows_with_an_edge(count: int) -> None:
-    rows = np.full((2 * count + 1, 7), np.nan, np.float32)
-    rows[1::2] = np.arange(count, dtype=np.float32)[:, None]
-    rows[0, :6] = 5.0  # one number is missing
-    found = _select_found(rows)
-    assert found.shape == (_REFINEMENT_ROWS, 7)
-    numbers = found[:, 0].astype(int)
+def test_each_start_has_the_same_number_of_rulers_with_an_edge(count: int) -> None:
+    offset = np.full((3, 2 * count + 1), np.nan)
+    offset[0, 1::2] = offset[2, -1] = 0.5
+    found = _select_found(offset)
+    assert found.shape == (3, _REFINEMENT_ROWS)
+    numbers = (found[0] - 1) // 2
     np.testing.assert_array_equal(numbers, [k * count // _REFINEMENT_ROWS for k in range(_REFINEMENT_ROWS)])
+    assert np.all(np.isfinite(offset[0, found[0]]))
     assert set(numbers) == set(range(count)) or count > _REFINEMENT_ROWS
-    assert np.isnan(_select_found(rows[:1])).all()
-    assert _select_found(rows[:1]).shape == found.shape
+    assert np.isnan(offset[1, found[1]]).all()
+    assert set(found[2]) == {2 * count}
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

@@ -74,8 +74,8 @@ class _MeasuredRulers(NamedTuple):
 
     def of(self, chosen: npt.NDArray[np.intp]) -> _MeasuredRulers:
         """Return rulers of each motion by their numbers (k, m)."""
-        motion = np.arange(len(chosen))[:, None]
-        return _MeasuredRulers(*(each[motion, chosen] for each in self))
+        at = (np.arange(len(chosen))[:, None], chosen)
+        return _MeasuredRulers(self.centre[at], self.direction[at], self.offset_px[at], self.inside[at])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

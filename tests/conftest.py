@@ -85,10 +85,13 @@ hypothesis.settings.load_profile("unhurried")
 _FOLDERS_OF_COMMANDS = ("cli", "docs", "workflows")
 
 DATA = ROOT.parent / "shared" / "data"
+HUGE_PAGES = Path("/sys/kernel/mm/transparent_hugepage/enabled")
 # Reasons of skips that are expected with all extras and both CPU runtimes; ``--strict-skips`` fails on other reasons.
 _NO_DATA = "the recordings in ../shared/data are not here"
+_NO_HUGE_PAGES = "the system has no huge pages"
 ALLOWED_SKIPS = (
     *(() if DATA.is_dir() else (_NO_DATA,)),
+    *(() if HUGE_PAGES.exists() else (_NO_HUGE_PAGES,)),
     "`make docs` ran this example after the last change",
     "only PoCL 3 has such a device",
     "only Intel's runtime does so by the work's groups",

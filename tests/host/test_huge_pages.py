@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from conftest import HUGE_PAGES
 from gpuvision.host import Device, host_view
 from gpuvision.host.huge_pages import LEAST_BYTES, advise_huge_pages
-
-_SETTING = Path("/sys/kernel/mm/transparent_hugepage/enabled")
 
 
 def is_advised(address: int) -> bool:
@@ -28,7 +27,7 @@ def is_advised(address: int) -> bool:
 
 @pytest.fixture(autouse=True)
 def huge_pages() -> None:
-    if not _SETTING.exists():
+    if not HUGE_PAGES.exists():
         pytest.skip("the system has no huge pages")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from gpuvision.host import Device
+from gpuvision.host import Define, Device, flags
 from gpuvision.host.arrays import memory_of
 from gpuvision.host.program import build
 from gpuvision.operation import KERNEL_FOLDER
@@ -18,7 +18,9 @@ SIZES = (1 << 20, 8 << 20, 192 << 20)
 """Bytes that the copies of `bandwidths` move."""
 _COPIES, _COPYING = 12, 0.03  # least number of copies of a size, and least time for them [s]
 _VECTOR = 64  # bytes that a work-item moves per step
-_ITEMS_PER_UNIT = 64
+# Work-items of a copy for each core, and for each core of a device that runs neighbouring work-items side by side.
+_SHARES_PER_CORE, _ITEMS_PER_UNIT = 8, 4096
+_TRIALS = 5  # launches of each form of the copy, of which the fastest form is kept
 _LAUNCH = 0.2  # a launch of the multiply-adds that takes longer gets no more work-items [s]
 _FLOPS_PER_STEP = 8 * 16 * 2  # 8 vectors of 16 floats, one multiplication and one addition each
 
@@ -26,8 +28,8 @@ _FLOPS_PER_STEP = 8 * 16 * 2  # 8 vectors of 16 floats, one multiplication and o
 def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[[], None]:
     """Return a function that reads and writes memory sequentially, `repeats` times back to back, and waits.
 
-    The arguments `read` and `written` are numbers of bytes. The time of this copy is a lower limit for a kernel with
-    the same traffic in the same cache or memory; it includes the launch.
+    The arguments `read` and `written` are numbers of bytes. The copy is the fastest of the forms that we know. Its time
+    is a lower limit for a kernel with the same traffic in the same cache or memory; it includes the launch.
     """
     launch = mover(device, device.queue, read, written)
 
@@ -55,15 +57,32 @@ def mover(device: Device, queue: Any, read: int, written: int) -> Callable[[], A
     target = device.empty((max(writes, 1) * 16,), np.float32)
     source.set(np.ones(source.shape, np.float32))
     target.set(np.ones(target.shape, np.float32))  # maps the pages before the first timed run
-    vectors = device.prefers_vectors
-    kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "move" if vectors else "move_items")
-    kernel.set_args(memory_of(source), memory_of(target), np.int64(reads), np.int64(writes))
-    items = device.compute_units * _ITEMS_PER_UNIT * (1 if vectors else 64)
+    arguments = memory_of(source), memory_of(target), np.int64(reads), np.int64(writes)
+    bypass = flags(PAST_CACHES=device.is_cpu and read + written > device.cache_bytes)
 
-    def launch(kept: object = (source, target)) -> Any:
-        return cl.enqueue_nd_range_kernel(queue, kernel, (items,), (1,) if vectors else None)
+    def form(name: str, defines: dict[str, Define], items: int, group: tuple[int] | None) -> Callable[[], Any]:
+        kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", defines), name)
+        kernel.set_args(*arguments)
 
-    return launch
+        def launch(kept: object = (source, target)) -> Any:
+            return cl.enqueue_nd_range_kernel(queue, kernel, (items,), group)
+
+        return launch
+
+    if not device.prefers_vectors:
+        return form("move_items", {}, device.compute_units * _ITEMS_PER_UNIT, None)
+    shares = device.compute_units * _SHARES_PER_CORE
+    return min((form("move", bypass | flags(PREFETCH=ahead), shares, (1,)) for ahead in (False, True)), key=_least_time)
+
+
+def _least_time(launch: Callable[[], Any]) -> float:
+    """Return the least time of a few launches, each of which is waited for [s]."""
+    times = []
+    for _ in range(_TRIALS):
+        start = time.perf_counter()
+        launch().wait()
+        times.append(time.perf_counter() - start)
+    return min(times)
 
 
 def bandwidths(device: Device) -> dict[int, float]:

@@ -2,16 +2,43 @@
 
 typedef float16 vector_at __attribute__((aligned(4)));
 
-// Reads `reads` and writes `writes` vectors of 64 bytes; every work-item processes a contiguous share of equal size.
+// A kernel that writes more than the last cache holds bypasses the caches (PAST_CACHES), and so does its copy. Memory
+// objects are aligned to 128 bytes.
+#ifdef PAST_CACHES
+static inline void write_vector(float16 value, global float *to) {
+    __builtin_nontemporal_store(value, (global float16 *)to);
+}
+#else
+static inline void write_vector(float16 value, global float *to) { *(global vector_at *)to = value; }
+#endif
+
+static inline float16 read_vector(global const float *from) {
+#ifdef PREFETCH
+    __builtin_prefetch((const void *)((ulong)from + 2048), 0, 3);
+#endif
+    return *(global const vector_at *)from;
+}
+
+// Reads `reads` and writes `writes` vectors of 64 bytes. Every work-item has a contiguous share of equal size, and takes
+// turns of TURN reads and the same part of its writes, as kernels that stream do. A copy that reads its whole share
+// before it writes takes 1.1 to 1.2 times as long.
+// Build options: PAST_CACHES; PREFETCH (reads are prefetched 2 KiB ahead, which some compilers and sizes gain by).
+#define TURN 16
 kernel void move(global const float *from, global float *to, long reads, long writes) {
     const long item = get_global_id(0), items = get_global_size(0);
+    const long first = reads * item / items, end = reads * (item + 1) / items;
+    const long first_write = writes * item / items, end_write = writes * (item + 1) / items;
+    long write = first_write;
     float16 sum = 0;
-    for (long i = reads * item / items; i < reads * (item + 1) / items; i++)
-        sum += *(global const vector_at *)(from + 16 * i);
-    const long first = writes * item / items, end = writes * (item + 1) / items;
-    for (long i = first; i < end; i++) *(global vector_at *)(to + 16 * i) = sum;
+    for (long begin = first; begin < end; begin += TURN) {
+        const long stop = min(begin + TURN, end);
+        for (long i = begin; i < stop; i++) sum += read_vector(from + 16 * i);
+        const long until = first_write + (end_write - first_write) * (stop - first) / (end - first);
+        for (; write < until; write++) write_vector(sum, to + 16 * write);
+    }
+    for (; write < end_write; write++) write_vector(sum, to + 16 * write);  // of a work-item that reads nothing
     // A work-item without writes must still use its sum, or the compiler would remove the reads.
-    if (first == end && sum.s0 == 1.0e30f) to[0] = sum.s1;
+    if (first_write == end_write && sum.s0 == 1.0e30f) to[0] = sum.s1;
 }
 
 // The same for devices where neighbouring work-items should touch neighbouring words.

@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import pyopencl as cl
 import pyopencl.array
+import pytest
 
 from gpuvision.host.program import build
 from gpuvision.operation import KERNEL_FOLDER
@@ -67,3 +68,19 @@ def test_the_kernels_compute_what_they_are_counted_for(device, rng):
     for _ in range(3):
         values = 0.5 * values + 0.5
     np.testing.assert_allclose(chains.get(), values.sum(), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "form", ["", *(pytest.param(each, marks=pytest.mark.vectors) for each in ("PREFETCH", "PAST_CACHES"))]
+)
+def test_a_copy_takes_turns_of_reads_and_writes(device, rng, form):
+    """Of 16 reads, and of the writes up to the same part of the share; the sum of all reads so far is written."""
+    reads, writes = 100, 75
+    given = rng.integers(0, 9, (reads, 16)).astype(np.float32)
+    source, made = (cl.array.to_device(device.queue, each) for each in (given, np.zeros((writes, 16), np.float32)))
+    kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {form: None} if form else {}), "move")
+    kernel(device.queue, (1,), None, source.data, made.data, np.int64(reads), np.int64(writes))
+    read_until = np.minimum(16 * np.arange(1, 8), reads)
+    sums = np.cumsum(given, axis=0)[read_until - 1]
+    counts = np.diff(writes * read_until // reads, prepend=0)
+    np.testing.assert_array_equal(made.get(), np.repeat(sums, counts, axis=0))

@@ -172,9 +172,10 @@ INLINE real group_ranked(private const real *values, int count, int rank, int lo
     bits found = 0;
     for (int bit = BITS_BELOW_SIGN - 1; bit >= lowest; bit--) {
         const bits next = found | ((bits)1 << bit);
-        masks below = 0;
-        for (int i = 0; i < count; i += LANES) below -= mask_of(as_masks(READ(values, i)) < (masks)next);
-        found = (int)sum_of(LANED(convert_real)(below)) >= rank ? found : next;
+        int below = 0;
+        for (int i = 0; i < count; i += LANES)
+            below += (int)popcount(lane_bits(mask_of(as_masks(READ(values, i)) < (masks)next)));
+        found = below >= rank ? found : next;
     }
     return as_real(found);
 }

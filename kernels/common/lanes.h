@@ -18,6 +18,16 @@
 
 #define INLINE static inline __attribute__((always_inline))
 
+// A function with much unrolled code: CPUs call it. LLVM splits vectors of 512 bits into halves in a function without
+// vectors as arguments where it prefers vectors of 256 bits, as PoCL does, unless the attribute forbids it.
+#ifndef VECTOR_VARIANT
+#define CALLED static inline
+#elif __has_attribute(min_vector_width)
+#define CALLED static __attribute__((noinline, min_vector_width(512)))
+#else
+#define CALLED static __attribute__((noinline))
+#endif
+
 #ifdef VECTOR_VARIANT
 #define LANES 16
 typedef real16 reals;

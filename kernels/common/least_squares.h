@@ -14,9 +14,12 @@ static inline real sum_of(reals value) {
     return (b.x + b.y) + (b.z + b.w);
 }
 #define FIRST(value) (value).s0
+// Loops over a matrix: unrolled, a CPU keeps its numbers in registers; each number depends on the numbers before it.
+#define UNROLLED _Pragma("unroll")
 #else
 static inline real sum_of(reals value) { return value; }
 #define FIRST(value) (value)
+#define UNROLLED
 #endif
 
 // Lower triangle of a symmetric matrix, row by row: (0, 0), (1, 0), (1, 1), ...
@@ -24,13 +27,13 @@ static inline real sum_of(reals value) { return value; }
 #define CELL(row, column) ((row) * ((row) + 1) / 2 + (column))
 
 // Cholesky factorisation in place; the diagonal holds reciprocals. Returns the lanes in which the matrix is singular.
-static inline masks factored_of(const int unknowns, private reals *matrix) {
+INLINE masks factored_of(const int unknowns, private reals *matrix) {
     masks bad = 0;
-    for (int i = 0; i < unknowns; i++) {
+    UNROLLED for (int i = 0; i < unknowns; i++) {
         const reals diagonal = matrix[CELL(i, i)];
-        for (int j = 0; j <= i; j++) {
+        UNROLLED for (int j = 0; j <= i; j++) {
             reals sum = matrix[CELL(i, j)];
-            for (int k = 0; k < j; k++) sum -= matrix[CELL(i, k)] * matrix[CELL(j, k)];
+            UNROLLED for (int k = 0; k < j; k++) sum -= matrix[CELL(i, k)] * matrix[CELL(j, k)];
             if (j < i) matrix[CELL(i, j)] = sum * matrix[CELL(j, j)];
             else {
                 const masks none = mask_of(!(sum > diagonal * (reals)(8 * REAL_EPSILON)));
@@ -42,16 +45,16 @@ static inline masks factored_of(const int unknowns, private reals *matrix) {
     return bad;
 }
 
-static inline void solved_of(const int unknowns, private const reals *factor, private const reals *right,
+INLINE void solved_of(const int unknowns, private const reals *factor, private const reals *right,
                       private reals *solution) {
-    for (int i = 0; i < unknowns; i++) {
+    UNROLLED for (int i = 0; i < unknowns; i++) {
         reals sum = right[i];
-        for (int k = 0; k < i; k++) sum -= factor[CELL(i, k)] * solution[k];
+        UNROLLED for (int k = 0; k < i; k++) sum -= factor[CELL(i, k)] * solution[k];
         solution[i] = sum * factor[CELL(i, i)];
     }
-    for (int i = unknowns - 1; i >= 0; i--) {
+    UNROLLED for (int i = unknowns - 1; i >= 0; i--) {
         reals sum = solution[i];
-        for (int k = i + 1; k < unknowns; k++) sum -= factor[CELL(k, i)] * solution[k];
+        UNROLLED for (int k = i + 1; k < unknowns; k++) sum -= factor[CELL(k, i)] * solution[k];
         solution[i] = sum * factor[CELL(i, i)];
     }
 }

@@ -102,7 +102,7 @@ static inline void take_edges(ruler_edge edge, int i, blob_layout layout, blob_s
 INLINE void measure(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
                     constant real *table, blob_layout layout, GROUP_SPACE blob_edges *edges,
                     GROUP_SPACE blob_room *room) {
-    const real cosine = cos(shape.angle), sine = sin(shape.angle);
+    const real cosine = cosine_of(shape), sine = sine_of(shape);
 #ifdef IN_GROUP
     for (int first = 0; first < PADDED_SPOKES; first += RULERS_PER_GROUP) {
         const int i = min(first + ruler_of_item(), PADDED_SPOKES - 1);
@@ -133,7 +133,7 @@ typedef struct {
 // Reject edges further than `search` from the nominal contour and, with EITHER_POLARITY, edges of the minority polarity.
 INLINE blob_count keep_edges(GROUP_SPACE blob_edges *edges, blob_layout layout, blob_shape nominal, real search,
                              GROUP_SPACE blob_room *room) {
-    const real cosine = cos(nominal.angle), sine = sin(nominal.angle);
+    const real cosine = cosine_of(nominal), sine = sine_of(nominal);
 #ifdef EITHER_POLARITY
     reals sum;
     EACH_PART(part) {

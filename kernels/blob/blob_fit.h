@@ -37,7 +37,7 @@ static inline real bent_by(real blur, real across) {
 // Return the robust scale of the residuals within reach: their median absolute deviation.
 INLINE real scale_of(GROUP_SPACE const blob_edges *edges, blob_layout layout, blob_shape shape, real bent, real reach,
                      GROUP_SPACE real *distances, GROUP_SPACE blob_room *room) {
-    const real cosine = cos(shape.angle), sine = sin(shape.angle);
+    const real cosine = cosine_of(shape), sine = sine_of(shape);
     reals inside;
     EACH_PART(part) {
         masks counted = 0;
@@ -82,7 +82,7 @@ BETWEEN_BARRIERS void fit_stepped(private blob_fit *fit, private reals *sums) {
 INLINE void fit_step(GROUP_SPACE blob_fit *fit, GROUP_SPACE const blob_edges *edges, blob_layout layout, real scale,
                      real across, GROUP_SPACE blob_room *room) {
     const blob_shape shape = fit->shape;
-    const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale;
+    const real cosine = cosine_of(shape), sine = sine_of(shape), per_scale = 1 / scale;
     const real bent = bent_by(fit->blur, across);
     reals sums[FIT_SUMS];
     EACH_PART(part) {
@@ -176,7 +176,7 @@ INLINE void quality_from(GROUP_SPACE blob_quality *quality, private reals *sums,
 
 INLINE void quality_of(GROUP_SPACE blob_quality *quality, GROUP_SPACE const blob_edges *edges, blob_layout layout,
                        blob_shape shape, real scale, real bent, real overlap, GROUP_SPACE blob_room *room) {
-    const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale;
+    const real cosine = cosine_of(shape), sine = sine_of(shape), per_scale = 1 / scale;
     reals sums[QUALITY_SUMS];
     EACH_PART(part) {
         for (int k = 0; k < QUALITY_SUMS; k++) sums[k] = 0;

@@ -14,7 +14,7 @@
 INLINE real background_of(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
                           GROUP_SPACE const blob_edges *edges, GROUP_SPACE const real *weights, blob_layout layout,
                           real blur, GROUP_SPACE blob_room *room) {
-    const real cosine = cos(shape.angle), sine = sin(shape.angle), out = BEYOND * blur + (real)0.5f;
+    const real cosine = cosine_of(shape), sine = sine_of(shape), out = BEYOND * blur + (real)0.5f;
     reals sums[2];
     EACH_PART(part) {
         real sum = 0, all = 0;
@@ -38,7 +38,7 @@ INLINE real background_of(global const CODE *image, int rows, int columns, real 
 // Mark the parts of the contour whose edges disagree with the shape, as wide as the spacing of the rulers.
 static inline void hide(blob_shape shape, GROUP_SPACE const real *weights, blob_layout layout, real spacing, real blur,
                         GROUP_SPACE blob_hidden *hidden) {
-    const real cosine = cos(shape.angle), sine = sin(shape.angle);
+    const real cosine = cosine_of(shape), sine = sine_of(shape);
     int count = 0;
     for (int i = 0; i < SPOKES; i++) {
         if (weights[i] >= OWN) continue;

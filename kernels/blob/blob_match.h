@@ -43,7 +43,8 @@ static inline masks hidden_at(GROUP_SPACE const blob_hidden *hidden, reals dx, r
 }
 
 #ifdef VECTOR_VARIANT
-#define PIXELS(from) LANED(convert_real)(vload16(0, from))
+typedef CODE16 codes_at __attribute__((aligned(sizeof(CODE)))); // PoCL's vload16 loads element by element
+#define PIXELS(from) LANED(convert_real)(*(global const codes_at *)(from))
 #define COUNTED (reals)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
 #else
 #define PIXELS(from) convert_real(*(from))
@@ -112,8 +113,7 @@ INLINE void match_added(private const match_equation *batch, int count, const in
 }
 
 // Add the products of a batch. Inlined, constants of the caller's loops would take its registers.
-static __attribute__((noinline)) void match_batch_added(private const match_equation *batch, int count,
-                                                        private reals *sums) {
+CALLED void match_batch_added(private const match_equation *batch, int count, private reals *sums) {
     match_added(batch, count, 0, MATCH_SPLIT, sums);
     match_added(batch, count, MATCH_SPLIT, UNKNOWNS, sums);
 }
@@ -121,7 +121,7 @@ static __attribute__((noinline)) void match_batch_added(private const match_equa
 #define MATCH_BATCH 1
 
 // Add the products of one vector of pixels.
-static inline void match_batch_added(private const match_equation *of, int count, private reals *sums) {
+CALLED void match_batch_added(private const match_equation *of, int count, private reals *sums) {
 #pragma unroll
     for (int i = 0; i < UNKNOWNS; i++) {
         const reals weighted = of->weight * of->row[i];
@@ -132,21 +132,27 @@ static inline void match_batch_added(private const match_equation *of, int count
 }
 #endif
 
+// Return the smallest integer that is not less than x. (PoCL's ceil() takes 25 instructions.)
+static inline int ceiling(real x) {
+    const int whole = (int)x;
+    return whole + (whole < x);
+}
+
 // Add up the normal equations of a part of the pixels of the fiducial and its background around (x, y), in units of the
 // contrast.
 static inline void match_summed(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
                          blob_grey grey, real slope_x, real slope_y, real scale, real reach,
                          GROUP_SPACE const blob_hidden *hidden, int part, private reals *sums) {
-    const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale, per_size = 1 / shape.size;
+    const real cosine = cosine_of(shape), sine = sine_of(shape), per_scale = 1 / scale, per_size = 1 / shape.size;
     const real per_contrast = 1 / grey.contrast;
-    const int top = max((int)ceil(y - reach), 0), bottom = min((int)(y + reach), rows - 1);
+    const int top = max(ceiling(y - reach), 0), bottom = min((int)(y + reach), rows - 1);
     match_equation batch[MATCH_BATCH];
     int count = 0;
     reals pixels = 0, squares = 0, weights = 0, used = 0;
     for (int i = 0; i < MATCH_SQUARE; i++) sums[i] = 0;
     for (int row = top + PART_ROW(part); row <= bottom; row += PART_ROWS) {
         const real dy = row - y, half_chord = sqrt(fmax(reach * reach - dy * dy, (real)0));
-        const int left = max((int)ceil(x - half_chord), 0), right = min((int)(x + half_chord), columns - 1);
+        const int left = max(ceiling(x - half_chord), 0), right = min((int)(x + half_chord), columns - 1);
         for (int column = left + PART_COLUMN(part); column <= right; column += LANES * PART_COLUMNS) {
             const int from = min(column, columns - LANES);
             const reals place = (reals)(real)from + COUNTED, dx = place - (reals)x;
@@ -156,7 +162,7 @@ static inline void match_summed(global const CODE *image, int rows, int columns,
             const reals pixel = (PIXELS(image + row * columns + from) - (reals)grey.background) * (reals)per_contrast;
             private match_equation *const equation = batch + (MATCH_BATCH > 1 ? count : 0);
             count++;
-            for (int i = 0; i < FREEDOMS + 1; i++) equation->row[i] = model.row[i];
+            UNROLLED for (int i = 0; i < FREEDOMS + 1; i++) equation->row[i] = model.row[i];
             equation->row[FREEDOMS + 1] = model.level;
             equation->row[FREEDOMS + 2] = 1;
             equation->row[FREEDOMS + 3] = dx * per_size;
@@ -196,13 +202,20 @@ typedef struct {
 #define MATCH_ENDS 1  // with a shape
 #define MATCH_FAILS 2 // the normal equations are singular, too few pixels agree, or the fiducial moved too far
 
+// Factor the normal equations in place; return the lanes in which they are singular.
+CALLED masks match_factored(private reals *sums) { return factored_of(UNKNOWNS, sums); }
+
+CALLED void match_solved(private const reals *factor, private const reals *right, private reals *solution) {
+    solved_of(UNKNOWNS, factor, right, solution);
+}
+
 // Do the Gauss-Newton step of the normal equations.
 BETWEEN_BARRIERS void match_stepped(private blob_match *match, private reals *sums, int is_last) {
     reals moved[UNKNOWNS];
     const real contrast = match->grey.contrast;
     match->state = MATCH_FAILS;
-    if (any_lane(factored_of(UNKNOWNS, sums))) return;
-    solved_of(UNKNOWNS, sums, sums + MATCH_RIGHT, moved);
+    if (any_lane(match_factored(sums))) return;
+    match_solved(sums, sums + MATCH_RIGHT, moved);
     const real dx = FIRST(moved[0]), dy = FIRST(moved[1]), ds = FIRST(moved[2]);
     const real db = FIRST(moved[FREEDOMS]);
     real less = 0, da = 0;
@@ -229,7 +242,7 @@ BETWEEN_BARRIERS void match_stepped(private blob_match *match, private reals *su
     for (int i = 0; i < FREEDOMS; i++) {
         reals unit[UNKNOWNS], column[UNKNOWNS];
         for (int k = 0; k < UNKNOWNS; k++) unit[k] = (reals)(real)(i == k);
-        solved_of(UNKNOWNS, sums, unit, column);
+        match_solved(sums, unit, column);
         for (int k = 0; k < FREEDOMS; k++) match->covariance[i][k] = variance * FIRST(column[k]);
     }
     const real off_x = match->shape.x - match->first.x, off_y = match->shape.y - match->first.y;

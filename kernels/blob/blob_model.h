@@ -11,6 +11,15 @@ typedef struct {
     real x, y, size, angle;
 } blob_shape;
 
+// Cosine and sine of the angle of a shape; a round shape has the angle 0.
+#ifdef ROUND
+static inline real cosine_of(blob_shape shape) { return 1; }
+static inline real sine_of(blob_shape shape) { return 0; }
+#else
+static inline real cosine_of(blob_shape shape) { return cos(shape.angle); }
+static inline real sine_of(blob_shape shape) { return sin(shape.angle); }
+#endif
+
 // Grey level of the model (0 to 1) and its derivatives with respect to the shape and the blur.
 typedef struct {
     reals level, row[FREEDOMS + 1];

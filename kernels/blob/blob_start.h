@@ -112,6 +112,17 @@ static inline laned_shape shape_through(private const contour_edge *edges, const
     return shape;
 }
 
+#ifdef VECTOR_VARIANT
+static inline real least_of(reals value) {
+    const real8 a = value.lo < value.hi ? value.lo : value.hi;
+    const real4 b = a.lo < a.hi ? a.lo : a.hi;
+    const real low = b.x < b.y ? b.x : b.y, high = b.z < b.w ? b.z : b.w;
+    return low < high ? low : high;
+}
+#else
+static inline real least_of(reals value) { return value; }
+#endif
+
 // Compute the shape through the edges i, i + pattern[p][0] / 16 and i + pattern[p][1] / 16 of the contour in each lane,
 // and its sum of truncated squares; infinity where an edge is missing.
 static inline reals start_loss(private const blob_circuit *circuit, int p, int i, laned_shape near, real reach,
@@ -120,12 +131,12 @@ static inline reals start_loss(private const blob_circuit *circuit, int p, int i
                                    edge_from(circuit, i + pattern[p][1] * SPOKES / 16)};
     const masks all = mask_of(edges[0].there * edges[1].there * edges[2].there > (reals)0);
     *tried = shape_through(edges, near);
+    const reals most = (reals)(reach * reach);
     reals loss = 0;
     for (int m = 0; m < SPOKES; m++) {
         const contour_edge edge = edge_for_all(circuit, m);
-        const reals off = residual_at(*tried, edge).off, squared = off * off;
-        const masks in = mask_of(edge.there > (reals)0) & mask_of(squared < (reals)(reach * reach));
-        loss += in ? squared : (reals)(reach * reach);
+        const reals off = residual_at(*tried, edge).off;
+        loss += edge.there * lane_min(off * off, most) + ((reals)1 - edge.there) * most;
     }
     return all ? loss : (reals)INFINITY;
 }
@@ -134,7 +145,7 @@ static inline reals start_loss(private const blob_circuit *circuit, int p, int i
 // squares. The items of a group try different triples. No triples are tried unless `is_wanted`.
 INLINE void start_of(GROUP_SPACE blob_shape *shape, GROUP_SPACE const blob_edges *edges, blob_layout layout,
                      int is_wanted, real reach, GROUP_SPACE blob_room *room) {
-    const real cosine = cos(shape->angle), sine = sin(shape->angle);
+    const real cosine = cosine_of(*shape), sine = sine_of(*shape);
     const laned_shape near = {(reals)shape->x, (reals)shape->y, (reals)shape->size};
     real least = SPOKES * reach * reach;
 #ifdef IN_GROUP
@@ -157,17 +168,20 @@ INLINE void start_of(GROUP_SPACE blob_shape *shape, GROUP_SPACE const blob_edges
     if (!is_wanted) return;
     blob_circuit circuit;
     wrap(edges, layout, cosine, sine, &circuit);
+    laned_shape best = near;
+    reals losses = (reals)least;
     for (int p = 0; p < PATTERNS; p++)
         for (int i = 0; i < PADDED_SPOKES; i += LANES) {
             laned_shape tried;
             const reals loss = start_loss(&circuit, p, i, near, reach, &tried);
-            if (!any_lane(mask_of(loss < (reals)least))) continue;
-            for (int lane = 0; lane < LANES; lane++) {
-                if (!(LANE(loss, lane) < least)) continue;
-                least = LANE(loss, lane);
-                shape->x = LANE(tried.x, lane), shape->y = LANE(tried.y, lane), shape->size = LANE(tried.size, lane);
-            }
+            const masks better = mask_of(loss < losses);
+            losses = better ? loss : losses;
+            best.x = better ? tried.x : best.x;
+            best.y = better ? tried.y : best.y;
+            best.size = better ? tried.size : best.size;
         }
+    const int lane = lowest_bit(lane_bits(mask_of(losses == (reals)least_of(losses))));
+    shape->x = LANE(best.x, lane), shape->y = LANE(best.y, lane), shape->size = LANE(best.size, lane);
 #endif
 }
 

@@ -32,6 +32,7 @@ from gpuvision.host import (
     Variant,
     flags,
     round_up,
+    type_defines,
 )
 from gpuvision.matching.features.ruler import RulerEdges, RulerTable
 from gpuvision.matching.robust import efficiency, loss_defines
@@ -48,7 +49,7 @@ TUNING_CONSTANT = 6.0
 MAX_SPOKES = 256
 _LANES, _GROUP = 16, 64
 _SHARES_PER_CORE = 4  # work-items per core: balances the cores
-_INLINE = 8  # blobs up to which one thread is faster than waking a second one (measured)
+_INLINE = 24  # blobs up to which one thread is faster than waking a second one (measured)
 # Polarity along a ruler across the contour, which points out of the blob.
 _POLARITIES: dict[str, Literal["falling", "rising", "any"]] = {"bright": "falling", "dark": "rising", "either": "any"}
 
@@ -276,7 +277,7 @@ class FindBlobs(VisionOperation[Blobs]):
             work=work,
             more_inputs=[((self.count, freedoms), build.real)],
             outputs=build.outputs(shapes | ({"angle": None} if self._round else {}), inliers=np.int32),
-            defines={**edges.defines, **self._defines(freedoms)},
+            defines={**edges.defines, **type_defines("CODE", dtype, 16), **self._defines(freedoms)},
             arguments=[
                 self._table(edges),
                 self._layout().astype(build.real),

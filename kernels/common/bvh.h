@@ -7,6 +7,7 @@
 // gpuvision/simulation/scene/bvh.py builds the tree.
 //
 // Build options: BVH_DEPTH, not less than the number of nodes on any path from the root; REAL_IS_DOUBLE; VECTOR_VARIANT;
+// CONVEX_PARTS (occluded_irradiance only);
 // FOUR_WIDE, work-item variant: nodes with four children and leaves with four triangles. A work-item tests a whole node or
 // leaf with vectors of four: 6 or 9 loads of 16 bytes in single precision. The items of a warp read different nodes, and
 // each load of an item touches a sector: with 16 children and loads of single numbers these are 96 sectors for a node.
@@ -74,6 +75,9 @@ typedef struct {
     global const int *axes;      // (n,): axis along which the children are sorted
     global const real *leaves;   // (m, 9, WIDTH): x, y, z of the first corners, of the second, of the third
     global const int *triangles; // (m, WIDTH): triangle indices
+#ifdef CONVEX_PARTS
+    global const real *parts; // (m, PART_ROW): convex parts (occluded_irradiance/visible.h)
+#endif
 } bvh_tree;
 
 // Reciprocal of a direction component. A component near zero is replaced by 1e-30: the slab of a parallel ray is then

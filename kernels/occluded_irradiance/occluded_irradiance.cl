@@ -9,7 +9,8 @@
 // Outputs: irradiance (strips, each) [W/m2]; left, right (strips,); status (strips, each) flags.
 // Options: INPUT (type of the inputs), REAL_IS_DOUBLE, DOUBLE_POSITIONS or, in the work-item variant,
 //          TWO_FLOAT_POSITIONS (common/places.h), SELECTED, GROUP (size of a work-group), BVH_DEPTH;
-//          INTERVALS (exact visibility, visible.h), RAYS (shadow rays to `samples` parts of a segment); without both:
+//          INTERVALS (exact visibility, visible.h), CONVEX_PARTS (INTERVALS in the vector variant: some leaves belong to
+//          convex parts), RAYS (shadow rays to `samples` parts of a segment); without both:
 //          no occlusion.
 // Variants: vector: a work-item per share of the strips, 16 receivers in a vector (receiver_blocks.h); work-item: a
 //          work-group per strip, a pair of a receiver and a segment per item (lit_pairs.h).
@@ -27,16 +28,24 @@
 #else
 #define SEGMENT_LISTS
 #endif
+#ifdef CONVEX_PARTS
+#define PARTS global const real *restrict parts,
+#else
+#define PARTS
+#endif
 
 #ifdef VECTOR_VARIANT
 AS_IT_IS kernel void occluded_irradiance(
     global const INPUT *restrict receivers, global const INPUT *restrict weights, global const INPUT *restrict segments,
     SEGMENT_LISTS global real *restrict irradiance, global real *restrict left, global real *restrict right,
     global uchar *restrict status, global const real *nodes, global const int *children, global const int *axes,
-    global const real *leaves, global const int *triangles, constant place *middle, const real clearance,
+    global const real *leaves, global const int *triangles, PARTS constant place *middle, const real clearance,
     const uint samples, const uint each, const uint segment_count, const uint pick_count, const uint strips
 ) {
-    const bvh_tree tree = {nodes, children, axes, leaves, triangles};
+    bvh_tree tree = {nodes, children, axes, leaves, triangles};
+#ifdef CONVEX_PARTS
+    tree.parts = parts;
+#endif
     const ulong group = get_group_id(0), groups = get_num_groups(0);
     const uint of_strip = (each + LANES - 1) / LANES; // blocks of a strip
     const ulong end_block = strips * (group + 1) / groups * of_strip;

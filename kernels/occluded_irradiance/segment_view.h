@@ -49,6 +49,9 @@ static inline view view_from(const segment_axes *of, const placement *from, cons
     // Occluders lie above the lit surface and above the receiver's surface.
     v.halves[4] = view_half_of(&v, of->ex, of->ey, of->ez, over - height);
     v.halves[5] = view_half_of(&v, at->nx, at->ny, at->nz, v.lift);
+#ifdef CONVEX_PARTS
+    v.above = v.halves[5].least + (real)16 * (real)REAL_EPSILON * (fabs(at->x) + fabs(at->y) + fabs(at->z));
+#endif
     return v;
 }
 #endif

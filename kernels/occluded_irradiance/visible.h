@@ -18,6 +18,9 @@
 #define SMALLEST_WINDOW ((real)0.0001)
 // Smallest gap between two hidden intervals; smaller gaps are rounding.
 #define SMALLEST_GAP ((real)4 * (real)REAL_EPSILON)
+// Numbers of a row of bvh_tree.parts (ConvexParts.table in gpuvision/simulation/scene/convex_parts.py): lower corner of the
+// box, 0, upper corner, 0; apex, axis and squared sine of the cone, 0.
+#define PART_ROW 16
 
 // Half-space x X + y Y + z Z >= least; at_x, at_y, at_z: offsets in a node of the box corner farthest along (x, y, z).
 typedef struct {
@@ -37,6 +40,9 @@ typedef struct {
     real from, to;                                    // window: part of the segment that is searched
     real low_x, low_y, low_z, high_x, high_y, high_z; // bounding box of the point and the window
     view_half halves[VIEW_HALVES];                    // occluders reach into all of these
+#ifdef CONVEX_PARTS
+    real above;                                       // x X + y Y + z Z of halves[5] from which a place is surely in it
+#endif
 } view;
 
 // Hidden intervals in local memory, in groups of HIDDEN_GROUP items: number n of an item is HIDDEN_GROUP numbers after
@@ -246,9 +252,6 @@ INLINE void view_shadows(const view *view, global const real *leaf, shadows *cas
     const reals first = (beyond1 ? cut_along : along1) / (beyond1 ? cut_deep : deep1);
     const reals last = (beyond2 ? cut_along : along2) / (beyond2 ? cut_deep : deep2);
     cast->low = hides ? lane_min(first, last) : cast->low, cast->high = hides ? lane_max(first, last) : cast->high;
-#ifdef VECTOR_VARIANT
-    shadows_join(cast);
-#endif
 }
 
 INLINE void hidden_begin(hidden *all, real from, real to) {
@@ -316,17 +319,78 @@ INLINE void hidden_add_all(hidden *all, const shadows *cast) {
 #endif
 }
 
+#ifdef CONVEX_PARTS
+// Smallest of the lanes, by halves.
+INLINE real least_lane(reals v) {
+    const real8 half_of_it = v.lo < v.hi ? v.lo : v.hi;
+    const real4 quarter = half_of_it.lo < half_of_it.hi ? half_of_it.lo : half_of_it.hi;
+    const real even = quarter.x < quarter.z ? quarter.x : quarter.z, odd = quarter.y < quarter.w ? quarter.y : quarter.w;
+    return even < odd ? even : odd;
+}
+
+// Smallest x p for p from low to high.
+INLINE real least_product(real x, real low, real high) {
+    const real one = x * low, other = x * high;
+    return one < other ? one : other;
+}
+
+// Whether the convex part of a leaf lies above the receiver's surface. `part`: row of the leaf in bvh_tree.parts, with the
+// box around the part; it is infinite for a leaf whose triangles do not all belong to one convex part.
+INLINE int view_part_is_above(const view *view, global const real *part) {
+    const view_half *surface = view->halves + 5;
+    return least_product(surface->x, part[0], part[4]) + least_product(surface->y, part[1], part[5]) +
+               least_product(surface->z, part[2], part[6]) >=
+           view->above;
+}
+
+// Whether the point lies in the cone from which all triangles of a leaf of a convex part face away.
+INLINE int view_is_behind(const view *view, global const real *part) {
+    const real x = part[8] - view->x, y = part[9] - view->y, z = part[10] - view->z;
+    const real along = x * part[11] + y * part[12] + z * part[13];
+    return along > 0 && along * along >= part[14] * (x * x + y * y + z * z);
+}
+#endif
+
 // Add the shadows of the leaves among a node's children. Returns the children that are nodes.
+//
+// CONVEX_PARTS (vector variant): a convex solid above the receiver's surface is seen from outside. It hides one interval,
+// and each ray that meets it enters through a triangle that faces the point, above the receiver's surface. So leaves of its
+// surface whose triangles all face away are left out, and the shadows of another leaf are added as one interval from the
+// smallest low to the largest high: the solid hides all between them. Merging single shadows takes as long as their
+// arithmetic, because its branches depend on the data.
 INLINE uint view_leaves(const bvh_tree *tree, const view *view, int node, uint met, hidden *all) {
     global const int *children = tree->children + node * WIDTH;
 #ifdef VECTOR_VARIANT
     const uint leaves = met & lane_bits(to_masks(*(global const ints_at *)children < 0));
     // Compute all shadows before any is merged: merging branches on the data and would stall the arithmetic of the next.
-    shadows cast[WIDTH];
-    int count = 0;
-    for (uint left = leaves; left; left &= left - 1)
-        view_shadows(view, tree->leaves + (size_t)~children[lowest_bit(left)] * (9 * WIDTH), cast + count++);
-    for (int n = 0; n < count && !hidden_is_done(all); n++) hidden_add_all(all, cast + n);
+    shadows single[WIDTH];
+    int single_count = 0;
+#ifdef CONVEX_PARTS
+    real low[WIDTH], high[WIDTH];
+    int part_count = 0;
+#endif
+    for (uint left = leaves; left; left &= left - 1) {
+        const size_t leaf = ~children[lowest_bit(left)];
+        shadows *cast = single + single_count;
+#ifdef CONVEX_PARTS
+        global const real *part = tree->parts + PART_ROW * leaf;
+        const int is_part = view_part_is_above(view, part);
+        if (is_part && view_is_behind(view, part)) continue;
+#endif
+        view_shadows(view, tree->leaves + leaf * (9 * WIDTH), cast);
+#ifdef CONVEX_PARTS
+        if (is_part) {
+            low[part_count] = least_lane(cast->low), high[part_count++] = -least_lane(-cast->high);
+            continue;
+        }
+#endif
+        shadows_join(cast);
+        single_count++;
+    }
+#ifdef CONVEX_PARTS
+    for (int n = 0; n < part_count && !hidden_is_done(all); n++) hidden_add(all, low[n], high[n]);
+#endif
+    for (int n = 0; n < single_count && !hidden_is_done(all); n++) hidden_add_all(all, single + n);
     return met & ~leaves;
 #else
     uint inner = 0;

@@ -80,7 +80,12 @@ class Bvh:
 
     @classmethod
     def build(
-        cls, corners: npt.NDArray[Any], wanted: npt.NDArray[np.bool_] | None = None, *, width: int = WIDTH
+        cls,
+        corners: npt.NDArray[Any],
+        wanted: npt.NDArray[np.bool_] | None = None,
+        *,
+        width: int = WIDTH,
+        parts: Integers | None = None,
     ) -> Bvh:
         """Build a BVH.
 
@@ -92,6 +97,9 @@ class Bvh:
             bool (n,), triangles that belong to the tree; None: all.
         width
             Most children of a node and triangles of a leaf, 4 or more, because up to four triangles are bundled.
+        parts
+            int (n,), number of the convex part of each triangle that belongs to the tree, -1 for none; None: no parts.
+            A leaf holds triangles of one part, with similar normals, or triangles of no part.
 
         Raises
         ------
@@ -121,7 +129,8 @@ class Bvh:
         rows -= middle[:, None]
         extents = np.concatenate([rows.min(axis=0), -rows.max(axis=0)])
         moved = rows.reshape(9, -1).T.reshape(-1, 3, 3)
-        binary = _binary_tree(extents, width)
+        bundles = _bundles(extents) if parts is None else _part_bundles(extents, moved, parts, width)
+        binary = _binary_tree(extents, bundles, width)
         children, depth = _collapse(binary, width)
         boxes = binary.extents.T[children].transpose(0, 2, 1)
         boxes[:, 3:] *= -1.0
@@ -169,10 +178,13 @@ class Bvh:
         """Build option ``BVH_DEPTH``: the depth as a power of two, not below `MIN_STACK_SIZE`."""
         return capacity(self.depth, least=MIN_STACK_SIZE)
 
+    def rounding(self, real: np.dtype[Any]) -> float:
+        """Return a bound of the rounding of coordinates in a real type [m], by which the boxes grow."""
+        return rounding_of(float(np.abs(self.corners).max(initial=0.0)), real)
+
     def tables(self, real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
         """Return nodes, children, axes, leaves and triangle numbers for kernels/common/bvh.h, in a real type."""
-        reach = float(np.abs(self.corners).max(initial=0.0))
-        pad = _BOX_PADDING_ULPS * float(np.finfo(real).eps) * reach
+        pad = self.rounding(real)
         nodes = self.boxes.copy()
         nodes[:, :3] -= pad
         nodes[:, 3:] += pad
@@ -244,19 +256,56 @@ def radix_argsort(key: Integers) -> Integers:
     return order
 
 
+def rounding_of(reach: float, real: np.dtype[Any]) -> float:
+    """Return a bound of the rounding of coordinates up to `reach` [m] to a real type [m]."""
+    return _BOX_PADDING_ULPS * float(np.finfo(real).eps) * reach
+
+
+def _part_bundles(extents: Reals, corners: Reals, parts: Integers, width: int) -> _Bundles:
+    """Bundle up to `width` triangles of a part with similar normals; bundle other triangles as `_bundles` does.
+
+    Each bundle of a part fills a leaf: its last triangle is repeated. The triangles of a part are split by their
+    normals as other triangles are by their places.
+    """
+    solid, loose = np.flatnonzero(parts >= 0), np.flatnonzero(parts < 0)
+    solid = solid[np.argsort(parts[solid], kind="stable")]
+    each = np.arange(len(solid))
+    normals = unit_normals(corners[solid]).T
+    single = _Bundles(each, each, np.ones_like(each), np.concatenate([normals, -normals]).astype(np.float32))
+    forest = _BinaryTree(single.size, np.flatnonzero(np.diff(parts[solid], prepend=-1)))
+    _split(forest, single, _FINE_BINS, width)
+    leaves = np.flatnonzero(forest.left < 0)
+    start, last = forest.start[leaves, None], (forest.start + forest.count)[leaves, None] - 1
+    groups = solid[forest.order[np.minimum(start + np.arange(width), last)]]
+    rest, count = _bundles(extents[:, loose]), len(groups)
+    return _Bundles(
+        np.append(groups, loose[rest.order]),
+        np.append(np.arange(count) * width, groups.size + rest.first),
+        np.append(np.full(count, width), rest.size),
+        np.concatenate([extents[:, groups].min(axis=2).astype(np.float32), rest.extents], axis=1),
+    )
+
+
+def unit_normals(corners: Reals) -> Reals:
+    """Return unit normals (..., 3) of triangles (..., 3, 3)."""
+    normals = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+    return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+
+
 class _BinaryTree:
-    """Binary tree over bundles during its construction: arrays over its nodes.
+    """Binary trees over bundles during their construction: arrays over their nodes.
 
     ``left`` is the left child of a node, -1 for a leaf; the right child is left + 1. ``count`` is the number of bundles
     of a node, ``load`` its number of triangles, ``start`` its first bundle in ``order``.
     """
 
-    def __init__(self, size: Integers) -> None:
+    def __init__(self, size: Integers, roots: Integers) -> None:
+        """Start with one node per tree; `roots`: the first bundle of each."""
         self.order: Integers = np.arange(len(size))
-        self.start: Integers = np.zeros(1, np.int64)
-        self.count: Integers = np.full(1, len(size))
-        self.load: Integers = np.full(1, size.sum())
-        self.left: Integers = np.full(1, -1)
+        self.start: Integers = roots
+        self.count: Integers = np.diff(roots, append=len(size))
+        self.load: Integers = np.add.reduceat(size, roots)
+        self.left: Integers = np.full(len(roots), -1)
         self.triangles: Integers = np.zeros(0, np.int64)
         self.begins: Integers = np.zeros(0, np.int64)
         self.extents: Reals = np.zeros((6, 0))
@@ -292,20 +341,25 @@ class _BinaryTree:
             self.extents[:, nodes] = np.minimum(self.extents[:, left], self.extents[:, left + 1])
 
 
-def _binary_tree(extents: Reals, width: int) -> _BinaryTree:
+def _binary_tree(extents: Reals, bundles: _Bundles, width: int) -> _BinaryTree:
     """Build the binary tree over triangles with the given extents, (6, n)."""
-    bundles = _bundles(extents)
-    tree, levels = _BinaryTree(bundles.size), []
+    tree = _BinaryTree(bundles.size, np.zeros(1, np.int64))
+    levels = _split(tree, bundles, _FINE_BINS if extents.shape[1] <= _FEW_TRIANGLES else _BINS, width)
+    tree.unbundle(bundles)
+    tree.measure(extents, levels)
+    return tree
+
+
+def _split(tree: _BinaryTree, bundles: _Bundles, bins: int, width: int) -> list[Integers]:
+    """Split all nodes with more than `width` triangles; return the nodes that were split, level by level."""
+    levels = []
     active = np.flatnonzero(tree.load > width)
-    bins = _FINE_BINS if extents.shape[1] <= _FEW_TRIANGLES else _BINS
     while len(active):
         levels.append(active)
         halve = len(levels) > _MAX_HEURISTIC_DEPTH
         fresh = _split_level(tree, active, bundles, bins, width, halve=halve)
         active = fresh[tree.load[fresh] > width]
-    tree.unbundle(bundles)
-    tree.measure(extents, levels)
-    return tree
+    return levels
 
 
 def _split_level(
@@ -374,6 +428,8 @@ def _members(tree: _BinaryTree, leaves: Integers, width: int) -> Integers:
     places = tree.begins[leaves, None] + np.arange(width)
     members: Integers = tree.triangles[np.minimum(places, len(tree.triangles) - 1)]
     members[np.arange(width) >= tree.load[leaves, None]] = -1
+    is_repeated = members[:, 1:] == members[:, :-1]
+    members[:, 1:][is_repeated] = -1
     return members
 
 

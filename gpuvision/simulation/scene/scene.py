@@ -15,6 +15,7 @@ import numpy.typing as npt
 from gpuvision.host.errors import ReadError
 from gpuvision.host.reading import reading
 from gpuvision.simulation.scene.bvh import GPU_WIDTH, WIDTH, Bvh, radix_argsort
+from gpuvision.simulation.scene.convex_parts import ConvexParts, ConvexSurfaces
 from gpuvision.simulation.scene.mesh_file import SUFFIXES, check_mesh
 
 # Multiplier of the hash: 2^64 over the golden ratio, made odd (Fibonacci hashing, Knuth).
@@ -104,14 +105,26 @@ class Scene:
         return self._tree(WIDTH)
 
     @functools.cached_property
+    def convex_parts(self) -> ConvexParts:
+        """Convex parts of the triangles of `bvh` and a tree over them, built at the first use."""
+        good = self._is_in_tree
+        surfaces = ConvexSurfaces.of(self.corners[good])
+        is_plain = not surfaces.is_convex.any()
+        return ConvexParts.of(self.bvh if is_plain else Bvh.build(self.corners, good, parts=surfaces.parts), surfaces)
+
+    @functools.cached_property
     def gpu_bvh(self) -> Bvh:
         """BVH over the same triangles with four children per node, for GPUs; built at the first use."""
         return self._tree(GPU_WIDTH)
 
-    def _tree(self, width: int) -> Bvh:
+    @property
+    def _is_in_tree(self) -> npt.NDArray[np.bool_]:
         good = np.ones(len(self.corners), bool)
         good[[*self.defects.not_finite, *self.defects.degenerate]] = False
-        return Bvh.build(self.corners, good, width=width)
+        return good
+
+    def _tree(self, width: int) -> Bvh:
+        return Bvh.build(self.corners, self._is_in_tree, width=width)
 
     @classmethod
     def of(cls, meshes: Any, *, metres: float = 1.0) -> Scene:

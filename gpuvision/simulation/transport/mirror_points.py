@@ -23,7 +23,7 @@ from gpuvision.host import (
 )
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.bvh import Bvh
-from gpuvision.simulation.scene.closed_surfaces import vertex_numbers
+from gpuvision.simulation.scene.connected_surfaces import vertex_numbers
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.sheet_cut import concatenated_ranges
 

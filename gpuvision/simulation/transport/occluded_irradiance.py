@@ -157,7 +157,10 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
         is_valid = len(shape) == 3 and shape[-1] == 6 and shape[1] > 0
         build.check_shape(is_valid, "receivers (strips, n, 6), n at least 1")
         strips, each = shape[:2]
-        tree = self.scene.bvh
+        # Convex parts are used by the vector variant only, and compiled only for a scene that has some.
+        parts = self.scene.convex_parts if build.uses_vectors and self.visibility == "intervals" else None
+        tree = self.scene.bvh if parts is None else parts.tree
+        of_parts = [] if parts is None or not len(parts.leaves) else [parts.table(build.real)]
         if build.uses_vectors:
             work = WorkSize((min(strips, _SHARES_PER_CORE * device.compute_units),), (1,), vectors=True)
         else:
@@ -186,12 +189,14 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
                     DOUBLE_POSITIONS=not two_floats and device.has_double,
                     TWO_FLOAT_POSITIONS=two_floats,
                     INTERVALS=self.visibility == "intervals",
+                    CONVEX_PARTS=bool(of_parts),
                     RAYS=self.visibility == "rays",
                     SELECTED=self.selected is not None,
                 ),
             },
             arguments=[
                 *tree.tables(build.real),
+                *of_parts,
                 build.positions(tree.middle) if two_floats else tree.middle.astype(build.widest),
                 _clearance(self.clearance, self.scene, build.real, dtype),
                 np.uint32(self.samples),

@@ -70,6 +70,8 @@ class LightPaths:
         which varies slowly. Default 0.0.
     nodes : pair of ints
         Of `ViewRays`. Default ``(1, 1)``.
+    bounce_nodes : pair of ints, optional
+        Nodes for "multi-bounce" light, which is smooth: it needs fewer. Default: ``nodes``.
     spreads_rays : bool
         Of `ViewRays`: for readings that add up all bins. Default False.
     end_bins : int
@@ -78,6 +80,9 @@ class LightPaths:
     patch_size : float, optional
         Largest edge of the patches of the radiosity solution [m]; None: a sixteenth of the scene's diagonal. Towards
         concave edges the patches become smaller (`Patches.from_scene`).
+    solvers : dict of float to Radiosity
+        Radiosity solutions by size of the patches [m], which are used, and added if they are missing. Give the same
+        dictionary to several instances of a scene so that their form factors are computed once. Default: empty.
     tolerance : float
         Range error that omitted secondary light may cause [m], 0 or more; 0: all light is computed. See the notes.
         Default 0.0.
@@ -125,9 +130,11 @@ class LightPaths:
     sub_sheets: int = 1
     blur: float = 0.0
     nodes: tuple[int, int] = (1, 1)
+    bounce_nodes: tuple[int, int] | None = None
     spreads_rays: bool = False
     end_bins: int = 0
     patch_size: float | None = None
+    solvers: dict[float, Radiosity] = field(default_factory=dict, repr=False)
     tolerance: float = 0.0
     min_power: float = 0.0
     device: Device | None = None
@@ -136,6 +143,7 @@ class LightPaths:
     _direct: DirectLight = field(init=False, repr=False)
     _mirrors: Mirrors = field(init=False, repr=False)
     view_rays: ViewRays = field(init=False, repr=False)
+    _bounce_rays: ViewRays = field(init=False, repr=False)
     _radiosity: Radiosity | None = field(init=False, repr=False)
     _coarse_radiosity: Radiosity | None = field(init=False, repr=False)
     _clustered: ClusteredIrradiance = field(init=False, repr=False)
@@ -154,6 +162,8 @@ class LightPaths:
             spreads_rays=self.spreads_rays,
             device=device,
         )
+        bounce_nodes = self.nodes if self.bounce_nodes is None else self.bounce_nodes
+        bounce_rays = view_rays if bounce_nodes == self.nodes else replace(view_rays, nodes=bounce_nodes)
         if self.end_bins < 0:
             raise ValueError(f"LightPaths.end_bins is {self.end_bins}, expected 0 or more")
         direct = DirectLight(
@@ -178,6 +188,7 @@ class LightPaths:
         object.__setattr__(self, "_direct", direct)
         object.__setattr__(self, "_mirrors", mirrors)
         object.__setattr__(self, "view_rays", view_rays)
+        object.__setattr__(self, "_bounce_rays", bounce_rays)
         for name, factor in (("_radiosity", 1.0), ("_coarse_radiosity", 2.0)):
             made = self._make_radiosity(factor) if "multi-bounce" in self.paths else None
             object.__setattr__(self, name, made)
@@ -239,7 +250,10 @@ class LightPaths:
                 choice = select_paths({"multi-bounce": bound}, self.tolerance)
                 remaining, omitted = choice.remaining_tolerance, sum(choice.omitted.values())
                 if "multi-bounce" in choice.modelled:
-                    exposures["multi-bounce"], error = self._multi_bounce_exposure(seen, segments, exposures["direct"])
+                    rays = self._bounce_rays
+                    by_bounces = seen if rays is self.view_rays else rays.visible_surface(L)
+                    light, error = self._multi_bounce_exposure(by_bounces, segments, exposures["direct"])
+                    exposures["multi-bounce"] = light
                     statistics |= {"estimated error of patches [m]": error}
             statistics |= {"bound of multi-bounce left out [m]": omitted}
             if "diffuse-diffuse" in self.paths:
@@ -259,7 +273,7 @@ class LightPaths:
         found = []
         for solver in (self._radiosity, self._coarse_radiosity):
             light = solver.irradiance(seen.receivers, solver.solve(solver.direct_irradiance(segments)))
-            found.append(self.view_rays.exposure(seen, np.asarray(to_numpy(light.irradiance), np.float64)))
+            found.append(self._bounce_rays.exposure(seen, np.asarray(to_numpy(light.irradiance), np.float64)))
         readings = [StripErrorModel.from_exposure(self.view, direct + each, min_power=self.min_power) for each in found]
         read = direct.total() > self.min_power
         difference = readings[0].slope * np.abs(readings[0].position - readings[1].position)
@@ -320,8 +334,11 @@ class LightPaths:
         if size is None:
             corners = self.scene.corners.reshape(-1, 3)
             size = float(np.linalg.norm(np.ptp(corners, axis=0))) / 16.0
-        albedo = [each.albedo for each in self.materials]
-        return Radiosity.from_scene(self.scene, albedo, size=factor * size, graded=True, device=self.device)
+        size *= factor
+        if size not in self.solvers:
+            albedo = [each.albedo for each in self.materials]
+            self.solvers[size] = Radiosity.from_scene(self.scene, albedo, size=size, graded=True, device=self.device)
+        return self.solvers[size]
 
 
 def _widened(view: SensorView, bins: int) -> SensorView:

@@ -62,6 +62,8 @@ class SimulationTask:
         Range error that omitted light may cause [m]; 0: all light is computed. Default 0.0.
     patch_size
         Largest edge of the patches for multi-bounce light [m]; None: a sixteenth of the scene's diagonal.
+    bounce_nodes
+        Rays per bin along u and along v for multi-bounce light; None: `Light.nodes`, as for other indirect light.
     """
 
     part: Scene
@@ -71,6 +73,7 @@ class SimulationTask:
     paths: tuple[str, ...]
     tolerance: float = 0.0
     patch_size: float | None = None
+    bounce_nodes: tuple[int, int] | None = None
 
     @functools.cached_property
     def fingerprint(self) -> str:
@@ -233,6 +236,7 @@ def make_light_paths(task: SimulationTask, device: Device) -> LightPaths:
         sub_sheets=light.sub_sheets,
         blur=light.blur,
         nodes=light.nodes,
+        bounce_nodes=task.bounce_nodes,
         spreads_rays=is_psd,  # a strip adds up its bins; a pixel is read alone
         end_bins=math.ceil(_END_FRACTION * light.bins) if is_psd else 0,
         patch_size=task.patch_size,

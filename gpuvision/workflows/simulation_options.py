@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from gpuvision.sensor.simulated import require_light
 from gpuvision.simulation.sensors.readings import PATHS
@@ -67,8 +68,6 @@ class LightOptions:
     rays : list of Exposure
         Light of two diffuse reflections for the numbers of rays per bin, ascending. The last is the reference of all
         others: four times the rays of the finest option, spread (`ViewRays`). Empty without such light.
-    checks : dict of str to Exposure
-        Light of the finest options and of the reference by path, on the other profiles of the sample.
     """
 
     def __init__(self, sample: ProfileSample, tolerance: float, progress: Progress) -> None:
@@ -76,7 +75,7 @@ class LightOptions:
         self.setups: dict[float, float] = {}
         self.proven: dict[str, ErrorPart] = {}
         self.rays: list[Exposure] = []
-        self.checks: dict[str, Exposure] = {}
+        self._finest: list[tuple[SimulationSettings, dict[str, Any]]] = []
         self._paths = [each for each in scene_paths(sample.task) if each in sample.task.paths]
         self._tolerance, self._progress, self._done = tolerance, progress, 0
         self._bound_of_bounces = math.inf
@@ -93,15 +92,27 @@ class LightOptions:
         self.axes = [each for each in axes if each]
 
     def combinations(self) -> Iterator[list[Option]]:
-        """Yield the combinations of options in which diffuse and multi-bounce light have the same rays per bin."""
+        """Yield the combinations of an option of each axis."""
         for options in itertools.product(*self.axes):
-            if len({each.changes["nodes"] for each in options if "nodes" in each.changes}) < 2:
-                yield list(options)
+            yield list(options)
 
     def reference(self) -> dict[str, Exposure]:
         """Return the light with which all options are compared: of the finest ones, with more rays of diffuse light."""
         light = light_of_options([axis[-1] for axis in self.axes])
         return light | ({"diffuse-diffuse": self.rays[-1]} if self.rays else {})
+
+    def reference_at(self, places: npt.NDArray[np.float64]) -> dict[str, Exposure]:
+        """Compute the light of the reference on other profiles than those of the sample.
+
+        Parameters
+        ----------
+        places : numpy.ndarray
+            (profiles,): transports [m].
+        """
+        light: dict[str, Exposure] = {}
+        for settings, more in self._finest:  # the direct light of the first one is the finest
+            light = self.sample.light(settings, places, **{"runs": 1, **more}).exposures | light
+        return light
 
     def settings_of(self, options: Sequence[Option]) -> SimulationSettings:
         """Return the settings of a combination of options."""
@@ -170,8 +181,8 @@ class LightOptions:
     def _bounces(self) -> list[Option]:
         """Return no multi-bounce light, and such light for rays per bin and sizes of patches.
 
-        It is smooth, and takes most of the time: only every other number of rays is tried. There are no options if a
-        bound of such light is negligible.
+        It is smooth, and takes most of the time: every other number of rays is tried, and larger patches too. There are
+        no options if a bound of such light is negligible.
         """
         name = "multi-bounce"
         if name not in self._paths:
@@ -180,13 +191,14 @@ class LightOptions:
             self.proven["without multi-bounce"] = ErrorPart(self._bound_of_bounces, math.nan, is_bound=True)
             return []
         options = [Option({}, {}, 0.0)]
-        sizes = (2.0 * self.settings.patch_size, self.settings.patch_size)
+        sizes = tuple(factor * self.settings.patch_size for factor in (4.0, 2.0, 1.0))
         counts = self._nodes[::2]
         finest = (counts[-1], sizes[-1])
         for nodes, size in itertools.product(counts, sizes):
-            light = self._light(is_finest=(nodes, size) == finest, paths=("direct", name), nodes=nodes, patch_size=size)
-            options.append(self._option(name, light, nodes=nodes, patch_size=size))
-            self.setups[size] = light.setup
+            given: dict[str, Any] = {"bounce_nodes": nodes, "patch_size": size}
+            light = self._light(is_finest=(nodes, size) == finest, paths=("direct", name), nodes=nodes, **given)
+            options.append(self._option(name, light, **given))
+            self.setups.setdefault(size, light.setup)  # further light with these patches finds them prepared
         return options
 
     def _option(self, name: str, light: SampledLight, **changes: Any) -> Option:
@@ -194,20 +206,16 @@ class LightOptions:
         return Option({"paths": (name,), **changes}, exposures, max(light.seconds - self._least, 0.0))
 
     def _light(self, *, is_finest: bool, is_reference: bool = False, **changes: Any) -> SampledLight:
-        """Return the light of the sample; of finest options keep that of the other profiles for the check."""
+        """Return the light of the sample; keep the settings of the reference."""
         # The direct light that comes with other paths is only their reference: one slab suffices.
         settings = replace(self.settings, **{"sub_sheets": 1, "tolerance": 0.0, **changes})
-        count = len(self.sample.places)
-        places = np.concatenate([self.sample.places, self.sample.others]) if is_finest else self.sample.places
-        more = {"runs": 1, "spreads_rays": True} if is_reference else {}
-        light = self.sample.light(settings, places, **more)
+        more: dict[str, Any] = {"runs": 1, "spreads_rays": True} if is_reference else {}
+        if is_finest:
+            self._finest.append((settings, more))
+        light = self.sample.light(settings, **more)
         self._done += 1
         self._progress(self._done, None)
-        if is_finest:
-            new = {name: each for name, each in light.exposures.items() if name not in self.checks}
-            self.checks |= {name: Exposure(each.power[count:], each.moment[count:]) for name, each in new.items()}
-        cut = {name: Exposure(each.power[:count], each.moment[:count]) for name, each in light.exposures.items()}
-        return light._replace(exposures=cut)
+        return light
 
 
 def light_of_options(options: Sequence[Option]) -> dict[str, Exposure]:

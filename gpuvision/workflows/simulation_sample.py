@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,17 +16,18 @@ from gpuvision.ranging.line import LineReadout
 from gpuvision.sensor.simulated import make_sensor_view, make_simulator, require_light
 from gpuvision.simulation.sensors.readings import PATHS, Reading, Simulator, height_secant, stack_profiles
 from gpuvision.simulation.sensors.sensor_view import Exposure
+from gpuvision.simulation.transport.radiosity import Radiosity
 from gpuvision.status import Status
-from gpuvision.workflows.light_cache import SimulationTask, make_light_paths
+from gpuvision.workflows.light_cache import PROFILES_PER_BLOCK, SimulationTask, make_light_paths
 
 Float64 = npt.NDArray[np.float64]
 
-# Standard errors of the mean over the profiles by which the mean square error is raised. Chosen: the mean over all
-# profiles of a part exceeds it in few cases.
+# Standard errors of the mean over the profiles by which the mean square error is raised, and lowered. Chosen: the mean
+# over all profiles of a part lies beyond these limits in few cases.
 _STANDARD_ERRORS = 2.0
 # Runs of a light whose shortest time counts, and the time [s] after which it is not repeated. Chosen: pauses of a busy
-# machine hit one run or a few.
-RUNS, _LEAST_TIME = 5, 0.4
+# machine hit one run or a few. On a very busy one they hit each of five runs of 10 ms; 20 take most of the planning.
+RUNS, _LEAST_TIME = 8, 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +46,8 @@ class SimulationSettings:
         Largest edge of the patches for multi-bounce light [m].
     tolerance : float
         Range error that omitted or clustered pairs may cause [m]; 0: all pairs are computed. Default 0.0.
+    bounce_nodes : pair of ints, optional
+        Rays per bin along u and along v for multi-bounce light. Default: ``nodes``.
     """
 
     paths: tuple[str, ...]
@@ -52,6 +55,7 @@ class SimulationSettings:
     nodes: tuple[int, int]
     patch_size: float
     tolerance: float = 0.0
+    bounce_nodes: tuple[int, int] | None = None
 
     @classmethod
     def of(cls, task: SimulationTask) -> SimulationSettings:
@@ -66,6 +70,7 @@ class SimulationSettings:
             nodes=light.nodes,
             patch_size=size,
             tolerance=task.tolerance,
+            bounce_nodes=task.bounce_nodes,
         )
 
     def applied(self, task: SimulationTask) -> SimulationTask:
@@ -77,6 +82,7 @@ class SimulationSettings:
             paths=self.paths,
             tolerance=self.tolerance,
             patch_size=self.patch_size,
+            bounce_nodes=self.bounce_nodes,
         )
 
     @property
@@ -90,7 +96,8 @@ class SimulationSettings:
             clustered = f" {1e6 * self.tolerance:.3g} um" if self.tolerance else ""
             parts.append(f"diffuse {self.nodes[0]}x{self.nodes[1]}{clustered}")
         if "multi-bounce" in self.paths:
-            parts.append(f"bounces {1e3 * self.patch_size:.3g} mm")
+            u, v = self.nodes if self.bounce_nodes is None else self.bounce_nodes
+            parts.append(f"bounces {u}x{v} {1e3 * self.patch_size:.3g} mm")
         return ", ".join(parts)
 
 
@@ -129,7 +136,7 @@ def sample_light(
     device : Device
         Device of the kernels.
     runs : int
-        Largest number of runs, 1 or more; the shortest time counts. Default 5.
+        Largest number of runs, 1 or more; the shortest time counts. Default 8.
     **changes
         Other parameters of `LightPaths`.
     """
@@ -137,12 +144,16 @@ def sample_light(
     paths = replace(make_light_paths(task, device), **changes)
     paths.profile(float(places[0]))
     first = time.perf_counter() - start  # with the preparation
-    taken: list[float] = []
-    while not taken or (len(taken) < runs and sum(taken) < _LEAST_TIME):
+    start = time.perf_counter()
+    profiles = paths.profiles(places)
+    spent = time.perf_counter() - start
+    taken, block = [spent / len(places)], np.resize(places, PROFILES_PER_BLOCK)
+    while len(taken) < runs and spent < _LEAST_TIME:  # as many profiles as a simulation computes together
         start = time.perf_counter()
-        profiles = paths.profiles(places)
-        taken.append(time.perf_counter() - start)
-    seconds = min(taken) / len(places)
+        paths.profiles(block)
+        spent += time.perf_counter() - start
+        taken.append((time.perf_counter() - start) / len(block))
+    seconds = min(taken)
     exposures = stack_profiles([each.exposures for each in profiles])
     names = {name for each in profiles for name in each.statistics}
     statistics = {name: max(each.statistics.get(name, 0.0) for each in profiles) for name in names}
@@ -180,19 +191,26 @@ class Difference(NamedTuple):
     Attributes
     ----------
     error : float
-        Range error [m]: root mean square, raised by twice the standard error of its mean over the profiles.
+        Upper limit of the range error [m]: root of the mean square plus twice the standard error of this mean over
+        the profiles.
+    least : float
+        Lower limit of the range error [m]: root of the mean square minus twice its standard error, 0 at least.
     worst : float
         Largest range error [m].
     signal : float
         Root mean square of the difference of the signals, as a fraction of the root mean square signal.
     changed : float
         Fraction of the samples that only one of the readings reads, or that the readings read on different lines.
+    least_changed : float
+        Lower limit of this fraction: minus twice its standard error over the profiles, 0 at least.
     """
 
     error: float
+    least: float
     worst: float
     signal: float
     changed: float
+    least_changed: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -203,22 +221,22 @@ class SampleReader:
     ----------
     simulator : Simulator
         Sensor without a mask.
-    fraction : float
-        Sampled profiles as a fraction of all profiles, above 0 to 1: errors of all profiles have no standard error.
+    profiles : int
+        Number of profiles of the part: the mean error of all of them has no standard error.
     device : Device
         Device of the readout.
     """
 
     simulator: Simulator
-    fraction: float
+    profiles: int
     device: Device
 
     @classmethod
-    def of(cls, task: SimulationTask, profiles: int, device: Device) -> SampleReader:
-        """Return the reader for some profiles of a task."""
+    def of(cls, task: SimulationTask, device: Device) -> SampleReader:
+        """Return the reader for profiles of a task."""
         return cls(
             simulator=make_simulator(task.sensor, make_sensor_view(task.sensor)),
-            fraction=profiles / len(task.transports),
+            profiles=len(task.transports),
             device=device,
         )
 
@@ -248,29 +266,47 @@ class SampleReader:
         u = np.where(expected, reference.position, 0.0)
         slope = np.abs(height_secant(view.triangulation, u, u, view.v_centres))
         error = np.where(same, slope * moved, 0.0)
-        counted = int((read | expected).sum())
+        counted = read | expected
         strength = np.where(same, reference.strength, 0.0)
         change = np.where(same, found.strength - reference.strength, 0.0)
         total = float(np.sum(strength**2))
+        least, most = self._root_mean_square(error, same)
+        changed, deviation = self._mean(counted & ~same, counted)
         return Difference(
-            error=self._root_mean_square(error, same),
+            error=most,
+            least=least,
             worst=float(error.max(initial=0.0)),
             signal=math.sqrt(float(np.sum(change**2)) / total) if total > 0.0 else 0.0,
-            changed=(counted - int(same.sum())) / max(counted, 1),
+            changed=changed,
+            least_changed=max(changed - deviation, 0.0),
         )
 
-    def _root_mean_square(self, error: Float64, same: npt.NDArray[np.bool_]) -> float:
-        """Return the root mean square (profiles, samples) over the counted samples, raised by its standard error."""
-        counts = np.sum(same, axis=-1)
+    def _root_mean_square(self, error: Float64, same: npt.NDArray[np.bool_]) -> tuple[float, float]:
+        """Return limits of the root mean square (profiles, samples) over the counted samples, by its standard error."""
+        if not same.any():
+            return math.nan, math.nan
+        mean, deviation = self._mean(error**2, same)
+        return math.sqrt(max(mean - deviation, 0.0)), math.sqrt(mean + deviation)
+
+    def _mean(self, values: npt.NDArray[Any], counted: npt.NDArray[np.bool_]) -> tuple[float, float]:
+        """Return the mean of values (profiles, samples) over the counted samples, and twice its standard error.
+
+        All other values are 0. There is no standard error of a single profile, and of all profiles of the part.
+        """
+        sums, counts = np.sum(values, axis=-1), np.sum(counted, axis=-1)
         if not counts.any():
-            return math.nan
-        squares = np.sum(error**2, axis=-1)
-        mean = float(squares.sum() / counts.sum())
+            return 0.0, 0.0
+        mean = float(sums.sum() / counts.sum())
         if len(counts) < 2:
-            return math.sqrt(mean)
-        shares = squares - mean * counts  # residuals of the ratio estimate of the mean
+            return mean, 0.0
+        shares = sums - mean * counts  # residuals of the ratio estimate of the mean
         variance = float(np.sum(shares**2)) / (len(counts) - 1) / len(counts) / float(counts.mean()) ** 2
-        return math.sqrt(mean + _STANDARD_ERRORS * math.sqrt(variance * (1.0 - self.fraction)))
+        return mean, _STANDARD_ERRORS * math.sqrt(variance * max(1.0 - len(counts) / self.profiles, 0.0))
+
+
+def join_readings(readings: Sequence[Reading]) -> Reading:
+    """Return the readings (profiles, samples) of several groups of profiles as one."""
+    return Reading(*(np.concatenate(each) for each in zip(*readings, strict=True)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -283,22 +319,25 @@ class ProfileSample:
         The task.
     places : numpy.ndarray
         (profiles,): transports of the sample [m].
-    others : numpy.ndarray
-        (others,): transports of other profiles, to check results [m].
+    others : tuple of numpy.ndarray
+        (others,) each: transports of groups of other profiles, to judge settings more closely [m].
     reader : SampleReader
         Reader of the light.
     device : Device
         Device of the kernels.
+    solvers : dict of float to Radiosity
+        Radiosity solutions that `light` has made, by size of the patches [m]: they take most of the time.
     """
 
     task: SimulationTask
     places: Float64
-    others: Float64
+    others: tuple[Float64, ...]
     reader: SampleReader
     device: Device
+    solvers: dict[float, Radiosity] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, task: SimulationTask, profiles: int, device: Device, *, others: int = 0) -> ProfileSample:
+    def of(cls, task: SimulationTask, profiles: int, device: Device, *, others: Sequence[int] = ()) -> ProfileSample:
         """Return evenly spaced profiles of a task; all if it has fewer.
 
         Parameters
@@ -309,27 +348,32 @@ class ProfileSample:
             Number of profiles of the sample, 1 or more.
         device : Device
             Device of the kernels.
-        others : int
-            Number of evenly spaced profiles among the others, at most. Default 0.
+        others : sequence of int
+            Largest number of profiles of each group of other profiles, evenly spaced among the rest. Groups without
+            profiles are left out. Default: no groups.
         """
-        chosen = _spaced(np.arange(len(task.transports)), profiles)
-        rest = _spaced(np.setdiff1d(np.arange(len(task.transports)), chosen), others)
+        rest = np.arange(len(task.transports))
+        groups = []
+        for count in (profiles, *others):
+            chosen = _spaced(rest, count)
+            rest = np.setdiff1d(rest, chosen)
+            groups.append(task.transports[chosen])
         return cls(
             task=task,
-            places=task.transports[chosen],
-            others=task.transports[rest],
-            reader=SampleReader.of(task, len(chosen), device),
+            places=groups[0],
+            others=tuple(each for each in groups[1:] if len(each)),
+            reader=SampleReader.of(task, device),
             device=device,
         )
 
     def light(self, settings: SimulationSettings, places: Float64 | None = None, **changes: Any) -> SampledLight:
         """Compute the light of settings, on other places than those of the sample if given.
 
-        ``changes`` are other parameters of `LightPaths`, or ``runs`` of `sample_light`.
+        ``changes`` are other parameters of `LightPaths`, or ``runs`` of `sample_light`. The time of the preparation is
+        complete only for the first light with patches of a size.
         """
-        return sample_light(
-            settings.applied(self.task), self.places if places is None else places, self.device, **changes
-        )
+        where = self.places if places is None else places
+        return sample_light(settings.applied(self.task), where, self.device, **{"solvers": self.solvers, **changes})
 
 
 def _spaced(numbers: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:

@@ -38,7 +38,7 @@ def run(*words: str, out: str = "out") -> str:
 def test_a_plan_is_printed_drawn_and_reported(folder: Path) -> None:
     text = run("--plan", "--tolerance", "1mm", "--json", "plan.json")
     lines = text.splitlines()
-    columns = ["light", "us/prof.", "error", "change", "pairs", "finest", "worst", "signal", "moved"]
+    columns = ["light", "us/prof.", "error", "change", "pairs", "finest", "worst", "signal", "moved", "profiles"]
     assert lines[0].split() == columns
     assert sum(line.startswith("* direct ") for line in lines) == 1
     assert "predicted error" in lines[-2]

@@ -439,11 +439,11 @@ def test_a_setting_that_drops_a_part_is_no_accurate_one(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    ("tolerance", "rate", "chosen", "keeps_up"),
-    [(4.5, 0.5, "fast", True), (2.2, 0.9, "middle", False), (1.0, 0.5, None, True)],
+    ("tolerance", "rate", "chosen", "keeps_up", "room"),
+    [(4.5, 0.5, "fast", True, 1.5), (2.2, 0.9, "middle", False, 1.0 / 0.9), (1.0, 0.5, None, True, 1.0 / 1.2)],
 )
 def test_outcome_of_a_simulation(
-    monkeypatch: pytest.MonkeyPatch, tolerance: float, rate: float, chosen: str | None, keeps_up: bool
+    monkeypatch: pytest.MonkeyPatch, tolerance: float, rate: float, chosen: str | None, keeps_up: bool, room: float
 ) -> None:
     """The run of a chosen setting takes 1.5 times the planned time: half of the rate of the fastest one is kept."""
     names = list(SETTINGS)
@@ -464,7 +464,7 @@ def test_outcome_of_a_simulation(
         settings: Any = SimpleNamespace(paths=("direct",), name=fits[0])
         return SimpleNamespace(chosen=SimpleNamespace(settings=_Name(fits[0], settings), seconds=SETTINGS[fits[0]][0]))
 
-    def light(settings: Any) -> Any:
+    def light(settings: Any, **_: Any) -> Any:
         return SimpleNamespace(seconds=1.5 * SETTINGS[settings][0], setup=9.0, exposures=settings)
 
     truth = SimpleNamespace(sample=SimpleNamespace(light=light), error=lambda light, max_moved: SETTINGS[str(light)][2])
@@ -478,6 +478,7 @@ def test_outcome_of_a_simulation(
     found = simulation_plans.judge(np.random.default_rng(1), device)
     assert found.possible == (tolerance > 1.2)
     assert asked == [None if chosen is None else rate / SETTINGS[chosen][0]]
+    assert found.room == pytest.approx(room)
     if chosen is None:
         assert found.plan is None
         return

@@ -289,3 +289,14 @@ def test_bins_beyond_the_ends_have_the_width_of_the_last_ones(bins: int) -> None
     np.testing.assert_array_equal(wide[bins : bins + len(edges)], edges)
     steps = np.diff(wide)
     np.testing.assert_allclose(steps, [*[0.5e-3] * bins, *np.diff(edges), *[1.8e-3] * bins], rtol=1e-9)
+
+
+def test_multi_bounce_light_has_nodes_of_its_own(device):
+    """Light with 4 nodes, and with 1 for multi-bounce light, is the light of either number."""
+    found, few, many = (
+        paths(corner(), device, paths=(*PATHS, "multi-bounce"), patch_size=0.02, **nodes).profile(0.0).exposures
+        for nodes in ({"nodes": (2, 2), "bounce_nodes": (1, 1)}, {"nodes": (1, 1)}, {"nodes": (2, 2)})
+    )
+    for name, expected, other in (("diffuse-diffuse", many, few), ("multi-bounce", few, many)):
+        np.testing.assert_allclose(found[name].power, expected[name].power, rtol=1e-6)
+        assert np.abs(found[name].power - other[name].power).max() > 1e-4 * other[name].power.max()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -135,7 +136,8 @@ def test_light_paths_of_a_task(preset: str, end_bins: int, monkeypatch: pytest.M
         monkeypatch.setattr(light_cache, function, lambda sensor, name=name: (name, sensor))
     sensor = Sensor.load(preset)
     device: Any = "cpu"
-    assert make_light_paths(task_of(3, sensor), device) == "paths"
+    task = dataclasses.replace(task_of(3, sensor), bounce_nodes=(1, 2))
+    assert make_light_paths(task, device) == "paths"
     (options,) = made
     light = sensor.light
     assert light is not None
@@ -148,6 +150,7 @@ def test_light_paths_of_a_task(preset: str, end_bins: int, monkeypatch: pytest.M
         "sub_sheets": light.sub_sheets,
         "blur": light.blur,
         "nodes": light.nodes,
+        "bounce_nodes": (1, 2),
         "spreads_rays": preset == "psd_line",
         "end_bins": end_bins,
         "patch_size": 2e-3,

@@ -36,8 +36,9 @@ from gpuvision.workflows.simulation_sample import ProfileSample
 Progress = Callable[[int, int | None], object]
 
 # Profiles of a part up to which planning takes longer than it saves, with and without multi-bounce light. Measured on
-# PoCL: planning took the time of 115 profiles with it (one part), and of 279 to 402 profiles without it (two parts).
-_WORTH_BOUNCES, _WORTH = 120, 300
+# PoCL beside other work: planning took the time of 484 to 1067 profiles of the sensor file's light without it (two
+# sensors, two tolerances), and of 115 profiles with it (one part, before more profiles were tried).
+_WORTH_BOUNCES, _WORTH = 120, 1000
 # A setting whose error is undecided is worth more profiles if the fastest certain setting takes this many times its
 # time or more. Chosen: the largest ratio to the best setting that a plan should have, 1.5, less the scatter of times.
 _GAIN = 1.25

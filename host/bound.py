@@ -13,10 +13,12 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array
 
+from gpuvision.host.array_checks import check_apart, check_on_device, same_memory
 from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
 from gpuvision.host.build_notice import building
 from gpuvision.host.constant_memory import fitting_defines
 from gpuvision.host.device import Device
+from gpuvision.host.events import COMPLETE, are_complete, flush_queues
 from gpuvision.host.failure import launch_failure
 from gpuvision.host.launch import Launch, Launchable, Spec, describe_launch
 from gpuvision.host.limits import fit_work
@@ -25,7 +27,6 @@ from gpuvision.host.program import build
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
-_COMPLETE = cl.command_execution_status.COMPLETE
 # Launches that move fewer bytes run inline. Measured: one core of a PC moves 1 MiB in about the time that PoCL needs to
 # wake two worker threads.
 _SHORT_BYTES = 1 << 20
@@ -269,13 +270,13 @@ class Bound(Generic[R]):
         event of the other.
         """
         site = self._call_site
-        if site is self._inline_site and _are_complete(wait_for):
+        if site is self._inline_site and are_complete(wait_for):
             self._finish_queue()
         elif site is self._inline_site:
             site = self._queue_site
         if given is not site.given:
             self._set_arrays(site, given)
-        _flush_queues(wait_for, self.queue)
+        flush_queues(wait_for, self.queue)
         if self._empty:
             return cl.enqueue_marker(self.queue, wait_for=wait_for)
         if site.inline:
@@ -301,7 +302,7 @@ class Bound(Generic[R]):
         targets = self._computed(out)
         for (name, (shape, dtype)), array in zip(self._computed_specs.items(), targets, strict=True):
             check_host(array, shape, dtype, f"out.{name}")
-        _check_apart(frames, targets, np.may_share_memory)
+        check_apart(frames, targets, np.may_share_memory)
         if self._empty:
             return out
         try:
@@ -396,16 +397,16 @@ class Bound(Generic[R]):
             given, site.given, self._places, self._array_specs, strict=True
         ):
             if array is not before:
-                # The conditions of `_check`, which costs as much again for its call.
+                # The conditions of `check_on_device`, which costs as much again for its call.
                 is_array = isinstance(array, cl.array.Array)
                 if not is_array or array.dtype != dtype or array.shape != shape or array.context != context:
-                    self._check(array, shape, dtype)
+                    check_on_device(array, shape, dtype, self.device)
                 changed.append((place, known.get(id(array)) or memory_of(array)))
         # A memory object is repeated for three reasons: the same input twice and empty arrays are allowed, an output
         # that shares memory with another array is refused. Without a repetition the comparison of arrays is skipped.
         if changed and len({id(array.base_data) for array in given}) < len(given):
             inputs = len(self.inputs)
-            _check_apart(given[:inputs], given[inputs:], _same_memory)
+            check_apart(given[:inputs], given[inputs:], same_memory)
         for place, memory in changed:
             site.kernel.set_arg(place, memory)
         site.given = given
@@ -418,16 +419,6 @@ class Bound(Generic[R]):
             if (array is not None) != (name in self._computed_specs):
                 defect = "is missing" if array is None else "is not computed; expected None"
                 raise ValueError(f"out.{name} {defect}")
-
-    def _check(self, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-        if not isinstance(array, cl.array.Array):
-            raise TypeError(f"expected a pyopencl array on {self.device.label}, got {type(array).__name__}")
-        if array.dtype != dtype:
-            raise TypeError(f"expected dtype {dtype}, got {array.dtype}; bind the operation to it")
-        if array.shape != shape:
-            raise ValueError(f"expected shape {shape}, got {array.shape}; bind the operation to it")
-        if array.context != self.device.context:
-            raise ValueError(f"the array lies on another device than {self.device.label}; copy it there first")
 
     def _clear(self, array: DeviceArray) -> None:
         if self.device.shares_memory:
@@ -469,7 +460,7 @@ class Bound(Generic[R]):
     def _hold(self, event: Any, given: tuple[Any, ...]) -> None:
         """Keep references to arrays of the caller until the kernel has run."""
         flight = self._in_flight
-        while flight and flight[0][0].command_execution_status <= _COMPLETE:
+        while flight and flight[0][0].command_execution_status <= COMPLETE:
             flight.popleft()
         flight.append((event, given))
 
@@ -478,35 +469,6 @@ def _buffer_over(context: Any, array: DeviceArray) -> Any:
     """Return a buffer over the shared memory of an array."""
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
     return cl.Buffer(context, flags, hostbuf=host_view(array)) if array.nbytes else None
-
-
-def _are_complete(events: Sequence[Any]) -> bool:
-    """Return whether commands have ended; an error counts as an end."""
-    return all(each.command_execution_status <= _COMPLETE for each in events)
-
-
-def _flush_queues(events: Sequence[Any], queue: Any) -> None:
-    """Flush the other queues of some events before `queue` waits for them.
-
-    OpenCL 3.0, 5.15: a queue may wait forever for an event of another queue that was not flushed. Mesa's rusticl does.
-    """
-    for event in events:
-        if event.command_execution_status > _COMPLETE:
-            other = event.get_info(cl.event_info.COMMAND_QUEUE)  # None: an event that the user completes
-            if other is not None and other != queue:
-                other.flush()
-
-
-def _same_memory(one: DeviceArray, other: DeviceArray) -> bool:
-    """Return whether two arrays have the same memory; pyopencl gives an empty array no memory."""
-    return one.base_data is not None and one.base_data is other.base_data
-
-
-def _check_apart(inputs: Sequence[Any], outputs: Sequence[Any], same: Callable[[Any, Any], bool]) -> None:
-    """Check that no output is an input or another output, because kernels read and write in any order."""
-    for number, output in enumerate(outputs):
-        if any(same(output, other) for other in (*inputs, *outputs[:number])):
-            raise ValueError("an output shares its memory with an input or another output; expected arrays apart")
 
 
 def _refuse_calls() -> None:

@@ -19,6 +19,7 @@ from gpuvision.host import discovery
 from gpuvision.host.arrays import SHARED_FLAGS, DeviceArray
 from gpuvision.host.double_rate import SLOW_RATIO, double_ratio
 from gpuvision.host.errors import DeviceLimitError, DeviceMemoryError, DeviceUnusableError, NoDeviceError
+from gpuvision.host.events import COMPLETE
 from gpuvision.host.failure import launch_failure
 from gpuvision.host.huge_pages import advise_huge_pages
 from gpuvision.host.kept import clear_with
@@ -27,7 +28,6 @@ from gpuvision.host.text import printable, size_in_words
 from gpuvision.host.trace import active_trace
 
 VARIABLE = "GPUVISION_DEVICE"
-_COMPLETE = cl.command_execution_status.COMPLETE
 # Time for which `Device.wait` polls an event before it sleeps: longer than a small frame takes to compute, so that only
 # long kernels pay the delay of waking the calling thread.
 _POLLING_NS = 200_000
@@ -303,7 +303,7 @@ class Device:
         """
         if self.kind == "pocl":
             end = time.perf_counter_ns() + _POLLING_NS
-            while event.command_execution_status > _COMPLETE and time.perf_counter_ns() < end:
+            while event.command_execution_status > COMPLETE and time.perf_counter_ns() < end:
                 os.sched_yield()  # a worker thread of the runtime may be waiting for this core
         event.wait()
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import pyopencl as cl
 
+from gpuvision.host.events import COMPLETE
 from gpuvision.host.kept import drop_bound
 from gpuvision.host.outputs import Outputs, release, reserve
 from gpuvision.host.stages import record_stages
@@ -34,7 +35,6 @@ _LANES = {
     "wait": _CONSUMER,
     "sink": _CONSUMER,
 }
-_COMPLETE = cl.command_execution_status.COMPLETE
 # Allowed contradiction between bounds of the offset of two clocks (chosen): [ns] for the resolution of the times, and
 # five times the drift of two oscillators that are 1e-4 off each. Mesa's rusticl 22.3 counts 0, 1, 2, 3 instead of
 # nanoseconds.
@@ -259,7 +259,7 @@ class Trace:
             try:
                 if wait:
                     command.event.wait()
-                elif command.queue in busy or command.event.command_execution_status > _COMPLETE:
+                elif command.queue in busy or command.event.command_execution_status > COMPLETE:
                     busy.add(command.queue)
                     left.append(command)
                     continue

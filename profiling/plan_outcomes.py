@@ -35,7 +35,10 @@ class Outcome(NamedTuple):
         Largest factor by which a setting is truly more accurate than the tolerance and faster than the rate; NaN if
         unknown.
     note : str
-        Measured numbers for the line of the job. Default: none.
+        Measured numbers, or the reason of a refusal, for the line of the job. Default: none.
+    is_known : bool
+        Whether the search for the best setting was complete. Default True. Otherwise a cost of NaN is unknown, and so
+        is whether a refused job was possible.
     """
 
     plan: AccuracyPlan[Any] | None
@@ -46,6 +49,7 @@ class Outcome(NamedTuple):
     keeps_up: bool = True
     room: float = math.nan
     note: str = ""
+    is_known: bool = True
 
 
 def room_of(errors: Sequence[float], times: Sequence[float], tolerance: float, rate: float) -> float:
@@ -76,16 +80,21 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     costs = np.array([each.cost for each in made if math.isfinite(each.cost)])
     cheap, largest = int(np.sum(costs <= 1.5)), costs.max(initial=0.0)
     ratios = np.array([each.error / each.tolerance for each in made])
-    return "\n".join(
-        [
-            f"{len(outcomes)} jobs: {len(made)} plans, {len(refused)} refused",
-            f"error within the tolerance: {int(np.sum(ratios <= 1.0))} of {len(made)}, largest "
-            f"{ratios.max(initial=0.0):.2f} tolerances",
-            f"kept up with the rate: {sum(each.keeps_up for each in made)} of {len(made)}",
-            f"cost at most 1.5 times the best: {cheap} of {len(costs)}, largest {largest:.2f}",
-            f"refused although a setting is truly accurate and fast enough: {_possible(refused)}",
-        ]
-    )
+    lines = [
+        f"{len(outcomes)} jobs: {len(made)} plans, {len(refused)} refused",
+        f"error within the tolerance: {int(np.sum(ratios <= 1.0))} of {len(made)}, largest "
+        f"{ratios.max(initial=0.0):.2f} tolerances",
+        f"kept up with the rate: {sum(each.keeps_up for each in made)} of {len(made)}",
+        f"cost at most 1.5 times the best: {cheap} of {len(costs)}, largest {largest:.2f}",
+        f"refused although a setting is truly accurate and fast enough: {_possible(refused)}",
+    ]
+    if unknown := [each for each in outcomes if not each.is_known]:
+        count = sum(each.plan is not None for each in unknown)
+        lines.append(
+            f"unknown, because the search was not complete: the cost of {count} plans, and whether a setting is "
+            f"possible for {len(unknown) - count} refused jobs"
+        )
+    return "\n".join(lines)
 
 
 def _possible(refused: Sequence[Outcome]) -> str:
@@ -126,9 +135,19 @@ def _line(outcome: Outcome) -> str:
     """Return the outcome of a job in one line."""
     asked = f"{1e6 * outcome.tolerance:.3g} um"
     if outcome.plan is None:
-        factor = "" if math.isnan(outcome.room) else f" by a factor of {outcome.room:.2f}"
-        return f"refused {asked}{f', which is possible{factor}' if outcome.possible else ''}"
-    times = f"cost {outcome.cost:.2f}, {'kept up' if outcome.keeps_up else 'too slow'}"
+        return _refused_line(outcome, asked)
+    cost = f"{outcome.cost:.2f}" if outcome.is_known else "unknown"
+    times = f"cost {cost}, {'kept up' if outcome.keeps_up else 'too slow'}"
     if outcome.note:
         times += f", {outcome.note}"
     return f"{outcome.plan.chosen.name}, {1e6 * outcome.error:.3g} of {asked}, {times}"
+
+
+def _refused_line(outcome: Outcome, asked: str) -> str:
+    """Return the line of a refused job."""
+    line = "refused" if math.isnan(outcome.tolerance) else f"refused {asked}"
+    if outcome.possible:
+        line += ", which is possible" + ("" if math.isnan(outcome.room) else f" by a factor of {outcome.room:.2f}")
+    elif not outcome.is_known:
+        line += ", unknown whether it is possible"
+    return f"{line}: {outcome.note}" if outcome.note else line

@@ -140,9 +140,9 @@ def plan_placement(
     Raises
     ------
     ValueError
-        The machine is over the other side, the camera sees too few edges at the target or from a start in the landing
-        zone, or the coarse registration is ambiguous. The message names the nearest targets and the window that work,
-        where there are any.
+        The machine is over the other side, the camera sees too few edges at the target, or a coarse registration is
+        needed and is ambiguous, or the camera sees too few edges from a start in the landing zone. The message names
+        the nearest targets and the window that work, where there are any.
 
     Notes
     -----
@@ -150,8 +150,10 @@ def plan_placement(
     is worse than the tolerance (3 standard deviations of a frame), a coarse registration finds the pose of the first
     frame and rulers with a search range of `tracking_imaging` follow it. The registration is tried on ideal images from
     the target and from four corners of the landing zone, see `refused_starts`: a repeated pattern, such as equal traces
-    at a pitch below twice the landing zone, makes it ambiguous. From 27 starts in the landing zone, its corners among
-    them, the camera must see enough features: from a corner it does not see those at the border of the window.
+    at a pitch below twice the landing zone, makes it ambiguous. In plans with a coarse registration the camera must see
+    enough features from 27 starts in the landing zone, its corners among them: from a corner it does not see those at
+    the border of the window. Rulers that cover the landing zone are checked from the target only. If the coarse
+    registration is refused they are used where there are enough, even for a pose that is worse than the tolerance.
     """
     if machine.camera.mirrored != (artwork.side == "bottom"):
         raise ValueError(f"the artwork shows the {artwork.side} side; use machine.for_side({artwork.side!r})")
@@ -385,7 +387,9 @@ def _largest_leverage(features: FeatureSet) -> float:
     """
     rows, prior = _weighted_rows(features)
     scale = np.sqrt(np.sum(rows**2, axis=0) + np.diag(prior))
-    if len(rows) < _MIN_ROWS or not np.linalg.eigvalsh((rows.T @ rows + prior) / np.outer(scale, scale))[0] > _SINGULAR:
+    if len(rows) < _MIN_ROWS or not np.all(scale > 0.0):  # 0 if all normals are parallel to x or y
+        return 1.0
+    if not np.linalg.eigvalsh((rows.T @ rows + prior) / np.outer(scale, scale))[0] > _SINGULAR:
         return 1.0
     covariance = np.linalg.inv(rows.T @ rows + prior)
     return float(np.max(np.einsum("ij,jk,ik->i", rows, covariance, rows)))

@@ -274,15 +274,16 @@ def test_refused_starts_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     guidance._check(np.zeros(3), nothing)
 
 
-def test_rows_that_do_not_determine_the_pose_have_the_largest_leverage() -> None:
+@pytest.mark.parametrize("normal", [(0.6, 0.8), (1.0, 0.0), (0.0, 1.0)])
+def test_rows_that_do_not_determine_the_pose_have_the_largest_leverage(normal: tuple[float, float]) -> None:
     """Two rulers, parallel rulers, and a third direction by a single one."""
     found = features()
     nothing = found.fiducials.subset(np.zeros(3, bool))
     rows = {name: getattr(found, name)[:2] for name in ROWS}
     assert plan._largest_leverage(dataclasses.replace(found, **rows, fiducials=nothing)) == 1.0
-    parallel = np.tile([0.6, 0.8], (7, 1))
+    parallel = np.tile(normal, (7, 1))
     assert plan._largest_leverage(dataclasses.replace(found, normal=parallel, fiducials=nothing)) == 1.0
-    parallel[3] = [0.8, -0.6]
+    parallel[3] = [normal[1], -normal[0]]
     single = dataclasses.replace(found, normal=parallel, fiducials=nothing)
     assert plan._largest_leverage(single) == pytest.approx(1.0, abs=1e-6)
 

@@ -97,7 +97,9 @@ def memory_of(array: DeviceArray) -> Any:
     return array.base_data
 
 
-def check_host(array: HostArray, shape: tuple[int, ...], dtype: np.dtype[Any], what: str) -> None:
+def check_host(
+    array: HostArray, shape: tuple[int, ...], dtype: np.dtype[Any], what: str, *, is_written: bool = False
+) -> None:
     """Check dtype, shape and layout of a NumPy array for a kernel.
 
     Raises
@@ -105,7 +107,8 @@ def check_host(array: HostArray, shape: tuple[int, ...], dtype: np.dtype[Any], w
     TypeError
         The dtype differs, or the array is masked: a kernel does not see the mask.
     ValueError
-        The shape differs, or the array is not C-contiguous or not aligned to its dtype.
+        The shape differs, or the array is not C-contiguous, not aligned to its dtype, or read-only although it
+        `is_written`.
     """
     if isinstance(array, np.ma.MaskedArray):
         raise TypeError(f"{what}: expected a plain array, got a masked array; fill it with .filled(value), such as NaN")
@@ -118,3 +121,5 @@ def check_host(array: HostArray, shape: tuple[int, ...], dtype: np.dtype[Any], w
         raise ValueError(f"{what}: expected a C-contiguous array; use np.ascontiguousarray")
     if not flags.aligned:
         raise ValueError(f"{what}: expected an array aligned to {dtype}; use np.require(array, requirements='A')")
+    if is_written and not flags.writeable:
+        raise ValueError(f"{what}: expected an array that can be written, got a read-only one; use .copy()")

@@ -290,8 +290,8 @@ class Bound(Generic[R]):
     def on_host(self, frames: Sequence[HostArray], out: R | None = None) -> R:
         """Run on NumPy arrays and wait.
 
-        The arrays are copied to `inputs` and from `outputs`, but where memory is shared, the kernel may read and write
-        large arrays in place.
+        The arrays are copied to `inputs` and from `outputs`, whose contents are lost; but where memory is shared, the
+        kernel may read and write large arrays in place, and reads all arrays in place if `inputs` were given to `bind`.
         """
         if len(frames) != len(self.inputs):
             raise self._wrong_count(len(frames))
@@ -301,7 +301,7 @@ class Bound(Generic[R]):
             out = self._result({k: np.empty(shape, dtype) for k, (shape, dtype) in self._computed_specs.items()})
         targets = self._computed(out)
         for (name, (shape, dtype)), array in zip(self._computed_specs.items(), targets, strict=True):
-            check_host(array, shape, dtype, f"out.{name}")
+            check_host(array, shape, dtype, f"out.{name}", is_written=True)
         check_apart(frames, targets, np.may_share_memory)
         if self._empty:
             return out

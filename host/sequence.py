@@ -200,6 +200,7 @@ class BoundSequence(Bound[R]):
 
     def _run_shared(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> Any:
         """Copy to the inputs, run, and copy from the outputs: stages keep the arrays to which they are bound."""
+        self.queue.finish()  # an earlier call may still read the inputs
         for array, frame in zip(self.inputs, frames, strict=True):
             host_view(array)[...] = frame
         event = self()

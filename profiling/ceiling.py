@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 from typing import Any
@@ -28,7 +29,7 @@ _FLOPS_PER_STEP = 8 * 16 * 2  # 8 vectors of 16 floats, one multiplication and o
 def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[[], None]:
     """Return a function that reads and writes memory sequentially, `repeats` times back to back, and waits.
 
-    The arguments `read` and `written` are numbers of bytes. The copy is the fastest of the forms that we know. Its time
+    The arguments `read` and `written` are numbers of bytes. The copy is the fastest of the forms of `mover`. Its time
     is a lower limit for a kernel with the same traffic in the same cache or memory; it includes the launch.
     """
     launch = mover(device, device.queue, read, written)
@@ -58,7 +59,7 @@ def mover(device: Device, queue: Any, read: int, written: int) -> Callable[[], A
     source.set(np.ones(source.shape, np.float32))
     target.set(np.ones(target.shape, np.float32))  # maps the pages before the first timed run
     arguments = memory_of(source), memory_of(target), np.int64(reads), np.int64(writes)
-    bypass = flags(PAST_CACHES=device.is_cpu and read + written > device.cache_bytes)
+    is_large = device.is_cpu and read + written > device.cache_bytes
 
     def form(name: str, defines: dict[str, Define], items: int, group: tuple[int] | None) -> Callable[[], Any]:
         kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", defines), name)
@@ -72,7 +73,9 @@ def mover(device: Device, queue: Any, read: int, written: int) -> Callable[[], A
     if not device.prefers_vectors:
         return form("move_items", {}, device.compute_units * _ITEMS_PER_UNIT, None)
     shares = device.compute_units * _SHARES_PER_CORE
-    return min((form("move", bypass | flags(PREFETCH=ahead), shares, (1,)) for ahead in (False, True)), key=_least_time)
+    options = itertools.product((False, True), (False, True) if is_large else (False,))
+    forms = (form("move", flags(PREFETCH=ahead, PAST_CACHES=past), shares, (1,)) for ahead, past in options)
+    return min(forms, key=_least_time)
 
 
 def _least_time(launch: Callable[[], Any]) -> float:

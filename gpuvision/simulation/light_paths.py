@@ -27,6 +27,8 @@ from gpuvision.simulation.transport.occluded_irradiance import segment_rows
 from gpuvision.simulation.transport.radiosity import Radiosity
 
 Float64 = npt.NDArray[np.float64]
+# Scene, size of the patches [m], albedos of the materials, and device of a radiosity solution.
+SolverKey = tuple[Scene, float, tuple[float, ...], Device | None]
 
 
 class ProfileLight(NamedTuple):
@@ -80,9 +82,9 @@ class LightPaths:
     patch_size : float, optional
         Largest edge of the patches of the radiosity solution [m]; None: a sixteenth of the scene's diagonal. Towards
         concave edges the patches become smaller (`Patches.from_scene`).
-    solvers : dict of float to Radiosity
-        Radiosity solutions by size of the patches [m], which are used, and added if they are missing. Give the same
-        dictionary to several instances of a scene so that their form factors are computed once. Default: empty.
+    solvers : dict
+        Radiosity solutions by scene, size of the patches, albedos and device; they are used, and added if they are
+        missing. Give the same dictionary to several instances so that form factors are computed once. Default: empty.
     tolerance : float
         Range error that omitted secondary light may cause [m], 0 or more; 0: all light is computed. See the notes.
         Default 0.0.
@@ -134,7 +136,7 @@ class LightPaths:
     spreads_rays: bool = False
     end_bins: int = 0
     patch_size: float | None = None
-    solvers: dict[float, Radiosity] = field(default_factory=dict, repr=False)
+    solvers: dict[SolverKey, Radiosity] = field(default_factory=dict, repr=False)
     tolerance: float = 0.0
     min_power: float = 0.0
     device: Device | None = None
@@ -335,10 +337,11 @@ class LightPaths:
             corners = self.scene.corners.reshape(-1, 3)
             size = float(np.linalg.norm(np.ptp(corners, axis=0))) / 16.0
         size *= factor
-        if size not in self.solvers:
-            albedo = [each.albedo for each in self.materials]
-            self.solvers[size] = Radiosity.from_scene(self.scene, albedo, size=size, graded=True, device=self.device)
-        return self.solvers[size]
+        albedo = tuple(each.albedo for each in self.materials)
+        key = (self.scene, size, albedo, self.device)
+        if key not in self.solvers:
+            self.solvers[key] = Radiosity.from_scene(self.scene, albedo, size=size, graded=True, device=self.device)
+        return self.solvers[key]
 
 
 def _widened(view: SensorView, bins: int) -> SensorView:

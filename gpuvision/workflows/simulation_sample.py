@@ -14,6 +14,7 @@ import numpy.typing as npt
 from gpuvision.host import Device
 from gpuvision.ranging.line import LineReadout
 from gpuvision.sensor.simulated import make_sensor_view, make_simulator, require_light
+from gpuvision.simulation.light_paths import SolverKey
 from gpuvision.simulation.sensors.readings import PATHS, Reading, Simulator, height_secant, stack_profiles
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.simulation.transport.radiosity import Radiosity
@@ -325,8 +326,8 @@ class ProfileSample:
         Reader of the light.
     device : Device
         Device of the kernels.
-    solvers : dict of float to Radiosity
-        Radiosity solutions that `light` has made, by size of the patches [m]: they take most of the time.
+    solvers : dict
+        Radiosity solutions that `light` has made, as in `LightPaths`: they take most of the time.
     """
 
     task: SimulationTask
@@ -334,7 +335,7 @@ class ProfileSample:
     others: tuple[Float64, ...]
     reader: SampleReader
     device: Device
-    solvers: dict[float, Radiosity] = field(default_factory=dict)
+    solvers: dict[SolverKey, Radiosity] = field(default_factory=dict)
 
     @classmethod
     def of(cls, task: SimulationTask, profiles: int, device: Device, *, others: Sequence[int] = ()) -> ProfileSample:

@@ -169,18 +169,21 @@ INLINE void start_of(GROUP_SPACE blob_shape *shape, GROUP_SPACE const blob_edges
     blob_circuit circuit;
     wrap(edges, layout, cosine, sine, &circuit);
     laned_shape best = near;
-    reals losses = (reals)least;
+    reals losses = (reals)least, triples = 0;
     for (int p = 0; p < PATTERNS; p++)
         for (int i = 0; i < PADDED_SPOKES; i += LANES) {
             laned_shape tried;
             const reals loss = start_loss(&circuit, p, i, near, reach, &tried);
             const masks better = mask_of(loss < losses);
             losses = better ? loss : losses;
+            triples = better ? to_reals((ints)(p * PADDED_SPOKES + i) + LANE_NUMBERS) : triples;
             best.x = better ? tried.x : best.x;
             best.y = better ? tried.y : best.y;
             best.size = better ? tried.size : best.size;
         }
-    const int lane = lowest_bit(lane_bits(mask_of(losses == (reals)least_of(losses))));
+    // Of equal losses the first triple counts, as in the groups: shapes with opposite outliers have equal losses.
+    triples = mask_of(losses == (reals)least_of(losses)) ? triples : (reals)INFINITY;
+    const int lane = lowest_bit(lane_bits(mask_of(triples == (reals)least_of(triples))));
     shape->x = LANE(best.x, lane), shape->y = LANE(best.y, lane), shape->size = LANE(best.size, lane);
 #endif
 }

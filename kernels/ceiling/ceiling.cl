@@ -2,8 +2,8 @@
 
 typedef float16 vector_at __attribute__((aligned(4)));
 
-// A kernel that writes more than the last cache holds bypasses the caches (PAST_CACHES), and so does its copy. Memory
-// objects are aligned to 128 bytes.
+// A kernel that reads and writes more than the last cache holds bypasses the caches (PAST_CACHES); its copy is tried with
+// and without. Memory objects are aligned to 128 bytes.
 #ifdef PAST_CACHES
 static inline void write_vector(float16 value, global float *to) {
     __builtin_nontemporal_store(value, (global float16 *)to);

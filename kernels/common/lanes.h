@@ -10,7 +10,7 @@
 //
 // A comparison of vectors gives -1 in the lanes where it holds, a comparison of scalars gives 1. mask_of() and
 // int_mask() turn a comparison into a mask in both variants. The build options are REAL_IS_DOUBLE, VECTOR_VARIANT and
-// PAST_CACHES (outputs larger than the last cache).
+// PAST_CACHES (inputs and outputs together larger than the last cache).
 #ifndef LANES_H
 #define LANES_H
 

@@ -78,6 +78,15 @@ def test_a_read_only_input_is_fine(memory, pairs):
     np.testing.assert_allclose(READOUT(pairs, device=memory).position, expected(pairs), atol=5e-7)
 
 
+def test_a_read_only_output_is_refused(memory, pairs):
+    out = READOUT(pairs, device=memory)
+    before = out.total.copy()
+    out.total.flags.writeable = False
+    with pytest.raises(ValueError, match=r"out\.total: expected an array that can be written, got a read-only one"):
+        READOUT(2.0 * pairs, device=memory, out=out)
+    np.testing.assert_array_equal(out.total, before)
+
+
 def test_device_arrays_stay_on_the_device(memory, pairs):
     frame = memory.empty(pairs.shape, pairs.dtype)
     frame.set(pairs)

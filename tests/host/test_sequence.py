@@ -97,6 +97,20 @@ def test_numpy_arrays(memory: dict[str, Any]) -> None:
         check(bound.on_host([frame]), frame)
 
 
+def test_numpy_arrays_wait_for_an_earlier_call(device: Device) -> None:
+    """The earlier call reads the inputs of the instance, which NumPy arrays overwrite."""
+    ones = np.ones(4_000_000, np.int32)
+    bound = Chain().bind(device, ones.shape, ones.dtype)
+    out = bound.allocate()
+    bound.inputs[0].set(ones)
+    for _ in range(4):
+        bound()
+    event = bound(out=out)
+    bound.on_host([2 * ones])
+    event.wait()
+    np.testing.assert_array_equal(out.first.get(), 2 * ones)
+
+
 def test_given_outputs_are_written(memory: dict[str, Any]) -> None:
     last, parity, first = (np.full_like(FRAME, -99) for _ in range(3))
     out = Chained(last, None, parity, first)

@@ -114,6 +114,19 @@ def test_further_bounces_come_on_top(device):
     assert 0.05 * first < further < first
 
 
+def test_shared_solvers_serve_equal_scenes_only(device):
+    """Another albedo has another radiosity; the same light takes the solution that is there."""
+    scene, solvers, bounces = corner(), {}, {"paths": (*PATHS, "multi-bounce"), "patch_size": 0.02}
+    for albedo, count in ((0.2, 2), (0.8, 4), (0.2, 4)):  # two sizes of patches each
+        material = [Material(diffuse=Lambert(albedo=albedo))]
+        shared, own = (
+            paths(scene, device, materials=material, solvers=each, **bounces).profile(0.0).exposures["multi-bounce"]
+            for each in (solvers, {})
+        )
+        np.testing.assert_array_equal(shared.power, own.power)
+        assert len(solvers) == count
+
+
 def test_patches_are_a_sixteenth_of_the_diagonal_by_default(device):
     scene, diagonal = corner(width=0.04), math.hypot(0.12, 0.04, 0.05)
     sizes = {None: None, 0.02: 0.02, diagonal: diagonal / 16.0}

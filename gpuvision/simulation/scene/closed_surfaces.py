@@ -55,10 +55,13 @@ def visible_sides(
     triangles = scene.bvh.numbers
     if not len(triangles):
         return sides
-    of = connected_surfaces(scene.corners[triangles])
-    is_closed = of.is_closed & (np.abs(of.volume) > limits.min_volume_fraction * np.prod(of.high - of.low, axis=1))
-    is_closed &= ~_line_meets_boxes(np.asarray(eye, np.float64), np.asarray(direction, np.float64), of.low, of.high)
-    sides[triangles] = np.where(is_closed, np.sign(of.volume), 0.0)[of.number]
+    surfaces = connected_surfaces(scene.corners[triangles])
+    low, high = surfaces.low, surfaces.high
+    is_closed = surfaces.is_closed & (
+        np.abs(surfaces.volume) > limits.min_volume_fraction * np.prod(high - low, axis=1)
+    )
+    is_closed &= ~_line_meets_boxes(np.asarray(eye, np.float64), np.asarray(direction, np.float64), low, high)
+    sides[triangles] = np.where(is_closed, np.sign(surfaces.volume), 0.0)[surfaces.number]
     return sides
 
 

@@ -31,9 +31,12 @@ class Defects:
     Attributes
     ----------
     not_finite
-        Triangles with a corner that is NaN or infinite. They are not in the BVH. degenerate Triangles without area: two
-        corners coincide, or all three are collinear. They are not in the BVH. non_manifold Triangles on an edge of
-        three or more triangles, or on a surface that cannot be oriented (a Moebius strip). They are kept unchanged.
+        Triangles with a corner that is NaN or infinite. They are not in the BVH.
+    degenerate
+        Triangles without area: two corners coincide, or all three are collinear. They are not in the BVH.
+    non_manifold
+        Triangles on an edge of three or more triangles, or on a surface that cannot be oriented (a Moebius strip). They
+        are kept unchanged.
     inverted
         Triangles with the opposite winding to most of their connected neighbours. They are flipped, so that the
         winding of `Scene.corners` is consistent.

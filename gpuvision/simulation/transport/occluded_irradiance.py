@@ -24,6 +24,7 @@ from gpuvision.host import (
     type_defines,
 )
 from gpuvision.operation import VisionOperation
+from gpuvision.simulation.scene.bvh import Bvh
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LitSegments
 from gpuvision.validation import integer
@@ -198,7 +199,7 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
                 *tree.tables(build.real),
                 *of_parts,
                 build.positions(tree.middle) if two_floats else tree.middle.astype(build.widest),
-                _clearance(self.clearance, self.scene, build.real, dtype),
+                _clearance(self.clearance, tree, build.real, dtype),
                 np.uint32(self.samples),
                 np.uint32(each),
                 np.uint32(self.segments),
@@ -238,8 +239,8 @@ def _check_scene(scene: object, clearance: float | None) -> None:
         raise ValueError(f"OccludedIrradiance.clearance is {clearance!r}, expected metres, 0 or more, or None")
 
 
-def _clearance(given: float | None, scene: Scene, real: np.dtype[Any], dtype: np.dtype[Any]) -> Any:
+def _clearance(given: float | None, tree: Bvh, real: np.dtype[Any], dtype: np.dtype[Any]) -> Any:
     if given is None:
-        reach = float(np.abs(scene.bvh.corners).max(initial=0.0) + np.abs(scene.bvh.middle).max())
+        reach = float(np.abs(tree.corners).max(initial=0.0) + np.abs(tree.middle).max())
         given = _CLEARANCE[min(real.itemsize, dtype.itemsize)] * reach
     return real.type(given)

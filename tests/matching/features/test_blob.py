@@ -518,3 +518,26 @@ def test_rulers_lie_evenly_on_the_contour(spokes: int) -> None:
     turned = np.array([[0.0, -1.0], [1.0, 0.0]])
     np.testing.assert_allclose(base[spokes // 4 : spokes // 2], first @ turned.T, atol=1e-7)
     np.testing.assert_allclose(normal[spokes // 4 : spokes // 2], normals @ turned.T, atol=1e-7)
+
+
+def notched_square(half: float, depths: list[int]) -> np.ndarray:
+    """Return a square with notches of some depths [px] in the middle of its right, left, lower and upper side."""
+    dy, dx = np.mgrid[:64, :64] - 32.0
+    inside = np.clip(half + 0.5 - np.abs(dx), 0.0, 1.0) * np.clip(half + 0.5 - np.abs(dy), 0.0, 1.0)
+    for depth, along, across in zip(depths, (dx, -dx, dy, -dy), (dy, dy, dx, dx), strict=False):
+        inside[(along > half - depth) & (np.abs(across) < 6.0)] = 0.0
+    return 40.0 + 160.0 * inside
+
+
+@pytest.mark.parametrize("match", [True, False])
+def test_variants_choose_the_same_of_equal_starts(device: Device, match: bool) -> None:
+    """Several shapes fit the edges of a square with notches equally well."""
+    plain = FindBlobs(threshold=10.0, shape="square", match=match)
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        half = float(rng.choice([8.0, 9.5, 10.0, 12.0]))
+        image = np.rint(notched_square(half, list(rng.integers(2, 6, seed % 5)))).astype(np.uint8)
+        near = place(32.0, 32.0, half, 0.0)
+        vector, item = (replace(plain, variant=each)(image, near, device=device) for each in ("vector", "work_item"))
+        assert vector.status == item.status
+        np.testing.assert_allclose(centre(vector), centre(item), rtol=0, atol=1e-3)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from gpuvision.simulation.scene.convex_parts import ConvexSurfaces
 from gpuvision.simulation.scene.scene import Scene
@@ -111,3 +113,11 @@ def test_large_scenes_are_not_searched() -> None:
     several = np.concatenate([box + np.array([3.0 * n, 0.0, 0.0]) for n in range(2731)])
     assert not ConvexSurfaces.of(several).is_convex.any()
     assert ConvexSurfaces.of(several[12:]).is_convex.all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_leaves_with_opposite_normals(rng: np.random.Generator) -> None:
+    """The cosine between opposite normals of a turned box may round to less than -1."""
+    box = np.asarray(trimesh.creation.box().triangles)
+    for turn in Rotation.random(50, random_state=rng).as_matrix():
+        assert Scene(box @ turn.T).convex_parts is not None

@@ -29,8 +29,8 @@ class Outcome(NamedTuple):
         Whether a setting that truly meets the tolerance is fast enough for the rate.
     cost : float
         Time of the chosen setting over the time of the fastest one that truly meets the tolerance; NaN if none does.
-    keeps_up : bool
-        Whether the chosen setting kept up with the asked rate.
+    keeps_up : bool or None
+        Whether the chosen setting kept up with the asked rate; None without a plan or a rate.
     room : float
         Largest factor by which a setting is truly more accurate than the tolerance and faster than the rate; NaN if
         unknown.
@@ -46,7 +46,7 @@ class Outcome(NamedTuple):
     error: float = math.nan
     possible: bool = False
     cost: float = math.nan
-    keeps_up: bool = True
+    keeps_up: bool | None = None
     room: float = math.nan
     note: str = ""
     is_known: bool = True
@@ -80,11 +80,12 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     costs = np.array([each.cost for each in made if math.isfinite(each.cost)])
     cheap, largest = int(np.sum(costs <= 1.5)), costs.max(initial=0.0)
     ratios = np.array([each.error / each.tolerance for each in made])
+    kept_up = [each.keeps_up for each in made if each.keeps_up is not None]
     lines = [
         f"{len(outcomes)} jobs: {len(made)} plans, {len(refused)} refused",
         f"error within the tolerance: {int(np.sum(ratios <= 1.0))} of {len(made)}, largest "
         f"{ratios.max(initial=0.0):.2f} tolerances",
-        f"kept up with the rate: {sum(each.keeps_up for each in made)} of {len(made)}",
+        f"kept up with the rate: {sum(kept_up)} of {len(kept_up)}",
         f"cost at most 1.5 times the best: {cheap} of {len(costs)}, largest {largest:.2f}",
         f"refused although a setting is truly accurate and fast enough: {_possible(refused)}",
     ]
@@ -137,7 +138,8 @@ def _line(outcome: Outcome) -> str:
     if outcome.plan is None:
         return _refused_line(outcome, asked)
     cost = f"{outcome.cost:.2f}" if outcome.is_known else "unknown"
-    times = f"cost {cost}, {'kept up' if outcome.keeps_up else 'too slow'}"
+    speed = {None: "no rate", True: "kept up", False: "too slow"}[outcome.keeps_up]
+    times = f"cost {cost}, {speed}"
     if outcome.note:
         times += f", {outcome.note}"
     return f"{outcome.plan.chosen.name}, {1e6 * outcome.error:.3g} of {asked}, {times}"

@@ -2,11 +2,12 @@
 
 Each job is a part of boxes and a cylinder under a PSD or a camera, with a tolerance and a rate. Truth is an
 independent, finer computation of all profiles of the part (with multi-bounce light: of a third of them, chosen at
-random): four times the rays of the finest setting of the plan, spread over the samples, twice its slabs, half its bins,
-patches, steps in mirrors and parts of lobes, and 1.5 times its rays of multi-bounce light. A plan holds if the root
-mean square difference of the simulated heights is at most the tolerance, and if the time of a profile keeps up with the
-rate. Its cost is its time over the time of the fastest combination of options that truly meets the tolerance on these
-profiles (exhaustive search).
+random). It has eight times the rays of the finest setting of the plan, which is twice the rays of the plan's reference,
+spread over the samples. It has twice the slabs of the finest setting, half its bins, patches, steps in mirrors and
+parts of lobes, and three times its rays of multi-bounce light. A plan holds if the root mean square difference of the
+simulated heights is at most the tolerance, and if the time of a profile keeps up with the rate. No rate is asked if no
+combination of options truly meets the tolerance. The cost of a plan is its time over the time of the fastest
+combination that truly meets the tolerance on these profiles (exhaustive search).
 """
 
 from __future__ import annotations
@@ -155,7 +156,8 @@ def judge(rng: np.random.Generator, device: Device, limits: SimulationPlanLimits
     truth = Truth(job, device)
     options = LightOptions(truth.sample, job.tolerance, lambda done, of: None)
     combinations = list(options.combinations())
-    errors = [truth.error(light_of_options(each), limits.max_moved) for each in combinations]
+    max_moved = 2.0 * limits.max_moved  # as many as differ from the reference may differ again
+    errors = [truth.error(light_of_options(each), max_moved) for each in combinations]
     times = {options.settings_of(each): options.seconds_of(each) for each in combinations}
     meeting = [each for each, error in zip(times, errors, strict=True) if error <= job.tolerance]
     best = min(meeting, key=lambda each: times[each], default=None)
@@ -168,11 +170,9 @@ def judge(rng: np.random.Generator, device: Device, limits: SimulationPlanLimits
         return Outcome(None, job.tolerance, possible=bool(meeting), room=room)
     chosen = plan.chosen.settings
     light = truth.sample.light(chosen)
-    error = truth.error(
-        light.exposures, 2.0 * limits.max_moved
-    )  # as many as differ from the reference may differ again
+    error = truth.error(light.exposures, max_moved)
     cost = math.nan if best is None else time_ratio(truth.sample, options, chosen, best)
-    keeps_up = rate is None or (light.seconds + _preparation(options, chosen)) * rate <= 1.0
+    keeps_up = None if rate is None else (light.seconds + options.preparation_of(chosen)) * rate <= 1.0
     return Outcome(plan, job.tolerance, error, bool(meeting), cost, keeps_up, room)
 
 
@@ -183,13 +183,8 @@ def time_ratio(
     if chosen == best:
         return 1.0
     runs = [[sample.light(each, runs=1).seconds for each in (chosen, best)] for _ in range(_TURNS)]
-    one, other = np.min(runs, axis=0) + [_preparation(options, each) for each in (chosen, best)]
+    one, other = np.min(runs, axis=0) + [options.preparation_of(each) for each in (chosen, best)]
     return float(one / other)
-
-
-def _preparation(options: LightOptions, settings: SimulationSettings) -> float:
-    """Return the share of a profile in the time of the preparation of multi-bounce light [s]."""
-    return options.setups.get(settings.patch_size, 0.0) / _PROFILES if "multi-bounce" in settings.paths else 0.0
 
 
 class Truth:
@@ -204,15 +199,15 @@ class Truth:
     """
 
     def __init__(self, job: Job, device: Device) -> None:
-        task = dataclasses.replace(job.task, transports=job.places)
-        self.sample = ProfileSample.of(task, len(job.places), device)
+        task = job.task  # with all profiles: they share the preparation of multi-bounce light
+        self.sample = dataclasses.replace(ProfileSample.of(task, len(job.places), device), places=job.places)
         settings = SimulationSettings.of(task)
         u, v = settings.nodes
         finer = dataclasses.replace(
             settings,
             paths=tuple(each for each in task.paths if each != "multi-bounce"),
             sub_sheets=2 * (2 * settings.sub_sheets + 1),
-            nodes=(u, 16 * v),  # in bins of half the size: two rays along u
+            nodes=(2 * u, 16 * v),  # in bins of half the size: four rays along u
         )
         limits = {"direct_limits": DirectLimits(lobe_turn=0.5 * DirectLimits.lobe_turn), "mirror_steps": 4.0}
         light = divided_light(finer.applied(task), self.sample.places, device, 2, spreads_rays=True, **limits)
@@ -220,7 +215,7 @@ class Truth:
             smaller = dataclasses.replace(
                 settings,
                 paths=("direct", "multi-bounce"),
-                nodes=(2 * u, 3 * v),  # in the same bins, at other places than those of the options
+                nodes=(4 * u, 3 * v),  # in the same bins, at other places than those of the options
                 patch_size=0.5 * settings.patch_size,
             )
             light["multi-bounce"] = self.sample.light(smaller, solvers={}).exposures["multi-bounce"]

@@ -36,9 +36,11 @@ from gpuvision.workflows.simulation_sample import ProfileSample
 Progress = Callable[[int, int | None], object]
 
 # Profiles of a part up to which planning takes longer than it saves, with and without multi-bounce light. Measured on
-# PoCL beside other work: planning took the time of 484 to 1067 profiles of the sensor file's light without it (two
-# sensors, two tolerances), and of 115 profiles with it (one part, before more profiles were tried).
-_WORTH_BOUNCES, _WORTH = 120, 1000
+# PoCL beside other work: planning without it took the time of 484 to 1067 profiles of the sensor file's light (two
+# sensors, two tolerances). A plan of half of that light's time then saves time from 968 to 2134 profiles on. With it,
+# planning took the time of 115 profiles (one part). That was before settings were tried on up to 48 more profiles: it
+# takes longer now where it does that, which was not measured.
+_WORTH_BOUNCES, _WORTH = 120, 2000
 # A setting whose error is undecided is worth more profiles if the fastest certain setting takes this many times its
 # time or more. Chosen: the largest ratio to the best setting that a plan should have, 1.5, less the scatter of times.
 _GAIN = 1.25
@@ -87,7 +89,8 @@ def plan_simulation(
     limits
         Margins of the choice, and the size of the sample.
     progress
-        Called with the number of discretisations done and the number of all.
+        Called with the number of lights done, one for each discretisation on each group of profiles, and None: their
+        number is not known before.
 
     Returns
     -------
@@ -200,9 +203,8 @@ def _undecided(
     """Return a setting that more profiles may show to be the one to choose; None if the choice is certain.
 
     A setting is undecided if the lower limits of its error and of the moved samples are small enough, and it was not
-    tried on all profiles.
-    Only the fastest setting whose upper limit meets the tolerance matters, and faster ones. Settings on few profiles
-    come first, and of these the fastest.
+    tried on all profiles. Only the fastest setting whose upper limit meets the tolerance matters, and faster ones.
+    Settings on few profiles come first, and of these the fastest.
     """
     longest = math.inf if limit is None else limit.seconds
     quick = [each for each in trials if each.seconds <= longest]

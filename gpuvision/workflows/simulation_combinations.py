@@ -75,7 +75,7 @@ class Combinations:
         if len(self._references) == len(readings):
             self._references.append(read(self._options.reference_at(groups[len(readings) - 1])))
         for places in groups[len(readings) - 1 : len(self._references) - 1]:
-            readings.append(read(self._sample.light(trial.settings, places, runs=1).exposures))
+            readings.append(read(self._options.compute(trial.settings, places, runs=1).exposures))
         return self._judged(trial.settings, trial.seconds, trial.pairs)
 
     def _judged(self, settings: SimulationSettings, seconds: float, pairs: float) -> SettingsTrial:

@@ -55,14 +55,15 @@ class LightOptions:
     tolerance : float
         Asked error of the range [m].
     progress : callable
-        Called with the number of options done and None.
+        Called with the number of computed lights and None; see `compute`.
 
     Attributes
     ----------
     axes : list of list of Option
         Options of the direct light, of mirrors, and of diffuse and multi-bounce light; the last of each is the finest.
     setups : dict of float
-        Time of the preparation of multi-bounce light by size of the patches [s].
+        Time of the preparation of multi-bounce light by size of the patches, largest first [s]. Patches of twice the
+        size, which a simulation prepares as well, count only with the largest ones; see `preparation_of`.
     proven : dict of str to ErrorPart
         Errors of paths that are left out by a proven bound.
     rays : list of Exposure
@@ -111,7 +112,16 @@ class LightOptions:
         """
         light: dict[str, Exposure] = {}
         for settings, more in self._finest:  # the direct light of the first one is the finest
-            light = self.sample.light(settings, places, **{"runs": 1, **more}).exposures | light
+            light = self.compute(settings, places, **{"runs": 1, **more}).exposures | light
+        return light
+
+    def compute(
+        self, settings: SimulationSettings, places: npt.NDArray[np.float64] | None = None, **more: Any
+    ) -> SampledLight:
+        """Compute light as `ProfileSample.light`, and report that one more light is done."""
+        light = self.sample.light(settings, places, **more)
+        self._done += 1
+        self._progress(self._done, None)
         return light
 
     def settings_of(self, options: Sequence[Option]) -> SimulationSettings:
@@ -124,11 +134,18 @@ class LightOptions:
 
     def seconds_of(self, options: Sequence[Option]) -> float:
         """Return the time of a profile, with its share of the preparation of multi-bounce light [s]."""
-        settings = self.settings_of(options)
-        seconds = sum(each.seconds for each in options)
-        if "multi-bounce" in settings.paths:
-            seconds += self.setups[settings.patch_size] / len(self.sample.task.transports)
-        return seconds
+        return sum(each.seconds for each in options) + self.preparation_of(self.settings_of(options))
+
+    def preparation_of(self, settings: SimulationSettings) -> float:
+        """Return the share of a profile in the time of the preparation of multi-bounce light [s].
+
+        A simulation also prepares patches of twice the size, to estimate the error by patches. Patches that no option
+        has count as 0.
+        """
+        if "multi-bounce" not in settings.paths:
+            return 0.0
+        prepared = sum(self.setups.get(factor * settings.patch_size, 0.0) for factor in (1.0, 2.0))
+        return prepared / len(self.sample.task.transports)
 
     def _direct(self) -> list[Option]:
         """Return the direct light for numbers of slabs, ascending; specular highlights cost no time of their own."""
@@ -212,10 +229,7 @@ class LightOptions:
         more: dict[str, Any] = {"runs": 1, "spreads_rays": True} if is_reference else {}
         if is_finest:
             self._finest.append((settings, more))
-        light = self.sample.light(settings, **more)
-        self._done += 1
-        self._progress(self._done, None)
-        return light
+        return self.compute(settings, **more)
 
 
 def light_of_options(options: Sequence[Option]) -> dict[str, Exposure]:

@@ -371,7 +371,7 @@ class ProfileSample:
         """Compute the light of settings, on other places than those of the sample if given.
 
         ``changes`` are other parameters of `LightPaths`, or ``runs`` of `sample_light`. The time of the preparation is
-        complete only for the first light with patches of a size.
+        that of the patches that no earlier light had: of the given size, and of twice this size.
         """
         where = self.places if places is None else places
         return sample_light(settings.applied(self.task), where, self.device, **{"solvers": self.solvers, **changes})

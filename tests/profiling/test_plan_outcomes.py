@@ -19,6 +19,8 @@ from gpuvision.profiling.location_plans import Measured
 from gpuvision.profiling.plan_outcomes import Outcome, cost_of, room_of, summary
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows import planning_scan
+from gpuvision.workflows.simulation_options import LightOptions
+from gpuvision.workflows.simulation_sample import SimulationSettings
 
 
 def plan_of(seconds: float) -> Any:
@@ -39,18 +41,18 @@ def test_the_room_is_the_smaller_factor_of_the_best_setting() -> None:
 
 def test_shares_of_plans_that_hold() -> None:
     outcomes = [
-        Outcome(plan_of(1.0), 2.0, 1.0, True, 1.0),
-        Outcome(plan_of(1.0), 2.0, 2.0, True, 1.5),
+        Outcome(plan_of(1.0), 2.0, 1.0, True, 1.0, keeps_up=True),
+        Outcome(plan_of(1.0), 2.0, 2.0, True, 1.5, keeps_up=True),
         Outcome(plan_of(1.0), 2.0, 2.5, False, math.nan, keeps_up=False),
         Outcome(plan_of(1.0), 2.0, 1.0, True, 1.6, room=3.0),
         Outcome(None, 2.0, possible=True, room=1.0),
         Outcome(None, 2.0, possible=True, room=1.25),
         Outcome(None, 2.0, room=0.99),
     ]
-    assert summary(outcomes).splitlines() == [
+    assert summary(outcomes).splitlines() == [  # one plan has no rate
         "7 jobs: 4 plans, 3 refused",
         "error within the tolerance: 3 of 4, largest 1.25 tolerances",
-        "kept up with the rate: 3 of 4",
+        "kept up with the rate: 2 of 3",
         "cost at most 1.5 times the best: 2 of 3, largest 1.60",
         "refused although a setting is truly accurate and fast enough: 2, by a factor of 1.25 or more: 1",
     ]
@@ -67,9 +69,9 @@ def test_shares_of_plans_that_hold() -> None:
 @pytest.mark.parametrize(
     ("outcome", "line"),
     [
-        (Outcome(plan_of(1.0), 2e-6, 1e-6, True, 1.25), "a, 1 of 2 um, cost 1.25, kept up"),
+        (Outcome(plan_of(1.0), 2e-6, 1e-6, True, 1.25, keeps_up=True), "a, 1 of 2 um, cost 1.25, kept up"),
         (Outcome(plan_of(1.0), 2e-6, 1e-6, keeps_up=False, note="late"), "a, 1 of 2 um, cost nan, too slow, late"),
-        (Outcome(plan_of(1.0), 2e-6, 1e-6, is_known=False), "a, 1 of 2 um, cost unknown, kept up"),
+        (Outcome(plan_of(1.0), 2e-6, 1e-6, is_known=False), "a, 1 of 2 um, cost unknown, no rate"),
         (Outcome(None, 2e-6), "refused 2 um"),
         (Outcome(None, 2e-6, possible=True), "refused 2 um, which is possible"),
         (Outcome(None, 2e-6, possible=True, room=1.5), "refused 2 um, which is possible by a factor of 1.50"),
@@ -554,12 +556,23 @@ def test_a_setting_that_drops_a_part_is_no_accurate_one(monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize(
     ("tolerance", "rate", "chosen", "keeps_up", "room"),
-    [(4.5, 0.5, "fast", True, 1.5), (2.2, 0.9, "middle", False, 1.0 / 0.9), (1.0, 0.5, None, True, 1.0 / 1.2)],
+    [
+        (4.5, 0.5, "fast", True, 1.5),
+        (4.5, 0.6, "fast", False, 1.5),  # the preparation takes the rest
+        (2.2, 0.9, "middle", False, 1.0 / 0.9),
+        (1.15, 0.5, "slow", None, 1.15 / 1.2),  # no setting truly meets the tolerance
+        (1.0, 0.5, None, None, 1.0 / 1.2),
+    ],
 )
 def test_outcome_of_a_simulation(
-    monkeypatch: pytest.MonkeyPatch, tolerance: float, rate: float, chosen: str | None, keeps_up: bool, room: float
+    monkeypatch: pytest.MonkeyPatch,
+    tolerance: float,
+    rate: float,
+    chosen: str | None,
+    keeps_up: bool | None,
+    room: float,
 ) -> None:
-    """The run of a chosen setting takes 1.5 times the planned time: half of the rate of the fastest one is kept."""
+    """The run of a chosen setting takes 1.5 times the planned time, and the preparation 0.25 s of each profile."""
     names = list(SETTINGS)
 
     class Options:
@@ -567,8 +580,9 @@ def test_outcome_of_a_simulation(
             self.combinations = lambda: iter([[name] for name in names])
             self.settings_of = lambda options: options[0]
             self.seconds_of = lambda options: SETTINGS[options[0]][0]
+            self.preparation_of = lambda settings: 0.25
 
-    asked: list[float | None] = []
+    asked, moved = list[float | None](), set[float]()
 
     def planned(task: Any, *, tolerance: float, rate: float | None, device: Any, limits: Any) -> Any:
         asked.append(rate)
@@ -581,7 +595,11 @@ def test_outcome_of_a_simulation(
     def light(settings: Any, **_: Any) -> Any:
         return SimpleNamespace(seconds=1.5 * SETTINGS[settings][0], setup=9.0, exposures=settings)
 
-    truth = SimpleNamespace(sample=SimpleNamespace(light=light), error=lambda light, max_moved: SETTINGS[str(light)][2])
+    def error(light: Any, max_moved: float) -> float:
+        moved.add(max_moved)
+        return SETTINGS[str(light)][2]
+
+    truth = SimpleNamespace(sample=SimpleNamespace(light=light), error=error)
     job: Any = SimpleNamespace(task=None, tolerance=tolerance, rate=rate)
     monkeypatch.setattr(simulation_plans, "random_job", lambda rng: job)
     monkeypatch.setattr(simulation_plans, "Truth", lambda job, device: truth)
@@ -591,14 +609,28 @@ def test_outcome_of_a_simulation(
     device: Any = None
     found = simulation_plans.judge(np.random.default_rng(1), device)
     assert found.possible == (tolerance > 1.2)
-    assert asked == [None if chosen is None else rate / SETTINGS[chosen][0]]
+    assert asked == [None if chosen is None or keeps_up is None else rate / SETTINGS[chosen][0]]
+    assert moved == {0.01}  # twice `SimulationPlanLimits.max_moved`, for the chosen setting and for all others
     assert found.room == pytest.approx(room)
     if chosen is None:
         assert found.plan is None
         return
     assert found.plan is not None
     assert (found.plan.chosen.settings, found.error, found.keeps_up) == (chosen, SETTINGS[chosen][2], keeps_up)
-    assert found.cost == 1.0
+    assert found.cost == pytest.approx(1.0 if found.possible else math.nan, nan_ok=True)
+
+
+def test_truth_of_a_third_of_the_profiles_shares_the_preparation_among_all(device: Device) -> None:
+    """As the plan does, and the simulation."""
+    task = dataclasses.replace(simulation_plans.random_job(np.random.default_rng(1)).task, paths=("direct",))
+    job = simulation_plans.Job(task, task.transports[1::8], 1e-6, 0.5)
+    truth = simulation_plans.Truth(job, device)
+    np.testing.assert_array_equal(truth.sample.places, job.places)
+    assert truth.heights.shape[0] == 3
+    options = LightOptions(truth.sample, job.tolerance, lambda done, of: None)
+    options.setups = {1.0: 48.0, 2.0: 24.0}
+    settings = SimulationSettings.of(dataclasses.replace(task, paths=("direct", "multi-bounce"), patch_size=1.0))
+    assert options.preparation_of(settings) == 3.0  # 72 s of 24 profiles
 
 
 class _Name(str):

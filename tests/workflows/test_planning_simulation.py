@@ -117,7 +117,7 @@ def test_the_true_error_of_each_setting_is_at_most_the_predicted_one(monkeypatch
     for each in usable:
         found = heights_of(each.settings.applied(task), device, places)
         error = math.sqrt(float(np.nanmean((found - true) ** 2)))
-        assert error <= FEW.margin * each.error, each.name
+        assert error <= each.error, each.name
     # Without diffuse light the change is above 5 um.
     without = [each for each in trials if "diffuse-diffuse" not in each.settings.paths]
     assert all(each.change > 5e-6 for each in without)
@@ -273,7 +273,7 @@ def test_the_plan_of_a_job_simulates(tmp_path: Any) -> None:
     assert done.attribution.error.shape == (6, 16)
 
 
-@pytest.mark.parametrize(("paths", "albedo", "most"), [(PATHS, 0.7, 120), (PATHS, 0.0, 1000), (INDIRECT, 0.7, 1000)])
+@pytest.mark.parametrize(("paths", "albedo", "most"), [(PATHS, 0.7, 120), (PATHS, 0.0, 2000), (INDIRECT, 0.7, 2000)])
 def test_small_parts_are_not_worth_planning(paths: tuple[str, ...], albedo: float, most: int) -> None:
     """Black surfaces have no multi-bounce light."""
     task = dataclasses.replace(task_of(paths=paths), materials=white(albedo))
@@ -332,7 +332,10 @@ def test_clustered_pairs_count_with_their_bound(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_times_of_a_combination_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Direct light 1 s, diffuse light 2 s more, bounces 4 s more by ray and 80 s of preparation for 40 profiles."""
+    """Direct light 1 s, diffuse light 2 s more, bounces 4 s more by ray and 80 s of preparation for 40 profiles.
+
+    The preparation of patches of twice the size is included for the largest ones, and adds 80 s for others.
+    """
     seconds = {("direct",): 1.0, ("direct", "diffuse-diffuse"): 3.0}
 
     def times(each: SimulationSettings) -> SampledLight:
@@ -344,11 +347,26 @@ def test_times_of_a_combination_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
         expected = 1.0 + 2.0 * ("diffuse-diffuse" in settings.paths)
         if "multi-bounce" in settings.paths:
             assert settings.bounce_nodes is not None
-            expected += 4.0 * math.prod(settings.bounce_nodes) + 2.0
+            is_largest = settings.patch_size == max(found.setups)
+            expected += 4.0 * math.prod(settings.bounce_nodes) + (2.0 if is_largest else 4.0)
         assert found_seconds == pytest.approx(expected)
     # Numbers of slabs, times four numbers of rays or no diffuse light, times three sizes of patches for each of two
     # numbers of rays or no bounces.
     assert len(by_settings) == 4 * 5 * (1 + 2 * 3)
+
+
+def test_progress_counts_the_light_on_more_profiles() -> None:
+    """The light of the setting, and the direct and the diffuse light of the reference."""
+    done = list[tuple[int, int | None]]()
+    sample = ProfileSample.of(task_of(), 1, Device.best(), others=(1,))
+    options = LightOptions(sample, 1.0, lambda *each: done.append(each))
+    tried = Combinations(options, FEW.max_moved)
+    first = len(done)
+    assert done == [(count, None) for count in range(1, first + 1)]
+    trial = tried.trial([axis[-1] for axis in options.axes], 0.0)
+    assert len(done) == first
+    tried.look_closer(trial)
+    assert done[first:] == [(first + count, None) for count in (1, 2, 3)]
 
 
 def test_the_reference_has_the_finest_options_with_more_rays_of_diffuse_light() -> None:

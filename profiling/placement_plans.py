@@ -49,8 +49,8 @@ _FEW = (4, 8, 24)  # of another setting
 _CLEARLY = 3.0  # standard errors by which error and time differ from the asked ones (chosen)
 _SURELY = 0.99865  # probability of as much in one direction
 _SLOWER = 1.25  # a setting that is predicted slower than this part of the longest time is not fast enough (chosen)
-# Settings after which the search of a job ends. In a job with 105 settings the search placed 22, each in 0.2 to 2 s of a
-# core: 60 take two minutes at most, if those of other jobs take as long.
+# Settings after which the search of a job ends. In a job with 105 settings the search placed 22, each in 0.2 to 2 s of
+# a core: 60 take two minutes at most, if those of other jobs take as long.
 _PLACED = 60
 _LARGEST = math.sqrt(2.0)  # side of the largest camera window that a plan tries, relative to the machine's
 _RUNS = 8  # without images, for the times of settings that the plan left out

@@ -529,6 +529,7 @@ def notched_square(half: float, depths: list[int]) -> np.ndarray:
     return 40.0 + 160.0 * inside
 
 
+@pytest.mark.vectors
 @pytest.mark.parametrize("match", [True, False])
 def test_variants_choose_the_same_of_equal_starts(device: Device, match: bool) -> None:
     """Several shapes fit the edges of a square with notches equally well."""

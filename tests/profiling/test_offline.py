@@ -24,8 +24,9 @@ from gpuvision.profiling.offline.targets import TARGETS, CompilerError, Usage, u
 
 ROOT = Path(__file__).resolve().parents[2]
 _DIRECTIVE = re.compile(r"^[ \t]*#[ \t]*(if|ifdef|ifndef|elif)\b([^\n]*)", re.MULTILINE)
-# Macros that only builds for CPUs have: vectors, stores around the caches, prefetching, PoCL.
+# Macros that only builds for CPUs have: vectors, stores around the caches, prefetching, PoCL, convex parts of scenes.
 _OF_CPUS = {
+    "CONVEX_PARTS",
     "ITEM_PER_PROFILE",
     "VECTOR_VARIANT",
     "PAST_CACHES",

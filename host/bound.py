@@ -291,7 +291,8 @@ class Bound(Generic[R]):
         """Run on NumPy arrays and wait.
 
         The arrays are copied to `inputs` and from `outputs`, whose contents are lost; but where memory is shared, the
-        kernel may read and write large arrays in place, and reads all arrays in place if `inputs` were given to `bind`.
+        kernel may read and write large arrays in place. A single kernel does so with all arrays if `inputs` were given
+        to `bind`; a sequence overwrites these.
         """
         if len(frames) != len(self.inputs):
             raise self._wrong_count(len(frames))

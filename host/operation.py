@@ -119,7 +119,8 @@ class Operation(Generic[R]):
         queue : pyopencl.CommandQueue, optional
             In-order queue of the device's context to run in; the device's default queue otherwise.
         inputs : sequence of pyopencl.array.Array
-            Arrays that calls without arguments read, such as results of another operation; by default new arrays.
+            Arrays that calls without arguments read, such as results of another operation; by default new arrays. Calls
+            with NumPy arrays overwrite them in sequences, and on devices with memory of their own.
 
         Returns
         -------

@@ -6,8 +6,8 @@ and other noise than in the plan, and with the covariance of calibration and dri
 Placements follow, up to 384 of the chosen setting and up to 24 of another one, until error and time are clearly above
 or below the asked ones. A plan holds if the root mean square error is at most the tolerance, if each part is released,
 and if the mean time keeps up with the rate. Its cost is its true time over that of the fastest setting that truly meets
-the tolerance. The search for it goes through all settings that `try_placements` returns, also those that it left out
-by theory, in the order of their times in runs without images, until the next one takes 1.25 times as long as the
+the tolerance. The search goes through all settings that `try_placements` returns, and those that it left out by theory,
+in the order of their times in runs without images, until the next one takes 1.25 times as long as the
 fastest one found. No setting is passed over by its predicted error. The loops that `PlacementSettings` does not yield,
 because a small error of their model makes them unstable, are not in the search. It ends after 60 settings: the best one
 is then unknown. A board without features in view is drawn again; other refusals are counted, with their reason.
@@ -50,7 +50,7 @@ _CLEARLY = 3.0  # standard errors by which error and time differ from the asked 
 _SURELY = 0.99865  # probability of as much in one direction
 _SLOWER = 1.25  # a setting that is predicted slower than this part of the longest time is not fast enough (chosen)
 # Settings after which the search of a job ends. In a job with 105 settings the search placed 22, each in 0.2 to 2 s of
-# a core: 60 take two minutes at most, if those of other jobs take as long.
+# processor time. If settings of other jobs take as long, 60 take at most two minutes.
 _PLACED = 60
 _LARGEST = math.sqrt(2.0)  # side of the largest camera window that a plan tries, relative to the machine's
 _RUNS = 8  # without images, for the times of settings that the plan left out

@@ -215,7 +215,7 @@ class Truth:
             smaller = dataclasses.replace(
                 settings,
                 paths=("direct", "multi-bounce"),
-                nodes=(4 * u, 3 * v),  # in the same bins, at other places than those of the options
+                nodes=(4 * u, 3 * v),  # the same bins, but other places than in the options
                 patch_size=0.5 * settings.patch_size,
             )
             light["multi-bounce"] = self.sample.light(smaller, solvers={}).exposures["multi-bounce"]

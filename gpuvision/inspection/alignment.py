@@ -137,7 +137,7 @@ class _RigidFit(NamedTuple):
     """Fitted place of a board, and the number of fitted deposits; see the attributes of `Alignment`.
 
     ``motion`` (3,) is the shift of the centre [m] and the rotation [rad] by this round, ``moved`` [m] the largest
-    distance by which it moved a deposit.
+    motion of a deposit.
     """
 
     placement: BoardPlacement

@@ -79,7 +79,7 @@ class Combinations:
         return self._judged(trial.settings, trial.seconds, trial.pairs)
 
     def _judged(self, settings: SimulationSettings, seconds: float, pairs: float) -> SettingsTrial:
-        """Compare the readings of settings with those of the reference on the same profiles."""
+        """Return the trial of settings: the reference gives the readings to compare with, on the same profiles."""
         readings = self._readings[settings]
         found, reference = join_readings(readings), join_readings(self._references[: len(readings)])
         difference = self._sample.reader.compare(found, reference)

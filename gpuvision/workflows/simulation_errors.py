@@ -120,8 +120,8 @@ def estimate_errors(task: SimulationTask, *, profiles: int = 6, device: Device |
     range error is the distance of the readings on the sensor times the derivative dH/du of the height. The error is
     taken as twice the root mean square change, which holds for errors of first order and is too large for those of
     higher order; for bins and blur, of second order, as 4/3 of the change; for rays per bin, from rays that are spread
-    (see `ViewRays`), as 4/3 of the change as well. Patches are compared with patches of twice the size, of which they
-    have half the error. These are estimates. Proven bounds are those of clustered and omitted
+    (see `ViewRays`), as 4/3 of the change as well. Patches are compared with patches of twice the size, whose error
+    is assumed to be twice as large. These are estimates. Proven bounds are those of clustered and omitted
     pairs, and that of omitted multi-bounce light where it is smaller than the estimate; both for PSDs only. Rounding is
     that of the readout; the light is computed in single precision.
     """

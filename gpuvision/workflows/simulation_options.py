@@ -103,7 +103,7 @@ class LightOptions:
         return light | ({"diffuse-diffuse": self.rays[-1]} if self.rays else {})
 
     def reference_at(self, places: npt.NDArray[np.float64]) -> dict[str, Exposure]:
-        """Compute the light of the reference on other profiles than those of the sample.
+        """Compute the light of the reference on profiles that are not in the sample.
 
         Parameters
         ----------

@@ -64,8 +64,8 @@ class SettingsTrial(NamedTuple):
     least : float
         The same with the lower limit of the change [m]: more profiles may show that the error is as small as this.
     change : float
-        Root mean square difference of the readings from those of the reference, with all pairs [m]: the upper limit of
-        its mean square, twice its standard error above the mean. The reference has the finest options, with more rays
+        Root mean square difference between the readings and those of the reference, with all pairs [m]. It is an upper
+        limit: the mean square is raised by two standard errors. The reference has the finest options, with more rays
         per bin of diffuse light.
     pairs : float
         Proven bound of the error by clustered and omitted pairs [m]; only PSDs have such pairs.

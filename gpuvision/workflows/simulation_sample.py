@@ -23,8 +23,8 @@ from gpuvision.workflows.light_cache import PROFILES_PER_BLOCK, SimulationTask, 
 
 Float64 = npt.NDArray[np.float64]
 
-# Standard errors of the mean over the profiles by which the mean square error is raised, and lowered. Chosen: the mean
-# over all profiles of a part lies beyond these limits in few cases.
+# The mean square error over the profiles of a sample is raised and lowered by this many standard errors. Chosen: the
+# mean over all profiles of a part is rarely outside these limits.
 _STANDARD_ERRORS = 2.0
 # Runs of a light whose shortest time counts, and the time [s] after which it is not repeated. Chosen: pauses of a busy
 # machine hit one run or a few. On a very busy one they hit each of five runs of 10 ms; 20 take most of the planning.

@@ -96,7 +96,7 @@ def features_in_view(features: FeatureSet, view: BoardView) -> FeatureSet:
     """Return the features whose samples all lie in the image of a camera; others are not measured.
 
     All rulers have the length of the longest one (`FeatureSet.ruler_length`). ``covariance``, ``condition`` and
-    ``region`` remain those of all features.
+    ``region`` still hold for all features.
 
     Parameters
     ----------

@@ -179,7 +179,7 @@ class Bvh:
         return capacity(self.depth, least=MIN_STACK_SIZE)
 
     def rounding(self, real: np.dtype[Any]) -> float:
-        """Return a bound of the rounding of coordinates in a real type [m], by which the boxes grow."""
+        """Return an upper limit of the rounding error of coordinates in a real type [m]; boxes are enlarged by it."""
         return rounding_of(float(np.abs(self.corners).max(initial=0.0)), real)
 
     def tables(self, real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
@@ -257,7 +257,7 @@ def radix_argsort(key: Integers) -> Integers:
 
 
 def rounding_of(reach: float, real: np.dtype[Any]) -> float:
-    """Return a bound of the rounding of coordinates up to `reach` [m] to a real type [m]."""
+    """Return an upper limit of the rounding error [m] of coordinates up to `reach` [m] in a real type."""
     return _BOX_PADDING_ULPS * float(np.finfo(real).eps) * reach
 
 

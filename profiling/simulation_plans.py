@@ -1,13 +1,15 @@
 """Plans of simulations against truth: random parts and sensors: ``python -m gpuvision.profiling.simulation_plans``.
 
-Each job is a part of boxes and a cylinder under a PSD or a camera, with a tolerance and a rate. Truth is an
-independent, finer computation of all profiles of the part (with multi-bounce light: of a third of them, chosen at
-random). It has eight times the rays of the finest setting of the plan, which is twice the rays of the plan's reference,
-spread over the samples. It has twice the slabs of the finest setting, half its bins, patches, steps in mirrors and
-parts of lobes, and three times its rays of multi-bounce light. A plan holds if the root mean square difference of the
-simulated heights is at most the tolerance, and if the time of a profile keeps up with the rate. No rate is asked if no
-combination of options truly meets the tolerance. The cost of a plan is its time over the time of the fastest
-combination that truly meets the tolerance on these profiles (exhaustive search).
+Each job is a part of boxes and a cylinder under a PSD or a camera, with a tolerance and a rate. Half of the parts are
+small, with 24 profiles in the middle. The others are large, with 100 to 400 profiles of the whole part, of which the
+plan tries some. Truth is an independent, finer computation of 24 profiles (of 8 with multi-bounce light): a random one
+of each of 24 sections of the part, drawn without regard to the profiles of the plan. It has eight times the rays of the
+finest setting of the plan, which is twice the rays of the plan's reference, spread over the samples. It has twice the
+slabs of the finest setting, half its bins, patches, steps in mirrors and parts of lobes, and three times its rays of
+multi-bounce light. A plan holds if the root mean square difference of the simulated heights is at most the tolerance,
+and if the time of a profile keeps up with the rate. No rate is asked if no combination of options truly meets the
+tolerance. The cost of a plan is its time over the time of the fastest combination that truly meets the tolerance on
+these profiles (exhaustive search).
 """
 
 from __future__ import annotations
@@ -46,7 +48,9 @@ Float64 = npt.NDArray[np.float64]
 
 _WIDTH = 6  # strips or columns of the sensor file that are joined to one: a sixth of the work
 _BINS = 48  # of a strip of a PSD
-_PROFILES = 24  # of a part
+_PROFILES = 24  # of a small part, and of a large one that are compared with truth
+_LARGE = 0.5  # share of the large parts
+_MIN_LARGE, _MAX_LARGE = 100, 400  # profiles of a large part
 _THIRD = 3  # of three profiles with multi-bounce light, one is compared with truth, because that light takes minutes
 _TURNS = 5  # of the times of the chosen and of the best light: the machine may be busy
 _BOUNCES = 0.5  # share of the PSD's jobs with multi-bounce light, which takes most of the time
@@ -81,12 +85,23 @@ def random_job(rng: np.random.Generator) -> Job:
     diagonal = float(np.linalg.norm(np.ptp(scene.corners.reshape(-1, 3), axis=0)))
     size = diagonal / rng.uniform(4.0, 6.0)
     paths = PATHS if is_psd and rng.random() < _BOUNCES else PATHS[:-1]
-    task = prepare_simulation(scene, materials, sensor, paths=paths, patch_size=size, profiles=_PROFILES)
+    is_large = rng.random() < _LARGE
+    profiles = None if is_large else _PROFILES
+    task = prepare_simulation(scene, materials, sensor, paths=paths, patch_size=size, profiles=profiles)
+    if is_large:  # over the whole part, at another step than the sensor's
+        count = int(rng.integers(_MIN_LARGE, _MAX_LARGE + 1))
+        task = dataclasses.replace(task, transports=np.linspace(task.transports[0], task.transports[-1], count))
     low, high = (3e-6, 300e-6) if is_psd else (0.3e-6, 30e-6)
-    section = _THIRD if "multi-bounce" in paths else 1
-    places = task.transports[rng.integers(section, size=_PROFILES // section) + np.arange(0, _PROFILES, section)]
+    places = random_places(rng, task.transports, _PROFILES // (_THIRD if "multi-bounce" in paths else 1))
     tolerance = math.exp(rng.uniform(math.log(low), math.log(high)))
     return Job(task, places, tolerance, rng.uniform(0.3, 0.8))
+
+
+def random_places(rng: np.random.Generator, transports: Float64, count: int) -> Float64:
+    """Return a random transport of each of ``count`` equal sections."""
+    section = len(transports) / count
+    starts = np.ceil(np.arange(count + 1) * section - 0.5).astype(int)
+    return transports[rng.integers(starts[:-1], starts[1:])]
 
 
 def random_part(rng: np.random.Generator) -> tuple[Scene, tuple[Material, ...]]:
@@ -166,14 +181,20 @@ def judge(rng: np.random.Generator, device: Device, limits: SimulationPlanLimits
     room = job.tolerance / min(errors) if rate is None else room_of(errors, list(times.values()), job.tolerance, rate)
     try:
         plan = plan_task(job.task, tolerance=job.tolerance, rate=rate, device=device, limits=limits)
-    except PlanError:
-        return Outcome(None, job.tolerance, possible=bool(meeting), room=room)
+    except PlanError as refusal:
+        return Outcome(None, job.tolerance, possible=bool(meeting), room=room, note=note_of(job, str(refusal)))
     chosen = plan.chosen.settings
     light = truth.sample.light(chosen)
     error = truth.error(light.exposures, max_moved)
     cost = math.nan if best is None else time_ratio(truth.sample, options, chosen, best)
     keeps_up = None if rate is None else (light.seconds + options.preparation_of(chosen)) * rate <= 1.0
-    return Outcome(plan, job.tolerance, error, bool(meeting), cost, keeps_up, room)
+    return Outcome(plan, job.tolerance, error, bool(meeting), cost, keeps_up, room, note_of(job))
+
+
+def note_of(job: Job, reason: str = "") -> str:
+    """Return the number of profiles of the part, and the reason of a refusal."""
+    count = f"{len(job.task.transports)} profiles"
+    return f"{count}; {reason}" if reason else count
 
 
 def time_ratio(

@@ -600,7 +600,7 @@ def test_outcome_of_a_simulation(
         return SETTINGS[str(light)][2]
 
     truth = SimpleNamespace(sample=SimpleNamespace(light=light), error=error)
-    job: Any = SimpleNamespace(task=None, tolerance=tolerance, rate=rate)
+    job: Any = SimpleNamespace(task=SimpleNamespace(transports=range(120)), tolerance=tolerance, rate=rate)
     monkeypatch.setattr(simulation_plans, "random_job", lambda rng: job)
     monkeypatch.setattr(simulation_plans, "Truth", lambda job, device: truth)
     monkeypatch.setattr(simulation_plans, "LightOptions", Options)
@@ -614,10 +614,34 @@ def test_outcome_of_a_simulation(
     assert found.room == pytest.approx(room)
     if chosen is None:
         assert found.plan is None
+        assert found.note == "120 profiles; none"
         return
     assert found.plan is not None
+    assert found.note == "120 profiles"
     assert (found.plan.chosen.settings, found.error, found.keeps_up) == (chosen, SETTINGS[chosen][2], keeps_up)
     assert found.cost == pytest.approx(1.0 if found.possible else math.nan, nan_ok=True)
+
+
+@pytest.mark.parametrize(("profiles", "count"), [(24, 24), (24, 8), (101, 24), (399, 8)])
+def test_truth_is_on_a_random_profile_of_each_section(profiles: int, count: int) -> None:
+    transports = np.linspace(-3.0, 5.0, profiles)
+    draws = [
+        np.searchsorted(transports, simulation_plans.random_places(np.random.default_rng(seed), transports, count))
+        for seed in range(1000)
+    ]
+    sections = np.floor((np.array(draws) + 0.5) * count / profiles)
+    np.testing.assert_array_equal(sections, np.broadcast_to(np.arange(count), sections.shape))
+    assert len(np.unique(draws)) == profiles  # each profile of the part may be drawn
+
+
+def test_half_of_the_parts_have_more_profiles_than_a_plan_tries() -> None:
+    jobs = [simulation_plans.random_job(np.random.default_rng((1, number))) for number in range(24)]
+    counts = np.array([len(job.task.transports) for job in jobs])
+    assert set(counts[counts < 100]) == {24}
+    assert 6 <= np.sum(counts >= 100) <= 18
+    assert counts.max() <= 400
+    for job in jobs:
+        assert np.isin(job.places, job.task.transports).all()
 
 
 def test_truth_of_a_third_of_the_profiles_shares_the_preparation_among_all(device: Device) -> None:

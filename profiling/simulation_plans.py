@@ -101,7 +101,7 @@ def random_places(rng: np.random.Generator, transports: Float64, count: int) -> 
     """Return a random transport of each of ``count`` equal sections."""
     section = len(transports) / count
     starts = np.ceil(np.arange(count + 1) * section - 0.5).astype(int)
-    return transports[rng.integers(starts[:-1], starts[1:])]
+    return np.asarray(transports[rng.integers(starts[:-1], starts[1:])])
 
 
 def random_part(rng: np.random.Generator) -> tuple[Scene, tuple[Material, ...]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -264,7 +265,8 @@ def _write_plan(
         plan.write(out, title=title, overwrite=overwrite)
     report_plan(plan, out, as_json, outputs)
     if out is not None:
-        echo(f"next: give --features {out / FEATURES_FILE} instead of --tolerance", err=prints_report(as_json))
+        features = shlex.quote(str(out / FEATURES_FILE))
+        echo(f"next: give --features {features} instead of --tolerance", err=prints_report(as_json))
 
 
 def _features(file: Path, budget: int | None, side: Side | None) -> FeatureSet:

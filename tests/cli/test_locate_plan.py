@@ -47,21 +47,21 @@ def run(*words: str) -> str:
 
 
 def test_a_plan_is_printed_drawn_and_reported(folder: Path) -> None:
-    text = run("--plan", "--tolerance", "1mm", "--rate", "1", "--out", "out", "--json", "plan.json")
+    text = run("--plan", "--tolerance", "1mm", "--rate", "1", "--out", "my plan", "--json", "plan.json")
     lines = text.splitlines()
     assert lines[0].split() == ["features", "us/frame", "error", "scatter", "other", "leverage", "refused"]
     assert sum(line.startswith("* ") for line in lines) == 1
     assert "rulers of 5 px: predicted error" in lines[-3]
     assert lines[-2:] == [
-        "look at out/plan.png",
-        "next: give --features out/features.toml instead of --tolerance",
+        "look at my plan/plan.png",
+        "next: give --features 'my plan/features.toml' instead of --tolerance",
     ]
     report = json.loads((folder / "plan.json").read_text())
     assert report["tolerance"] == 1e-3
     assert report["chosen"] in report["trials"]
-    assert {path.name for path in (folder / "out").iterdir()} == {"plan.png", "features.toml", MANIFEST}
+    assert {path.name for path in (folder / "my plan").iterdir()} == {"plan.png", "features.toml", MANIFEST}
     # The features locate the board without another selection.
-    assert "sigmas" in run("--features", "out/features.toml")
+    assert "sigmas" in run("--features", "my plan/features.toml")
 
 
 def test_a_tolerance_locates_with_the_chosen_features(folder: Path) -> None:

@@ -45,23 +45,25 @@ def run(*words: str, machine: str = "machine.toml") -> str:
 
 
 def test_a_plan_is_printed_drawn_and_reported(folder: Path) -> None:
-    text = run("--plan", "--tolerance", "1mm", "--rate", "20", "--part-radius", "0m", "--json", "plan.json")
+    text = run(
+        "--plan", "--tolerance", "1mm", "--rate", "20", "--part-radius", "0m", "--json", "plan.json", "--out", "my plan"
+    )
     lines = text.splitlines()
     heads = ["settings", "us/part", "error", "machine", "vision", "loop", "images", "aborted"]
     assert lines[0].split() == heads
     assert sum(line.startswith("* ") for line in lines) == 1
     assert "128x128 at 1000/s, " in lines[-3]
     assert lines[-2:] == [
-        "look at out/plan.png",
-        "next: give --machine out/machine.toml --budget 60 instead of --machine and --tolerance",
+        "look at my plan/plan.png",
+        "next: give --machine 'my plan/machine.toml' --budget 60 instead of --machine and --tolerance",
     ]
     report = json.loads((folder / "plan.json").read_text())
     assert report["tolerance"] == 1e-3
     assert report["chosen"] in report["trials"]
     # Without a radius the angle does not count: the error is that of the calibration and the loop in x and y.
     assert report["chosen"]["error"] < 1.5e-6
-    assert {path.name for path in (folder / "out").iterdir()} == {"plan.png", "machine.toml", MANIFEST}
-    read, chosen = read_machine(folder / "out" / "machine.toml"), report["chosen"]
+    assert {path.name for path in (folder / "my plan").iterdir()} == {"plan.png", "machine.toml", MANIFEST}
+    read, chosen = read_machine(folder / "my plan" / "machine.toml"), report["chosen"]
     assert (read.control.observer, read.loop_gain) == (chosen["observer"], chosen["gain"])
     assert read.tolerance.position == chosen["release_position"]
     assert read.rate == chosen["rate"]

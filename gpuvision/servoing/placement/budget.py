@@ -44,12 +44,9 @@ class ErrorBudget(NamedTuple):
 
     @property
     def sigmas(self) -> dict[str, Float64]:
-        """Standard deviations (3,) of x, y [m] and theta [rad] by source, and of the "total".
-
-        Rounding makes a variance that is nearly 0 beside others negative: that of the etch bias, which has rank 1.
-        """
+        """Standard deviations (3,) of x, y [m] and theta [rad] by source, and of the "total"."""
         each = {**self.sources, "total": self.total}
-        return {name: np.sqrt(np.maximum(np.diag(covariance), 0.0)) for name, covariance in each.items()}
+        return {name: np.sqrt(np.diag(covariance)) for name, covariance in each.items()}
 
 
 def noise_gain(

@@ -355,12 +355,14 @@ def _split_covariance(features: FeatureSet) -> tuple[Float64, Float64]:
     """Return the covariances (3, 3) of the pose by the noise of the features and by the etch bias.
 
     The pose and the etch bias e are estimated together, with the prior of e: the error of the estimate is
-    ``C R' W noise - C P e`` with the information ``R' W R``, the prior P, and ``C = (R' W R + P)^-1``.
+    ``C R' W noise - C P e`` with the information ``R' W R``, the prior P, and ``C = (R' W R + P)^-1``. The computed
+    inverse is not exactly symmetric: ``C P C`` can have negative variances where the etch bias does not move the pose;
+    ``C P C'`` has none.
     """
     rows, prior = _weighted_rows(features)
     information = rows.T @ rows
     covariance = np.linalg.inv(information + prior)
-    noise, common = (covariance @ each @ covariance for each in (information, prior))
+    noise, common = (covariance @ each @ covariance.T for each in (information, prior))
     return noise[:3, :3], common[:3, :3]
 
 

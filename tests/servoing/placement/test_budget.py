@@ -12,13 +12,7 @@ from gpuvision.servoing.axis import Axis
 from gpuvision.servoing.delay import gain_limit
 from gpuvision.servoing.frames import Transform
 from gpuvision.servoing.margins import observer_matrix
-from gpuvision.servoing.placement.budget import (
-    ErrorBudget,
-    model_tolerance,
-    noise_covariance,
-    noise_gain,
-    predict_budget,
-)
+from gpuvision.servoing.placement.budget import model_tolerance, noise_covariance, noise_gain, predict_budget
 from gpuvision.servoing.placement.control import Control, Settling
 from gpuvision.servoing.placement.machine import ThermalDrift
 from gpuvision.servoing.placement.placing import REMAINDER
@@ -219,11 +213,3 @@ def test_corrections_of_a_kalman_filter_follow_its_recursion() -> None:
         at = [here - 0.7 * (here + error) for here, error in zip(at, by_noise, strict=True)]
     expected = sum(each @ noise @ each.T for each in at)
     np.testing.assert_allclose(noise_covariance(machine, reported, noise, 3), expected, rtol=1e-9)
-
-
-def test_variance_that_rounding_makes_negative_is_zero() -> None:
-    """An etch bias of rank 1 has exactly such variances after it is moved from the camera to the nozzle."""
-    etch_bias = np.diag([4e-21, -3e-27, 0.0])
-    budget = ErrorBudget({"etch bias": etch_bias, "servo": NOISE}, etch_bias + NOISE)
-    np.testing.assert_array_equal(budget.sigmas["etch bias"], [math.sqrt(4e-21), 0.0, 0.0])
-    np.testing.assert_array_equal(budget.sigmas["total"], np.sqrt(np.diag(etch_bias + NOISE)))

@@ -84,6 +84,20 @@ def test_covariance_of_noise_and_of_etch_bias_add_up_to_the_posterior() -> None:
     np.testing.assert_allclose(etch_bias, np.outer(moved, moved)[:3, :3], rtol=1e-6, atol=1e-30)
 
 
+def test_rounding_of_the_inverse_makes_no_variance_of_the_etch_bias_negative(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen on a board whose edges face each other: rounding alone determined both elements, with opposite signs."""
+    inverse = np.linalg.inv
+
+    def rounded(matrix: Any) -> Any:
+        found = inverse(matrix)
+        found[1, 3], found[3, 1] = 3e-22, -2e-22
+        return found
+
+    monkeypatch.setattr(np.linalg, "inv", rounded)
+    _, etch_bias = plan._split_covariance(features())
+    assert etch_bias[1, 1] == pytest.approx((3e-22 / 8e-6) ** 2, rel=1e-12, abs=0.0)
+
+
 def test_covariance_of_the_sampling_is_that_of_weighted_least_squares() -> None:
     found = features()
     rows = equations(found)

@@ -6,6 +6,7 @@ import contextlib
 import fnmatch
 import math
 import re
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -92,6 +93,11 @@ def echo(text: str, *, err: bool = False) -> None:
     from gpuvision.host.text import printable
 
     typer.echo(printable(text), err=err)
+
+
+def command_line(*words: object) -> str:
+    """Return words of a proposed command, quoted for the shell where they need it."""
+    return shlex.join(map(str, words))
 
 
 def prints_report(path: Path | None) -> bool:

@@ -16,6 +16,7 @@ from rich.table import Table
 from gpuvision.cli.arguments import (
     Overwrite,
     ReportFile,
+    command_line,
     echo,
     named_path,
     prints_report,
@@ -205,10 +206,8 @@ def _calibrate_camera(
     _show(done, to_stderr=prints_report(as_json))
     write_calibration(done, out, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
-    echo(
-        f"next: check {out.with_suffix('.png')}; correct images with gpuvision undistort IMAGES --lens {out} --out DIR",
-        err=prints_report(as_json),
-    )
+    correct = command_line("gpuvision", "undistort", "IMAGES", "--lens", out, "--out", "DIR")
+    echo(f"next: check {out.with_suffix('.png')}; correct images with {correct}", err=prints_report(as_json))
 
 
 def _corners(text: str) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from gpuvision.cli.arguments import (
+    command_line,
     echo,
     named_path,
     prints_report,
@@ -193,10 +194,8 @@ def calibrate_sensor(
     _show(done, show, to_stderr=prints_report(as_json))
     write_sensor_calibration(done, out, inputs=inputs, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
-    echo(
-        f"next: check {out.with_suffix('.png')}; scan with gpuvision scan RECORDING --sensor {out} --out DIR",
-        err=prints_report(as_json),
-    )
+    scan = command_line("gpuvision", "scan", "RECORDING", "--sensor", out, "--out", "DIR")
+    echo(f"next: check {out.with_suffix('.png')}; scan with {scan}", err=prints_report(as_json))
 
 
 def _check(options: SensorOptions, settings: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, Overwrite, echo, named_path, progress_bar
+from gpuvision.cli.arguments import DeviceLabel, Overwrite, command_line, echo, named_path, progress_bar
 
 if TYPE_CHECKING:
     from gpuvision.host import Device
@@ -59,10 +59,8 @@ def demo(
         write_text_atomic(inside / "report.json", report_text(json_tree(results)))
     echo(f"{name} with a mask computed for the part: {masked.summary()}")
     camera = out / "camera_line"
-    echo(
-        "next: scan a recording yourself: "
-        f"gpuvision scan {camera / 'recording.npy'} --sensor camera_line --out {out / 'again'}"
-    )
+    words = ("scan", camera / "recording.npy", "--sensor", "camera_line", "--out", out / "again")
+    echo(f"next: scan a recording yourself: {command_line('gpuvision', *words)}")
     echo(
         f"Range image of the part: {camera / 'picture.png'}. Errors of the PSD strips from light in the corners: "
         f"{out / name / 'errors.png'} and causes.png in the same folder; with a mask: "

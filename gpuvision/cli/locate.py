@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +14,7 @@ from gpuvision.cli.arguments import (
     LayerNames,
     Overwrite,
     ReportFile,
+    command_line,
     echo,
     layers_of,
     named_path,
@@ -265,8 +265,8 @@ def _write_plan(
         plan.write(out, title=title, overwrite=overwrite)
     report_plan(plan, out, as_json, outputs)
     if out is not None:
-        features = shlex.quote(str(out / FEATURES_FILE))
-        echo(f"next: give --features {features} instead of --tolerance", err=prints_report(as_json))
+        given = command_line("--features", out / FEATURES_FILE)
+        echo(f"next: give {given} instead of --tolerance", err=prints_report(as_json))
 
 
 def _features(file: Path, budget: int | None, side: Side | None) -> FeatureSet:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +12,7 @@ from gpuvision.cli.arguments import (
     LayerNames,
     Overwrite,
     ReportFile,
+    command_line,
     echo,
     layers_of,
     named_path,
@@ -210,7 +210,7 @@ def _write_plan(
     more = {_MACHINE_FILE: lambda path: write_settings(machine, chosen.machine, path)}
     plan.write(out, title=f"{Path(machine).stem}, {chosen.rulers} rulers", overwrite=overwrite, more=more)
     report_plan(plan, out, as_json, outputs)
-    given = f"--machine {shlex.quote(str(out / _MACHINE_FILE))} --budget {chosen.budget}"
+    given = command_line("--machine", out / _MACHINE_FILE, "--budget", chosen.budget)
     echo(f"next: give {given} instead of --machine and --tolerance", err=prints_report(as_json))
 
 

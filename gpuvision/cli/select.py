@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import re
-import shlex
-from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpuvision.cli.arguments import LayerNames, Overwrite, echo, layers_of, named_path, quantities, reject_unused
+from gpuvision.cli.arguments import (
+    LayerNames,
+    Overwrite,
+    command_line,
+    echo,
+    layers_of,
+    named_path,
+    quantities,
+    reject_unused,
+)
 
 if TYPE_CHECKING:
     from gpuvision.matching.features.feature_set import BudgetUnit
@@ -132,15 +139,9 @@ def select(
     with outputs.folder(out) as inside:
         write_features(features, inside / "features.toml")
         draw_features(inside / "features.png", artwork, features, box)
-    echo(
-        f"{features.summary()}\nlook at {out / 'features.png'}; next: "
-        f"gpuvision locate IMAGE --board {gerbers} --features {out / 'features.toml'}{_repeated(layers)}"
-    )
-
-
-def _repeated(layers: Sequence[str] | None) -> str:
-    """Return the options ``--layers`` of this command, for the next command."""
-    return "".join(f" --layers {shlex.quote(each)}" for each in layers or ())
+    same_layers = [word for each in layers or () for word in ("--layers", each)]
+    words = ("locate", "IMAGE", "--board", gerbers, "--features", out / "features.toml", *same_layers)
+    echo(f"{features.summary()}\nlook at {out / 'features.png'}; next: {command_line('gpuvision', *words)}")
 
 
 def _box(region: str) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -13,6 +13,7 @@ from gpuvision.cli.arguments import (
     DeviceLabel,
     Overwrite,
     ReportFile,
+    command_line,
     echo,
     named_path,
     prints_report,
@@ -352,5 +353,6 @@ def _write_recordings(
         given = {"seed": made["seed"], "device": made["device"], "mask": mask}
         write_recording(each.task, folder, file, light=out, inputs=inputs, overwrite=overwrite, **given)
         recording, sensor = (folder / name for name in RECORDING_FILES)
-        lines.append(f"next: gpuvision scan {recording} --sensor {sensor} --out {folder / 'scan'}")
+        words = ("scan", recording, "--sensor", sensor, "--out", folder / "scan")
+        lines.append(f"next: {command_line('gpuvision', *words)}")
     return lines

@@ -51,7 +51,7 @@ def test_each_sensor_is_simulated_scanned_and_written(
     monkeypatch.setattr(simulating, "simulate", simulate)
     monkeypatch.setattr(simulated_recording, "simulate_recording", record)
     monkeypatch.setattr(scanning, "scan", scan)
-    out = tmp_path / "out"
+    out = tmp_path / "my parts"
     ran = CliRunner().invoke(application(), ["demo", "--out", str(out), *options], catch_exceptions=False)
     assert ran.exit_code == 0
     device = other if options else best
@@ -80,8 +80,8 @@ def test_each_sensor_is_simulated_scanned_and_written(
         f"device {device.label}: {device.name}",
         *(line for name in SENSORS for line in (f"{name}: scanned by sensor {name}", f"  simulated {name} bare")),
         f"{last} with a mask computed for the part: simulated {last} best",
-        f"next: scan a recording yourself: gpuvision scan {out}/camera_line/recording.npy --sensor camera_line "
-        f"--out {out}/again",
+        f"next: scan a recording yourself: gpuvision scan '{out}/camera_line/recording.npy' "
+        f"--sensor camera_line --out '{out}/again'",
         f"Range image of the part: {out}/camera_line/picture.png. Errors of the PSD strips from light in the corners: "
         f"{out}/{last}/errors.png and causes.png in the same folder; with a mask: {out}/{last}_masked/errors.png.",
     ]

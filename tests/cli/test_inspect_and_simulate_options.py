@@ -283,7 +283,7 @@ def test_recordings_of_each_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
         SimpleNamespace(task="other", mask=SimpleNamespace(mask="made")),
     ]
     made = {"seed": 5, "device": "d", "mask": "given", "limit": 1.0}
-    out = Path("out")
+    out = Path("my part")
     lines = simulate._write_recordings(found, ["a.toml", "b.toml"], out, made, ["p.stl"], True)
     how: dict[str, Any] = {"light": out, "inputs": ["p.stl"], "overwrite": True, "seed": 5, "device": "d"}
     assert asked == [
@@ -292,8 +292,9 @@ def test_recordings_of_each_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
     recording, sensor = simulated_recording.RECORDING_FILES
     assert lines == [
-        f"next: gpuvision scan out/{recording} --sensor out/{sensor} --out out/scan",
-        f"next: gpuvision scan out/second/{recording} --sensor out/second/{sensor} --out out/second/scan",
+        f"next: gpuvision scan 'my part/{recording}' --sensor 'my part/{sensor}' --out 'my part/scan'",
+        f"next: gpuvision scan 'my part/second/{recording}' --sensor 'my part/second/{sensor}' "
+        "--out 'my part/second/scan'",
     ]
 
 

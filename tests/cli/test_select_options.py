@@ -71,7 +71,7 @@ def test_features_are_chosen_written_and_drawn(full: bool, tmp_path: Path, monke
     monkeypatch.setattr(
         board, "draw_features", lambda path, *given: asked.append((given, {})) or path.write_text("png")
     )
-    folder, out = tmp_path / "board", tmp_path / "out"
+    folder, out = tmp_path / "my board", tmp_path / "out"
     folder.mkdir()
     words = ["select", str(folder), "--region", "1mm,2mm,3mm,4mm", "--scale", "25um", "--out", str(out)]
     more = ["--budget", "150us", "--device", "gpu", "--placement", "2mm,3mm", "--side", "bottom", "--missing", "0.25"]
@@ -95,7 +95,7 @@ def test_features_are_chosen_written_and_drawn(full: bool, tmp_path: Path, monke
     assert drawn == (side, made, box)
     assert {each.name for each in out.iterdir() if not each.name.startswith(".")} == {"features.toml", "features.png"}
     assert ran.stderr.splitlines() == ["warning: an odd layer"]
-    next_command = f"gpuvision locate IMAGE --board {folder} --features {out}/features.toml"
+    next_command = f"gpuvision locate IMAGE --board '{folder}' --features {out}/features.toml"
     next_command += " --layers '*.gtl=top copper'" if full else ""
     assert ran.stdout.splitlines() == ["30 rulers", f"look at {out}/features.png; next: {next_command}"]
     with pytest.raises(ValueError, match="--device has no effect without a --budget in us"):

@@ -278,7 +278,7 @@ class Pipeline(Generic[R]):
             while not self._stopping and source.wait():
                 requested_at = clock()
                 stage = "ring"
-                slot = self._free_slot(number)
+                slot = self._free_slot()
                 if slot is None:
                     break
                 stage = "source"
@@ -301,7 +301,7 @@ class Pipeline(Generic[R]):
             self._failure.__cause__ = error
         ready.put(None)
 
-    def _free_slot(self, number: int) -> Slot[R] | None:
+    def _free_slot(self) -> Slot[R] | None:
         """Take a slot according to the policy; return None at shutdown."""
         if self.policy == "block":
             self._tokens.get()

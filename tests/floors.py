@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.matching.artwork.shapes import capsule
 from gpuvision.matching.field.distance_map import Field
-from gpuvision.matching.field.evidence import robot_to_field
+from gpuvision.matching.field.evidence import Crossings, robot_to_field
 from gpuvision.plots.field import field_lines
 
 _FINE = 4  # samples along each side of a pixel
@@ -81,3 +81,9 @@ def seen_ahead(
         total += cv2.remap(carpet, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     grey = cv2.GaussianBlur(60.0 + 170.0 * total / samples**2, (0, 0), 0.7) + rng.normal(0, noise, shape)
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+def detected_fraction(crossings: Crossings, points: npt.NDArray[np.float32], tolerance: float) -> float:
+    """Return the share of the crossings with a point within ``tolerance`` [m] of the line."""
+    away = np.hypot(*(points - crossings.places[:, None]).T).min(axis=0)
+    return float(np.mean(away * crossings.sines <= tolerance))

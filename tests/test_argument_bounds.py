@@ -15,7 +15,6 @@ from gpuvision.matching.features.imaging import Imaging
 from gpuvision.ranging.focus import DepthFromFocus
 from gpuvision.ranging.homography import triangulation_homography
 from gpuvision.simulation.errors.range_error import StripErrorModel, interreflection_power_bound
-from gpuvision.simulation.sensors.collection import image_irradiance
 from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.transport.patches import Patches
 
@@ -79,8 +78,6 @@ CASES: list[tuple[str, Callable[[Any], Any], list[Any], list[Any]]] = [
      [(TINY, 0.0, 1.0), (1.0, 1.0, 1.0 + 2.0 * math.pi)], [(0.0, 0.0, 1.0), (1.0, 1.0, 1.0), (1.0, 0.0, 6.3)]),
     ("baseline stand_off focal_distance", lambda v: triangulation_homography(*v, 0.1),
      [(0.1, 0.2, 0.01)], [(0.0, 0.2, 0.01), (0.1, 0.0, 0.01), (0.1, 0.2, 0.0)]),
-    ("f_number", lambda v: image_irradiance(1.0, v), [TINY**0.25], [0.0, -1.0]),
-    ("magnification", lambda v: image_irradiance(1.0, 4.0, magnification=v), [0.0], [-TINY]),
     ("albedo of a bound", lambda v: interreflection_power_bound(1.0, v, 1.0), [0.0, 1.0], [-TINY, AFTER_1]),
     ("power of a bound", lambda v: interreflection_power_bound(v, 0.5, 1.0), [0.0], [-TINY]),
     ("solid angle of a bound", lambda v: interreflection_power_bound(1.0, 0.5, v), [0.0], [-TINY]),

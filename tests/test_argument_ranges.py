@@ -118,6 +118,7 @@ FIELDS: list[tuple[Any, str, tuple[list[Any], list[Any]]]] = [
 CALLS: list[tuple[str, Callable[[Any], Any], tuple[list[Any], list[Any]]]] = [
     ("stage of a budget", lambda v: replace(BUDGET, stages={"pose": v}), NOT_NEGATIVE),
     ("f_number", lambda v: image_irradiance(1.0, v), POSITIVE),
+    ("magnification", lambda v: image_irradiance(1.0, 4.0, magnification=v), NOT_NEGATIVE),
     ("transmission", lambda v: image_irradiance(1.0, 4.0, transmission=v), SHARE),
     ("irradiance", lambda v: image_irradiance(v, 4.0), NOT_NEGATIVE),
     ("illuminance", lambda v: irradiance_from_lux(v, 555e-9), NOT_NEGATIVE),

@@ -281,7 +281,7 @@ def _measure_board(z: Float64, grid: Grid, apertures: Sequence[Aperture], settin
             free[window.rows, window.columns] &= ~window.cells
     known = []
     for number, (aperture, window) in enumerate(zip(apertures, windows, strict=True)):
-        surface = None if window is None else _reference(z, free, grid, window, aperture, settings)
+        surface = None if window is None else _reference(z, free, grid, aperture, settings)
         if window is not None and surface is not None:
             known.append(_Known(number, aperture, window, surface))
     scatter = float(np.median([each.surface.scale for each in known])) if known else math.nan
@@ -289,7 +289,7 @@ def _measure_board(z: Float64, grid: Grid, apertures: Sequence[Aperture], settin
 
 
 def _reference(
-    z: Float64, free: Bools, grid: Grid, window: Window, aperture: Aperture, settings: PasteSettings
+    z: Float64, free: Bools, grid: Grid, aperture: Aperture, settings: PasteSettings
 ) -> ReferenceSurface | None:
     """Return the surface through the board in a ring around an aperture, wider where it has too few cells."""
     ring = settings.ring

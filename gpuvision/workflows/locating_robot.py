@@ -366,13 +366,8 @@ def _step_devices(device: Device | StepDevices | None) -> StepDevices:
     return device if isinstance(device, StepDevices) else StepDevices(device, kernel_folders=(KERNEL_FOLDER,))
 
 
-def floor_points(image: npt.NDArray[Any], **how: Any) -> Float32:
-    """Return the points that `scan_floor` finds with the same parameters, float32 (points, 2) [m]."""
-    return scan_floor(image, **how).points
-
-
 def read_floor(path: Path) -> npt.NDArray[Any]:
-    """Read a top view as `floor_points` takes it.
+    """Read a top view as `scan_floor` takes it.
 
     Raises
     ------

@@ -298,15 +298,3 @@ def deviation(first: npt.ArrayLike, second: npt.ArrayLike) -> npt.NDArray[np.flo
     with np.errstate(invalid="ignore"):
         away = np.abs(a - b)
     return np.where(same, 0.0, np.where(np.isfinite(away), away, math.inf))
-
-
-def rows_of_limits() -> list[str]:
-    """Return the stated limits as rows of a Markdown table: operation, outputs, limits, quantity, reason."""
-    rows = []
-    for operation, stated in stated_limits().items():
-        for each in stated:
-            outputs = ", ".join(f"`{output}`" for output in each.outputs) + (f" ({each.when})" if each.when else "")
-            limits = f"{each.single:.2g}, {each.double:.2g} x {each.quantity}" if each.single else "equal"
-            between = f"{2.0 * each.single:.2g}, {2.0 * each.double:.2g} x the same" if each.single else "equal"
-            rows.append(f"| {operation} | {outputs} | {limits} | {between} | {each.reason} |")
-    return rows

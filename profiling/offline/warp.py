@@ -29,7 +29,6 @@ _SHARED, _STACK = 1 << 40, 1 << 41  # addresses of local memory and of private m
 _MOST_STEPS = 5_000_000
 _REGISTERS = {"p": bool, "rs": np.uint16, "r": np.uint32, "f": np.float32, "rd": np.uint64, "fd": np.float64}
 _REGISTER = re.compile(r"%(p|rs|rd|fd|r|f|h|SP)(L?\d*)$")
-_SPECIAL = re.compile(r"%(tid|ntid|ctaid|nctaid)\.([xyz])$")
 _HEX_FLOAT = re.compile(r"0([fFdD])([0-9a-fA-F]+)$")
 
 

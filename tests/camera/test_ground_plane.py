@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from floors import carpet_of, seen_ahead
+from floors import carpet_of, detected_fraction, seen_ahead
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.camera.lens import Lens
@@ -19,7 +19,7 @@ from gpuvision.cli import main as cli
 from gpuvision.formats.camera_file import read_mounted
 from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device
-from gpuvision.matching.field.evidence import detected_fraction, distances_to_lines, expected_crossings, robot_to_field
+from gpuvision.matching.field.evidence import distances_to_lines, expected_crossings, robot_to_field
 from gpuvision.schema import DescriptionError
 from gpuvision.workflows.locating_robot import locate_robot, scan_floor
 

@@ -17,7 +17,6 @@ from gpuvision.simulation.scene.rays import AnyHit, ClosestHit
 from gpuvision.simulation.scene.reflectance import Ggx, Lambert, OrenNayar, Phong, Ward
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.scene.visible_intervals import VisibleIntervals
-from gpuvision.simulation.sensors.collection import image_irradiance
 from gpuvision.simulation.sensors.masks import Mask, optimise_mask
 from gpuvision.simulation.sensors.readings import GroundTruth
 from gpuvision.simulation.transport.illumination import LightSheet
@@ -142,11 +141,6 @@ CASES: dict[str, tuple[Callable[[Any], Any], tuple[Any, ...], dict[Any, str]]] =
         {0.99e-4: r"Ggx.alpha is 9.9e-05, expected 0.0001 to 1", 1.01: r"Ggx.alpha is 1.01"},
     ),
     "reflection of facets": (lambda x: Ggx(alpha=0.3, f0=x), (0.0, 1.0), {-1e-9: r"Ggx.f0 is", 1.0 + 1e-6: r"Ggx.f0"}),
-    "lens": (
-        lambda x: image_irradiance(1.0, x[0], x[1]),
-        ((1e-3, 0.0),),
-        {(0.0, 0.0): "got 0.0 and 0.0", (2.0, -1e-9): "got 2.0 and -1e-09"},
-    ),
     "sigmas": (lambda x: SensorFusion(max_sigmas=x), (0.0,), {-1e-9: "max_sigmas is -1e-09, expected 0 or more"}),
     "tolerance": (lambda x: SensorFusion(tolerance=x), (0.0,), {-1e-9: "tolerance is -1e-09, expected 0 or more"}),
     "ratio": (

@@ -47,7 +47,7 @@ from gpuvision.workflows.locating_board import (
     _search_range,
     locate_board,
 )
-from gpuvision.workflows.locating_robot import floor_points
+from gpuvision.workflows.locating_robot import scan_floor
 
 PIXEL, SHAPE, NOISE = 40e-6, (300, 400), 2.0
 FINE, FINE_SHAPE = 25e-6, (480, 640)  # for boards of narrow traces, and few of them
@@ -931,7 +931,7 @@ def test_a_file_without_a_finite_point_is_named(tmp_path: Path, run: Locate, nam
 def test_points_of_any_camera_will_do(tmp_path: Path, run: Locate, rng: np.random.Generator) -> None:
     field = read_field("robocup_msl")
     image = floor_image(field, (-6.0, 2.0, 0.7), scale=0.03, shape=(400, 440), line_width=0.125, rng=rng)
-    points = floor_points(image, scale=0.03, line_width=0.125)
+    points = scan_floor(image, scale=0.03, line_width=0.125).points
     np.save(tmp_path / "points.npy", points)
     np.savetxt(tmp_path / "points.csv", points, delimiter=",")
     np.save(tmp_path / "wrong.npy", np.zeros((3, 3)))

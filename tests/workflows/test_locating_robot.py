@@ -15,7 +15,7 @@ import pytest
 
 from conftest import Draws
 from fakes import list_gpu
-from floors import GREEN, WHITE, floor_image
+from floors import GREEN, WHITE, detected_fraction, floor_image
 from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.camera.lens import Lens
 from gpuvision.cli import main as cli
@@ -24,7 +24,6 @@ from gpuvision.host import Device, StepDevices, device_choice
 from gpuvision.matching.field.distance_map import Arc, Field
 from gpuvision.matching.field.evidence import (
     Evidence,
-    detected_fraction,
     distances_to_lines,
     expected_crossings,
     robot_to_field,
@@ -39,7 +38,6 @@ from gpuvision.workflows.locating_robot import (
     _order,
     _usable,
     default_line_width,
-    floor_points,
     locate_robot,
     scan_floor,
 )
@@ -557,7 +555,7 @@ def test_a_robot_is_located_with_its_twin(
     field = read_field(name)
     wide = default_line_width(field)
     image = floor_image(field, pose, scale=scale, shape=(400, 440), line_width=wide, rng=rng)
-    points = floor_points(image, scale=scale, line_width=wide, device=device)
+    points = scan_floor(image, scale=scale, line_width=wide, device=device).points
     assert len(points) > 30
     found = locate_robot(points, field, device=device)
     assert found.reason == ""
@@ -583,7 +581,7 @@ def test_floor_points_lie_on_the_lines(rng: np.random.Generator) -> None:
     columns, rows = np.meshgrid(np.arange(500), np.arange(500))
     at = lens.undistort(np.stack([columns, rows], axis=-1)).astype(np.float32)
     bent = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    points = floor_points(bent, scale=scale, line_width=0.125, blind=0.5, model=lens)
+    points = scan_floor(bent, scale=scale, line_width=0.125, blind=0.5, model=lens).points
     assert len(points) > 60
     assert np.hypot(*points.T).min() > 0.5
     found = locate_robot(points, field)

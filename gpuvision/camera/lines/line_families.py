@@ -66,37 +66,6 @@ def _family(array: Float64) -> tuple[Float64, ...]:
     return tuple(line[kept] for line, kept in zip(array, finite, strict=True) if np.count_nonzero(kept) >= _MIN_POINTS)
 
 
-def group_lines(points: npt.ArrayLike, family: npt.ArrayLike, line: npt.ArrayLike) -> tuple[tuple[Float64, ...], ...]:
-    """Group labelled points into families of lines.
-
-    Parameters
-    ----------
-    points : array_like
-        (n, 2): measured (column, row) [px], in order along their lines.
-    family, line : array_like of int
-        (n,): labels of each point's family, and of its line in the family.
-
-    Returns
-    -------
-    tuple
-        Families in ascending order of their labels, with lines in ascending order of theirs.
-
-    Raises
-    ------
-    ValueError
-        The shapes do not match.
-    """
-    places = np.asarray(points, dtype=np.float64)
-    labels = np.stack([np.asarray(family), np.asarray(line)])
-    if places.ndim != 2 or places.shape[1] != 2 or labels.shape != (2, len(places)):
-        raise ValueError(f"points have shape {places.shape} and labels {labels.shape[1:]}, expected (n, 2) and (n,)")
-    found: list[tuple[Float64, ...]] = []
-    for which in np.unique(labels[0]):
-        inside = labels[0] == which
-        found.append(tuple(places[inside & (labels[1] == each)] for each in np.unique(labels[1][inside])))
-    return tuple(found)
-
-
 @dataclass(frozen=True)
 class PackedLines:
     """Points of all lines in one array, in normalised coordinates.

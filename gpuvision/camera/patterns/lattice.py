@@ -228,7 +228,7 @@ def index_patches(
     patches: list[LatticePatch] = []
     left = np.isfinite(bases[:, 0, 0])
     for _ in range(limits.max_seeds):
-        seed = _seed(points, bases, left)
+        seed = _seed(bases, left)
         if seed is None:
             break
         patch = _grow_patch(points, tree, seed, bases[seed], orientation, limits)
@@ -239,7 +239,7 @@ def index_patches(
     return _without_overlap(patches, min_points)
 
 
-def _seed(points: Float64, bases: Float64, left: npt.NDArray[np.bool_]) -> int | None:
+def _seed(bases: Float64, left: npt.NDArray[np.bool_]) -> int | None:
     """Return the remaining point whose steps are nearest to the median; None if no point remains."""
     candidates = np.flatnonzero(left)
     if candidates.size == 0:

@@ -113,7 +113,7 @@ def diagnose(
         _focus(focus * _noise_factor(fit, limits), limits),
         _centre(fit, limits),
         _possible_tilt(fit, size, limits),
-        *(_equal_alternative(fit, each, limits) for each in fit.alternatives),
+        *(_equal_alternative(each, limits) for each in fit.alternatives),
         _small_tilt(fit, limits),
         _lack_of_fit(fit, limits),
         _differing_views(fit, limits),
@@ -199,7 +199,7 @@ def _possible_tilt(fit: CameraFit, size: tuple[int, int], limits: CalibrationLim
     )
 
 
-def _equal_alternative(fit: CameraFit, other: CameraAlternative, limits: CalibrationLimits) -> str:
+def _equal_alternative(other: CameraAlternative, limits: CalibrationLimits) -> str:
     """Warn of an alternative model that fits equally well with another centre."""
     if other.p_value < limits.significance or other.centre_distance_px < limits.max_centre_sigma_px:
         return ""

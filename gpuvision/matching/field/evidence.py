@@ -254,13 +254,6 @@ def expected_crossings(field: Field, pose: npt.ArrayLike, paths: npt.ArrayLike, 
     return Crossings(first + share * (last - first), sines[good], line[good])
 
 
-def detected_fraction(crossings: Crossings, points: npt.ArrayLike, tolerance: float) -> float:
-    """Return the share of the crossings with a point within ``tolerance`` [m] of the line; NaN without crossings."""
-    if not len(crossings.places):
-        return math.nan
-    return float(np.mean(_detected(crossings, points, tolerance)))
-
-
 def _detected(crossings: Crossings, points: npt.ArrayLike, tolerance: float) -> npt.NDArray[np.bool_]:
     """Return which crossings have a point within ``tolerance`` [m] of the line."""
     found = np.asarray(points)

@@ -59,8 +59,9 @@ class Material:
         return self.diffuse.albedo
 
 
-def _normal_albedo(lobe: Brdf, rings: int = 400, spokes: int = 32) -> float:
+def _normal_albedo(lobe: Brdf) -> float:
     """Return the albedo of a lobe for normal incidence: its value times the cosine, integrated over the half space."""
+    rings, spokes = 400, 32
     # At normal incidence the half-way angle is theta / 2. Nodes are evenly spaced in log(tan(theta / 2)), because
     # narrow lobes are near theta = 0.
     step = np.linspace(-14.0, 0.0, rings + 1)

@@ -1,1 +1,1 @@
-"""Simulated sensors: visible surfaces, collection of light, and readings."""
+"""Simulated sensors: visible surfaces and readings."""

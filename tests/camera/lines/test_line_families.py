@@ -1,4 +1,4 @@
-"""Families of lines from grids and labels, and their packed arrays."""
+"""Families of lines from grids, and their packed arrays."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gpuvision.camera.lines.line_families import grid_lines, group_lines, pack
+from gpuvision.camera.lines.line_families import grid_lines, pack
 
 
 def numbered(rows: int, columns: int) -> np.ndarray:
@@ -44,18 +44,6 @@ def test_missing_points_are_left_out() -> None:
     rows, columns = grid_lines(grid)
     assert [len(line) for line in rows] == [5, 6, 6]
     assert [len(line) for line in columns] == [3, 4, 3, 3, 3, 3]
-
-
-def test_labels_make_group_lines(rng: np.random.Generator) -> None:
-    points = rng.normal(size=(12, 2))
-    found = group_lines(points, [7] * 6 + [3] * 6, [0, 0, 0, 1, 1, 1] * 2)
-    np.testing.assert_array_equal(found[0][1], points[9:])
-    np.testing.assert_array_equal(found[1][0], points[:3])
-    with pytest.raises(ValueError, match=r"points have shape \(12, 2\) and labels \(11,\)"):
-        group_lines(points, [0] * 11, [0] * 11)
-    for shape in ((12,), (12, 1), (12, 3), (12, 2, 1)):
-        with pytest.raises(ValueError, match=re.escape(f"points have shape {shape} and labels (12,)")):
-            group_lines(np.zeros(shape), [0] * 12, [0] * 12)
 
 
 def test_packed_lines_keep_what_is_finite(rng: np.random.Generator) -> None:

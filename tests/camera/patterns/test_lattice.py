@@ -169,9 +169,8 @@ def test_the_seed_has_the_median_steps() -> None:
             [[9.0, 0.0], [6.0, 7.0]],
         ]
     )
-    points = np.zeros((5, 2))
     for left, seed in (([0, 1, 2, 3, 4], 2), ([0, 1, 3], 1), ([3], 3), ([], None)):
-        assert _seed(points, bases, np.isin(np.arange(5), left)) == seed
+        assert _seed(bases, np.isin(np.arange(5), left)) == seed
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from scipy.special import rel_entr
 from gpuvision.formats.field_file import read_field
 from gpuvision.matching.field.distance_map import Arc, Field
 from gpuvision.matching.field.evidence import (
-    detected_fraction,
+    _detected,
     distances_to_lines,
     evidence,
     expected_crossings,
@@ -77,10 +77,11 @@ def test_circles_are_crossed_twice() -> None:
 def test_seen_is_what_has_a_point() -> None:
     paths = [(x, -1.0, x, 1.0) for x in (-3.5, -3.0, -2.5, -2.0)]
     crossings = expected_crossings(CROSS, (0.0, 0.0, 0.0), paths, line_width=0.1)
-    assert detected_fraction(crossings, np.array([(-3.5, 0.04), (-2.0, -0.06), (5.0, 5.0)]), 0.05) == 0.25
-    assert detected_fraction(crossings, crossings.places, 0.05) == 1.0
+    points = np.array([(-3.5, 0.04), (-2.0, -0.06), (5.0, 5.0)])
+    assert _detected(crossings, points, 0.05).tolist() == [True, False, False, False]
+    assert _detected(crossings, crossings.places, 0.05).tolist() == [True] * 4
     no_crossings = expected_crossings(CROSS, (0.0, 0.0, 0.0), [(5.0, 1.0, 5.0, 2.0)], line_width=0.1)
-    assert math.isnan(detected_fraction(no_crossings, crossings.places, 0.05))
+    assert _detected(no_crossings, crossings.places, 0.05).tolist() == []
 
 
 def test_chance_bounds_what_random_points_reach(rng: np.random.Generator) -> None:

@@ -7,7 +7,7 @@ import fnmatch
 import math
 import re
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,6 +41,19 @@ LayerNames = Annotated[
 ]
 
 
+def device_of(label: str | None) -> Device | None:
+    """Return the device with a label; None, the best device of a job, without a label.
+
+    Raises
+    ------
+    GpuVisionError
+        No device has the label.
+    """
+    from gpuvision.host import Device
+
+    return None if label is None else Device.named(label)
+
+
 def devices_of(labels: Sequence[str] | None) -> list[Device]:
     """Return the devices with these labels; without labels all devices that work.
 
@@ -65,6 +78,18 @@ def named_path(text: str | Path) -> Path:
     if not str(text):
         raise typer.BadParameter("the name is empty; give one, or . for this folder")
     return Path(text)
+
+
+def check_exists(path: Path) -> None:
+    """Check that an input file exists, before slow imports and reading of other files.
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file")
 
 
 ReportFile = Annotated[
@@ -95,6 +120,12 @@ def echo(text: str, *, err: bool = False) -> None:
     typer.echo(printable(text), err=err)
 
 
+def echo_warnings(warnings: Iterable[str], *, err: bool) -> None:
+    """Print a line for each warning to standard output or standard error."""
+    for each in warnings:
+        echo(f"warning: {each}", err=err)
+
+
 def command_line(*words: object) -> str:
     """Return words of a proposed command, quoted for the shell where they need it."""
     return shlex.join(map(str, words))
@@ -103,6 +134,43 @@ def command_line(*words: object) -> str:
 def prints_report(path: Path | None) -> bool:
     """Return whether ``--json`` asks for the report on standard output; other text then goes to standard error."""
     return str(path) == "-"
+
+
+def claim_outputs(
+    job: str,
+    inputs: Iterable[str | Path | None],
+    *targets: Path | tuple[Path | None, Iterable[str]] | None,
+    overwrite: bool,
+) -> Outputs:
+    """Check that the outputs of a job may be written, before the work.
+
+    Parameters
+    ----------
+    job : str
+        Name of the job, such as "scan".
+    inputs : iterable of str, Path or None
+        Files that the job reads; None is skipped.
+    *targets : Path, or tuple of Path and iterable of str
+        Output file, or folder with the names of its files, in the order of the checks; without a path, none.
+    overwrite : bool
+        Whether files may be replaced that no earlier run of the job wrote.
+
+    Raises
+    ------
+    OSError
+        A file cannot be written, is an input, or exists and is no output of the job.
+    ValueError
+        Two outputs are the same file.
+    """
+    from gpuvision.host.outputs import Outputs
+
+    outputs = Outputs(job, inputs=[each for each in inputs if each is not None], overwrite=overwrite)
+    for target in targets:
+        if not isinstance(target, tuple):
+            outputs.claim(target)
+        elif target[0] is not None:
+            outputs.claim_folder(target[0], target[1])
+    return outputs
 
 
 def write_report(path: Path | None, report: object, outputs: Outputs) -> None:
@@ -201,6 +269,19 @@ def quantities(text: str, option: str, units: str) -> tuple[float, ...]:
     ends = {"m": "m (or cm, mm, um)", "rad": "rad (or mrad, deg)", "s": "s (or ms, us)"}
     expected = ", ".join(ends[kind] for kind in kinds)
     raise ValueError(f"{option} is {text!r}, expected {len(kinds)} number{'s' * (len(kinds) > 1)}: {expected}")
+
+
+def length_of(text: str | None, option: str) -> float | None:
+    """Parse a length [m], see `quantities`; None without the option."""
+    return None if text is None else quantities(text, option, "m")[0]
+
+
+def pose_of(text: str | None, option: str) -> tuple[float, float, float] | None:
+    """Parse a pose, x, y [m] and theta [rad], see `quantities`; None without the option."""
+    if text is None:
+        return None
+    x, y, theta = quantities(text, option, "m,m,rad")
+    return x, y, theta
 
 
 def layers_of(given: Sequence[str] | None) -> dict[str, str] | None:

@@ -18,6 +18,7 @@ from gpuvision.cli.arguments import (
     ReportFile,
     command_line,
     echo,
+    echo_warnings,
     named_path,
     prints_report,
     progress_bar,
@@ -234,8 +235,7 @@ def _show(done: Calibration, to_stderr: bool) -> None:
     console.print(table)
     if done.alternatives:
         console.print(_alternatives(done))
-    for each in done.fit.warnings:
-        echo(f"warning: {each}", err=to_stderr)
+    echo_warnings(done.fit.warnings, err=to_stderr)
 
 
 def _digits(value: float, error: float) -> int:

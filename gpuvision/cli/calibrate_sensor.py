@@ -12,6 +12,7 @@ import typer
 from gpuvision.cli.arguments import (
     command_line,
     echo,
+    echo_warnings,
     named_path,
     prints_report,
     progress_bar,
@@ -274,8 +275,7 @@ def _show(done: SensorCalibration, show: Callable[[Calibration, bool], None], *,
     else:
         for line in (camera.summary(), *(f"skipped {path}: {reason}" for path, reason in camera.skipped_images)):
             echo(line, err=to_stderr)
-        for each in camera.warnings:
-            echo(f"warning: {each}", err=to_stderr)
+        echo_warnings(camera.warnings, err=to_stderr)
     echo(done.summary(), err=to_stderr)
     test = done.geometry.sheet.bend_test
     if test is not None:
@@ -285,5 +285,4 @@ def _show(done: SensorCalibration, show: Callable[[Calibration, bool], None], *,
             for name, value, sigma in zip(("gg", "gh", "hh"), test.bend, test.sigma, strict=True)
         )
         echo(f"bend of the sheet [1/m]: {bends}; p = {test.p_value:.2g} (F test): {verdict}", err=to_stderr)
-    for each in done.warnings[len(camera.warnings) :]:
-        echo(f"warning: {each}", err=to_stderr)
+    echo_warnings(done.warnings[len(camera.warnings) :], err=to_stderr)

@@ -12,6 +12,7 @@ from gpuvision.cli.arguments import (
     DeviceLabels,
     Overwrite,
     ReportFile,
+    claim_outputs,
     devices_of,
     echo,
     named_path,
@@ -69,14 +70,10 @@ def curves(
         reject_unused("with --maps", seconds=seconds)
         measure_stability(operations or (), device or (), as_json, plots, overwrite=overwrite)
         return
-    from gpuvision.host.outputs import Outputs
     from gpuvision.profiling.curves import curve, plot
     from gpuvision.profiling.machine import describe_machine
 
-    outputs = Outputs("curves", overwrite=overwrite)
-    outputs.claim(as_json)
-    if plots is not None:
-        outputs.claim_folder(plots, plot.FILES)
+    outputs = claim_outputs("curves", (), as_json, (plots, plot.FILES), overwrite=overwrite)
     devices = devices_of(device)
     machine = describe_machine(devices)
     points = curve.measure_curves(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpuvision.cli.arguments import devices_of, echo, prints_report, write_report
+from gpuvision.cli.arguments import claim_outputs, devices_of, echo, prints_report, write_report
 
 if TYPE_CHECKING:
     from gpuvision.profiling.maps.stability import StabilityMap
@@ -16,14 +16,10 @@ def measure_stability(
     operations: Sequence[str], labels: Sequence[str], as_json: Path | None, plots: Path | None, *, overwrite: bool
 ) -> None:
     """Measure the maps, print a line for each one, and draw them."""
-    from gpuvision.host.outputs import Outputs
     from gpuvision.profiling.machine import describe_machine
     from gpuvision.profiling.maps import picture, stability
 
-    outputs = Outputs("curves", overwrite=overwrite)
-    outputs.claim(as_json)
-    if plots is not None:
-        outputs.claim_folder(plots, picture.FILES)
+    outputs = claim_outputs("curves", (), as_json, (plots, picture.FILES), overwrite=overwrite)
     devices = devices_of(labels)
     maps = stability.measure_maps(
         operations or stability.OPERATIONS, devices, progress=lambda line: echo(line, err=True)

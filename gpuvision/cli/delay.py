@@ -11,7 +11,9 @@ import typer
 from gpuvision.cli.arguments import (
     Overwrite,
     ReportFile,
+    claim_outputs,
     echo,
+    echo_warnings,
     named_path,
     prints_report,
     quantities,
@@ -88,7 +90,6 @@ def delay(
     """
     from gpuvision.formats.cmos_sensor_file import CMOS_SENSORS
     from gpuvision.formats.loop_recording import read_loop_recording
-    from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.analysing_delay import DELAY_FILES, MEASURED_PICTURE, analyse_delay
 
     budget = None
@@ -101,9 +102,8 @@ def delay(
         budget = _budget(rate, exposure, readout, sensor, roi, transfer, stage or ())
     sensor_file = None if sensor in CMOS_SENSORS else sensor
     inputs = tuple(Path(each) for each in (recording, sensor_file) if each is not None)
-    outputs = Outputs("delay", inputs=inputs, overwrite=overwrite)
-    outputs.claim_folder(out, DELAY_FILES if recording is None else (*DELAY_FILES, MEASURED_PICTURE))
-    outputs.claim(as_json)
+    names = DELAY_FILES if recording is None else (*DELAY_FILES, MEASURED_PICTURE)
+    outputs = claim_outputs("delay", inputs, (out, names), as_json, overwrite=overwrite)
     deviation = None if jitter is None else _time(jitter, "--jitter")
     if recording is None:
         done = analyse_delay(budget, jitter=deviation)
@@ -113,8 +113,7 @@ def delay(
             done = analyse_delay(budget, recording=samples, jitter=deviation)
         except ValueError as error:
             raise ValueError(f"{recording}: {error}") from error
-    for each in done.warnings:
-        echo(f"warning: {each}", err=True)
+    echo_warnings(done.warnings, err=True)
     done.write(out, inputs=inputs, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
     echo(f"{done.summary()}\nlook at {out / 'delay.png'} and {out / 'report.json'}", err=prints_report(as_json))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, Overwrite, command_line, echo, named_path, progress_bar
+from gpuvision.cli.arguments import DeviceLabel, Overwrite, claim_outputs, command_line, echo, named_path, progress_bar
 
 if TYPE_CHECKING:
     from gpuvision.host import Device
@@ -33,17 +33,16 @@ def demo(
     from gpuvision.formats.json import json_tree, report_text
     from gpuvision.host import Device
     from gpuvision.host.files import atomic_write, write_text_atomic
-    from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.demo import SENSORS, make_part, make_scan_task
     from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES
     from gpuvision.workflows.simulating import simulate
     from gpuvision.workflows.simulation_result import simulation_files
 
-    outputs = Outputs("demo", overwrite=overwrite)
     each_sensor = {*SCAN_FILES, *SIGMA_FILES, *simulation_files(has_mask=False), "recording.npy"}
     names = ["part.ply", "report.json", *(f"{name}/{file}" for name in SENSORS for file in sorted(each_sensor))]
     masked_folder = f"{SENSORS[-1]}_masked"
-    outputs.claim_folder(out, [*names, *(f"{masked_folder}/{file}" for file in simulation_files(has_mask=True))])
+    names += [f"{masked_folder}/{file}" for file in simulation_files(has_mask=True)]
+    outputs = claim_outputs("demo", (), (out, names), overwrite=overwrite)
     chosen = Device.best() if device is None else Device.named(device)
     echo(f"device {chosen.label}: {chosen.name}")
     results: dict[str, Any] = {}

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpuvision.cli.arguments import Overwrite, ReportFile, echo, prints_report, write_report
+from gpuvision.cli.arguments import Overwrite, ReportFile, claim_outputs, echo, prints_report, write_report
 
 if TYPE_CHECKING:
     from gpuvision.host.discovery import ProbedDevice
@@ -22,10 +22,8 @@ def devices(
     A device works if a probe kernel was built, launched and checked on it. Exit code 1 if no device works.
     """
     from gpuvision.host import discovery
-    from gpuvision.host.outputs import Outputs
 
-    outputs = Outputs("devices", overwrite=overwrite)
-    outputs.claim(as_json)
+    outputs = claim_outputs("devices", (), as_json, overwrite=overwrite)
     listed = sorted(discovery.probed_devices(probe_again=probe), key=lambda each: each.rank)
     write_report(as_json, [_described(each) for each in listed], outputs)
     if not prints_report(as_json):

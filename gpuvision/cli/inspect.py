@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
@@ -13,9 +12,14 @@ from gpuvision.cli.arguments import (
     LayerNames,
     Overwrite,
     ReportFile,
+    check_exists,
+    claim_outputs,
     echo,
+    echo_warnings,
     layers_of,
+    length_of,
     named_path,
+    pose_of,
     prints_report,
     quantities,
     reject_unused,
@@ -25,7 +29,6 @@ from gpuvision.cli.select import Side
 
 if TYPE_CHECKING:
     from gpuvision.formats.height_files import ImageScale
-    from gpuvision.host.outputs import Outputs
     from gpuvision.inspection.apertures import Aperture
     from gpuvision.inspection.paste import PasteSettings
     from gpuvision.workflows.inspecting_leads import LeadInspection
@@ -195,17 +198,20 @@ def inspect(
     largest height, offset. Of each lead or ball: distance from the seating plane and from the least-squares plane.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    if not heights.exists():
-        raise FileNotFoundError(f"{heights}: no such file")
+    from gpuvision.workflows.inspecting_leads import LEAD_FILES
+    from gpuvision.workflows.inspecting_paste import PASTE_FILES
+
+    check_exists(heights)
     lead_file = Path(leads) if leads is not None and leads.lower().endswith(".csv") else None
-    outputs = _claim_outputs((heights, board, lead_file), out, as_json, overwrite, has_leads=leads is not None)
+    names = PASTE_FILES if leads is None else LEAD_FILES
+    outputs = claim_outputs("inspect", (heights, board, lead_file), (out, names), as_json, overwrite=overwrite)
     common = _Common(
         heights=heights,
         scale=_image_scale(cell, height_step, height_offset, hole),
         board=board,
         side="bottom" if side is Side.bottom else "top",
         layers=layers,
-        pose=_pose(pose, "--pose"),
+        pose=pose_of(pose, "--pose"),
         sigma=_sigma(sigma),
         correlation_area=_correlation_area(correlation_area),
     )
@@ -236,20 +242,6 @@ def inspect(
     write_report(as_json, found.report(), outputs)
     picture = out / ("volume.png" if leads is None else "coplanarity.png")
     echo(f"{found.summary()}\nlook at {picture} and {out / 'report.json'}", err=prints_report(as_json))
-
-
-def _claim_outputs(
-    inputs: Iterable[Path | None], out: Path, as_json: Path | None, overwrite: bool, *, has_leads: bool
-) -> Outputs:
-    """Check that the results and the report may be written, before the work."""
-    from gpuvision.host.outputs import Outputs
-    from gpuvision.workflows.inspecting_leads import LEAD_FILES
-    from gpuvision.workflows.inspecting_paste import PASTE_FILES
-
-    outputs = Outputs("inspect", inputs=[each for each in inputs if each is not None], overwrite=overwrite)
-    outputs.claim_folder(out, LEAD_FILES if has_leads else PASTE_FILES)
-    outputs.claim(as_json)
-    return outputs
 
 
 class _Common(NamedTuple):
@@ -287,7 +279,7 @@ class _PasteOptions(NamedTuple):
 
         return PasteSettings(
             stencil=quantities(stencil, "--stencil", "m")[0],
-            threshold=_length(self.threshold, "--threshold"),
+            threshold=length_of(self.threshold, "--threshold"),
             margin=quantities(self.margin or "50um", "--margin", "m")[0],
             ring=quantities(self.ring or "0.2mm", "--ring", "m")[0],
             reference_order=1 if self.reference_order is None else self.reference_order,
@@ -347,7 +339,7 @@ def _inspect_leads(
         sigma=common.sigma,
         correlation_area=common.correlation_area or 1.0,
         centre=None if gravity is None else (gravity[0], gravity[1]),
-        maximum=_length(maximum_gap, "--maximum-gap"),
+        maximum=length_of(maximum_gap, "--maximum-gap"),
         files={
             "height_map": str(common.heights),
             **({} if common.board is None else {"board": str(common.board)}),
@@ -380,7 +372,7 @@ def _inspect_paste(common: _Common, options: _PasteOptions) -> PasteInspection:
         settings,
         side=common.side,
         pose=common.pose,
-        initial_pose=_pose(options.initial_pose, "--initial-pose"),
+        initial_pose=pose_of(options.initial_pose, "--initial-pose"),
         search_range=reach,
         sigma=common.sigma,
         correlation_area=common.correlation_area,
@@ -388,8 +380,7 @@ def _inspect_paste(common: _Common, options: _PasteOptions) -> PasteInspection:
         scale_sigma=scales,
         files={"height_map": str(common.heights), "board": str(board)},
     )
-    for each in found.warnings():
-        echo(f"warning: {each}", err=True)
+    echo_warnings(found.warnings(), err=True)
     return found
 
 
@@ -413,7 +404,7 @@ def _sigma(text: str | None) -> float | None:
     """Parse ``--sigma``: a length above 0; None without the option."""
     from gpuvision.validation import finite
 
-    return None if text is None else finite(_length(text, "--sigma"), "--sigma", above=0.0)
+    return None if text is None else finite(length_of(text, "--sigma"), "--sigma", above=0.0)
 
 
 def _correlation_area(number: float | None) -> float | None:
@@ -421,17 +412,6 @@ def _correlation_area(number: float | None) -> float | None:
     from gpuvision.validation import finite
 
     return None if number is None else finite(number, "--correlation-area", minimum=1.0)
-
-
-def _pose(text: str | None, option: str) -> tuple[float, float, float] | None:
-    if text is None:
-        return None
-    x, y, theta = quantities(text, option, "m,m,rad")
-    return x, y, theta
-
-
-def _length(text: str | None, option: str) -> float | None:
-    return None if text is None else quantities(text, option, "m")[0]
 
 
 def _scale_sigmas(text: str) -> dict[str, float]:
@@ -456,6 +436,6 @@ def _image_scale(cell: str | None, step: str | None, offset: str | None, hole: f
         cell_x=cells[0],
         cell_y=cells[-1],
         step=quantities(step, "--height-step", "m")[0],
-        offset=_length(offset, "--height-offset") or 0.0,
+        offset=length_of(offset, "--height-offset") or 0.0,
         hole=0.0 if hole is None else hole,
     )

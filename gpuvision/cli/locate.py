@@ -14,16 +14,21 @@ from gpuvision.cli.arguments import (
     LayerNames,
     Overwrite,
     ReportFile,
+    check_exists,
+    claim_outputs,
     command_line,
+    device_of,
     echo,
+    echo_warnings,
     layers_of,
     named_path,
+    pose_of,
     prints_report,
     quantities,
     reject_unused,
 )
 from gpuvision.cli.plan_output import claim_plan, planned_tolerance, planning, report_plan
-from gpuvision.cli.pose_output import PoseFolder, check_image, claim_outputs, initial_pose_of, report_pose
+from gpuvision.cli.pose_output import POSE_FILES, PoseFolder, report_pose
 from gpuvision.cli.select import Side
 
 if TYPE_CHECKING:
@@ -195,14 +200,13 @@ def locate(
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size, read_lens
-    from gpuvision.host import Device
     from gpuvision.host.image_files import read_image
     from gpuvision.plots.board import draw_located_board
     from gpuvision.workflows.locating_board import locate_board
     from gpuvision.workflows.location_plan import FEATURES_FILE
     from gpuvision.workflows.planning_location import plan_location
 
-    check_image(image)
+    check_exists(image)
     largest = planned_tolerance(tolerance, "the pose, such as 2um", only_plan=only_plan)
     if largest is None:
         reject_unused("without --tolerance", rate=rate)
@@ -213,14 +217,14 @@ def locate(
         inputs = [each for each in (image, board, camera) if each is not None]
         outputs = claim_plan(out, as_json, inputs, overwrite=overwrite, more=(FEATURES_FILE,))
     else:
-        outputs = claim_outputs("locate", (image, board, camera, features), out, as_json, overwrite)
-        outputs.claim(gcode)
+        read = (image, board, camera, features)
+        outputs = claim_outputs("locate", read, as_json, (out, POSE_FILES), gcode, overwrite=overwrite)
     machine = _camera_at(camera_at, gcode, gcode_dialect)
     chosen = None if features is None else _features(features, budget, side)
     pixel = _pixel(scale, chosen)
     blur_px = blur or (_BLUR_PX if chosen is None else chosen.imaging.blur_px)
     # Check the options before the files, which take longer to read.
-    pose, distance_and_angle = initial_pose_of(initial_pose), _search_range(search_range)
+    pose, distance_and_angle = pose_of(initial_pose, "--initial-pose"), _search_range(search_range)
     etch_bias_sigma = quantities(etch_bias, "--etch-bias", "m")[0]
     picture = read_image(image)
     if camera is not None:
@@ -235,7 +239,7 @@ def locate(
         "etch_bias_sigma": etch_bias_sigma,
         "threshold": threshold,
         "copper": copper.value,
-        "device": None if device is None else Device.named(device),
+        "device": device_of(device),
     }
     if largest is not None:
         with planning(image.name) as progress:
@@ -247,8 +251,7 @@ def locate(
         chosen = plan.chosen.features
         options |= {"initial_pose": plan.located.pose, "search_range": None, "copper": plan.located.copper}
     located = locate_board(picture, artwork, features=chosen, budget=budget or _BUDGET, **options)
-    for each in located.warnings:
-        echo(f"warning: {each}", err=True)
+    echo_warnings(located.warnings, err=True)
     report_pose(located, lambda path: draw_located_board(path, picture, artwork, located), out, as_json, outputs)
     if gcode is not None and machine is not None:
         comment = f"gpuvision locate {image.name}".translate(_IN_COMMENTS)

@@ -12,14 +12,19 @@ from gpuvision.cli.arguments import (
     DeviceLabel,
     Overwrite,
     ReportFile,
+    check_exists,
+    claim_outputs,
+    device_of,
     echo,
+    length_of,
     named_path,
+    pose_of,
     prints_report,
     quantities,
     reject_unused,
     write_report,
 )
-from gpuvision.cli.pose_output import PoseFolder, check_image, claim_outputs, initial_pose_of, report_pose
+from gpuvision.cli.pose_output import POSE_FILES, PoseFolder, report_pose
 
 if TYPE_CHECKING:
     import numpy as np
@@ -122,24 +127,24 @@ def locate_robot(
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size
     from gpuvision.formats.field_file import read_field
-    from gpuvision.host import Device, StepDevices
+    from gpuvision.host import StepDevices
     from gpuvision.operation import KERNEL_FOLDER
     from gpuvision.plots.field import draw_located_robot
     from gpuvision.workflows.locating_robot import POINT_FILES, read_floor, read_points
     from gpuvision.workflows.locating_robot import locate_robot as locate
 
-    check_image(source)
-    pose = initial_pose_of(initial_pose)
-    pixel = None if scale is None else quantities(scale, "--scale", "m")[0]
+    check_exists(source)
+    pose = pose_of(initial_pose, "--initial-pose")
+    pixel = length_of(scale, "--scale")
     described = read_field(field)
-    chosen = None if device is None else Device.named(device)
+    chosen = device_of(device)
     if rate is not None:
         files = _TrackFiles((source, field, camera, odometry), out, as_json, overwrite)
         sizes = (camera, pixel, line_width, blind_radius)
         _track(source, described, rate, odometry, sizes, files, initial_pose=pose, threshold=threshold, device=chosen)
         return
     reject_unused("without --rate", odometry=odometry)
-    outputs = claim_outputs("locate-robot", (source, field, camera), out, as_json, overwrite)
+    outputs = claim_outputs("locate-robot", (source, field, camera), as_json, (out, POSE_FILES), overwrite=overwrite)
     devices = StepDevices(chosen, kernel_folders=(KERNEL_FOLDER,))
     picture = None
     measured: npt.NDArray[np.float32] | FloorScan
@@ -185,14 +190,10 @@ def _track(
     """Follow a robot through a recording and write its track."""
     from gpuvision.host import open_recording
     from gpuvision.host.errors import RecordingError
-    from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.tracking_robot import TRACK_FILES, read_odometry, track_robot
 
-    given = [each for each in files.inputs if each is not None]
-    outputs = Outputs("locate-robot", inputs=given, overwrite=files.overwrite)
-    outputs.claim(files.as_json)
-    if files.out is not None:
-        outputs.claim_folder(files.out, TRACK_FILES)
+    targets = (files.as_json, (files.out, TRACK_FILES))
+    outputs = claim_outputs("locate-robot", files.inputs, *targets, overwrite=files.overwrite)
     motions = None if odometry is None else read_odometry(odometry)
     views = open_recording(source)
     how = _scan_settings((int(views.shape[0]), int(views.shape[1])), field, *sizes)

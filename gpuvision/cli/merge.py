@@ -12,7 +12,10 @@ from gpuvision.cli.arguments import (
     DeviceLabel,
     Overwrite,
     ReportFile,
+    claim_outputs,
+    device_of,
     echo,
+    echo_warnings,
     named_path,
     prints_report,
     quantities,
@@ -85,15 +88,11 @@ def merge(
     overwrite: Overwrite = False,
 ) -> None:
     """Merge two scans of one part: fill what one sensor does not see, average the rest, flag disagreement."""
-    from gpuvision.host import Device
-    from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.merging import MERGE_FILES, SIGMA_FILE, height_map_file, merge_scans
 
     allowed = 0.0 if tolerance is None else quantities(tolerance, "--tolerance", "m")[0]
     inputs = (height_map_file(first), height_map_file(second))
-    outputs = Outputs("merge", inputs=inputs, overwrite=overwrite)
-    outputs.claim_folder(out, (*MERGE_FILES, SIGMA_FILE))
-    outputs.claim(as_json)
+    outputs = claim_outputs("merge", inputs, (out, (*MERGE_FILES, SIGMA_FILE)), as_json, overwrite=overwrite)
     done = merge_scans(
         first,
         second,
@@ -101,12 +100,11 @@ def merge(
         tolerance=allowed,
         disagreement=disagreement.value,
         require_both=require_both,
-        device=None if device is None else Device.named(device),
+        device=device_of(device),
     )
     done.write(out, inputs=inputs, overwrite=overwrite)
     write_report(as_json, done.report(), outputs)
-    for advice in done.advice():
-        echo(f"warning: {advice}", err=True)
+    echo_warnings(done.advice(), err=True)
     echo(
         f"{done.summary()}\nlook at {out / 'picture.png'}, {out / 'sources.png'} and {out / 'report.json'}",
         err=prints_report(as_json),

@@ -12,9 +12,13 @@ from gpuvision.cli.arguments import (
     LayerNames,
     Overwrite,
     ReportFile,
+    claim_outputs,
     command_line,
+    device_of,
     echo,
+    echo_warnings,
     layers_of,
+    length_of,
     named_path,
     prints_report,
     progress_bar,
@@ -130,9 +134,7 @@ def place(
     """
     from gpuvision.formats.json import json_tree, report_text
     from gpuvision.formats.machine_file import named_files, read_machine
-    from gpuvision.host import Device
     from gpuvision.host.files import write_text_atomic
-    from gpuvision.host.outputs import Outputs
     from gpuvision.matching.artwork.artwork import read_artwork
     from gpuvision.matching.features.feature_set import edge_clearance
     from gpuvision.servoing.placement.plan import placement_imaging
@@ -151,15 +153,12 @@ def place(
         reject_unused("with --plan", count=count, seed=seed)
         outputs = claim_plan(out, as_json, inputs, overwrite=overwrite, more=(_MACHINE_FILE,))
     else:
-        outputs = Outputs("place", inputs=inputs, overwrite=overwrite)
-        outputs.claim(as_json)
-        outputs.claim_folder(out, _FILES)
+        outputs = claim_outputs("place", inputs, as_json, (out, _FILES), overwrite=overwrite)
     described = read_machine(machine, rate=frame_rate)
     clearance = edge_clearance(placement_imaging(described))
     artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=clearance)
-    for each in artwork.warnings:
-        echo(f"warning: {each}", err=True)
-    chosen = None if device is None else Device.named(device)
+    echo_warnings(artwork.warnings, err=True)
+    chosen = device_of(device)
     if largest is not None:
         with planning(f"placements at {at}") as progress:
             plan = plan_placement_settings(
@@ -168,7 +167,7 @@ def place(
                 described,
                 tolerance=largest,
                 rate=rate,
-                part_radius=None if part_radius is None else quantities(part_radius, "--part-radius", "m")[0],
+                part_radius=length_of(part_radius, "--part-radius"),
                 budget=budget,
                 times_vision=time_vision,
                 device=chosen,

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpuvision.cli.arguments import echo, prints_report, progress_bar, quantities, write_report
+from gpuvision.cli.arguments import claim_outputs, echo, prints_report, progress_bar, quantities, write_report
 
 if TYPE_CHECKING:
     from gpuvision.accuracy.plan import AccuracyPlan
@@ -59,14 +59,9 @@ def claim_plan(
     more : sequence of str
         Names of other files in the folder. Default: none.
     """
-    from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.plan_files import PLAN_FILE
 
-    outputs = Outputs("plan", inputs=inputs, overwrite=overwrite)
-    if out is not None:
-        outputs.claim_folder(out, (PLAN_FILE, *more))
-    outputs.claim(as_json)
-    return outputs
+    return claim_outputs("plan", inputs, (out, (PLAN_FILE, *more)), as_json, overwrite=overwrite)
 
 
 @contextmanager

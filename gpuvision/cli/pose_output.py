@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from gpuvision.cli.arguments import echo, named_path, prints_report, quantities, write_report
+from gpuvision.cli.arguments import echo, named_path, prints_report, write_report
 from gpuvision.formats.json import report_text
 
 if TYPE_CHECKING:
     from gpuvision.host.outputs import Outputs
 
-_FILES = ("pose.json", "located.png")
+POSE_FILES = ("pose.json", "located.png")
+"""Names of the files in the folder of a pose."""
 
 PoseFolder = Annotated[
     Path | None,
@@ -39,45 +40,6 @@ class Located(Protocol):
 
     def report(self) -> dict[str, Any]:
         """Return the content of ``pose.json``."""
-
-
-def check_image(path: Path) -> None:
-    """Check that the input file exists, before slow imports and reading of other files.
-
-    Raises
-    ------
-    FileNotFoundError
-        The file does not exist.
-    """
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file")
-
-
-def initial_pose_of(text: str | None) -> tuple[float, float, float] | None:
-    """Parse ``--initial-pose``: x, y [m] and theta [rad]; None without the option."""
-    if text is None:
-        return None
-    x, y, theta = quantities(text, "--initial-pose", "m,m,rad")
-    return x, y, theta
-
-
-def claim_outputs(
-    job: str, inputs: Iterable[str | Path | None], out: Path | None, as_json: Path | None, overwrite: bool
-) -> Outputs:
-    """Check that the files of ``--out`` and ``--json`` may be written, before the work.
-
-    Raises
-    ------
-    OSError
-        A file cannot be written, is an input, or exists and is no output of the command.
-    """
-    from gpuvision.host.outputs import Outputs
-
-    outputs = Outputs(job, inputs=[each for each in inputs if each is not None], overwrite=overwrite)
-    outputs.claim(as_json)
-    if out is not None:
-        outputs.claim_folder(out, _FILES)
-    return outputs
 
 
 def report_pose(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from gpuvision.cli.arguments import devices_of, echo, prints_report, write_report
+from gpuvision.cli.arguments import claim_outputs, devices_of, echo, prints_report, write_report
 
 if TYPE_CHECKING:
     from gpuvision.profiling.contract.agreement import Comparison
@@ -19,13 +19,11 @@ def profile_contract(names: Sequence[str], labels: Sequence[str], as_json: Path 
 
     The exit code is 1 if a limit is broken, or if an operation failed.
     """
-    from gpuvision.host.outputs import Outputs
     from gpuvision.profiling import harness
     from gpuvision.profiling.contract.agreement import check
     from gpuvision.profiling.machine import describe_machine
 
-    outputs = Outputs("profile", overwrite=overwrite)
-    outputs.claim(as_json)
+    outputs = claim_outputs("profile", (), as_json, overwrite=overwrite)
     known = sorted(set(harness.MEASURED.values()))
     for name in names:
         if name not in known:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import typer
 
-from gpuvision.cli.arguments import devices_of, echo, prints_report
+from gpuvision.cli.arguments import claim_outputs, devices_of, echo, prints_report
 
 
 def profile_growth(
@@ -23,11 +23,9 @@ def profile_growth(
 
     The exit code is 1 if the machine changed its speed, an operation failed, or no size was measured.
     """
-    from gpuvision.host.outputs import Outputs
     from gpuvision.profiling.growth import measure_growth, workloads
 
-    outputs = Outputs("profile", overwrite=overwrite)
-    outputs.claim(as_json)
+    outputs = claim_outputs("profile", (), as_json, overwrite=overwrite)
     if plots is not None:
         from gpuvision.profiling.growth_plot import NAME, draw_growth
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from gpuvision.cli.arguments import echo, prints_report, progress_bar
+from gpuvision.cli.arguments import claim_outputs, echo, prints_report, progress_bar
 
 if TYPE_CHECKING:
     from gpuvision.profiling.offline.builds import KernelBuild
@@ -19,13 +19,11 @@ def profile_offline(
     names: Sequence[str], kernels: Sequence[str], as_json: Path | None, *, one_build: bool, overwrite: bool
 ) -> None:
     """Compile the kernels for targets, print the table, and exit with 1 if a kernel fails the check."""
-    from gpuvision.host.outputs import Outputs
     from gpuvision.profiling.offline.check import check_builds, one_build_each
     from gpuvision.profiling.offline.registry import all_builds
     from gpuvision.profiling.offline.targets import TARGETS
 
-    outputs = Outputs("profile", overwrite=overwrite)
-    outputs.claim(as_json)
+    outputs = claim_outputs("profile", (), as_json, overwrite=overwrite)
     for name in names:
         if name not in TARGETS:
             raise ValueError(f"no target {name!r} to compile for; expected some of {', '.join(TARGETS)}")

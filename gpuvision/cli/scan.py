@@ -14,7 +14,10 @@ from gpuvision.cli.arguments import (
     DeviceLabel,
     Overwrite,
     ReportFile,
+    claim_outputs,
+    device_of,
     echo,
+    echo_warnings,
     named_path,
     prints_report,
     progress_bar,
@@ -24,7 +27,6 @@ from gpuvision.cli.arguments import (
 from gpuvision.cli.plan_output import claim_plan, planned_tolerance, planning, report_plan
 
 if TYPE_CHECKING:
-    from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
     from gpuvision.workflows.scan_result import Scan
 
@@ -163,10 +165,9 @@ def scan(
     """
     # Silence OpenCV: the command reports a bad image in one line.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    from gpuvision.host import Device
-    from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
     from gpuvision.workflows.planning_scan import plan_scan
+    from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES, surface_files
     from gpuvision.workflows.scanning import scan as run
 
     described = Sensor.load(sensor, encoder=encoder)
@@ -197,9 +198,9 @@ def scan(
         )
         outputs = claim_plan(out, as_json, inputs, overwrite=overwrite)
     else:
-        outputs = Outputs("scan", inputs=inputs, overwrite=overwrite)
-        _claim(outputs, out, chosen_formats, as_json)
-    chosen = None if device is None else Device.named(device)
+        names = (*SCAN_FILES, *SIGMA_FILES, *surface_files(chosen_formats).values())
+        outputs = claim_outputs("scan", inputs, (out, names), as_json, overwrite=overwrite)
+    chosen = device_of(device)
     plan = None
     asked: Literal["single", "double"] | None = None if precision is None else precision.value
     if largest is not None:
@@ -234,20 +235,11 @@ def scan(
         raise ValueError(f"{'; '.join(problems.values())}; all other files are written")
 
 
-def _claim(outputs: Outputs, out: Path, formats: Sequence[str], as_json: Path | None) -> None:
-    """Claim all files of a scan before it runs."""
-    from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES, surface_files
-
-    outputs.claim_folder(out, (*SCAN_FILES, *SIGMA_FILES, *surface_files(formats).values()))
-    outputs.claim(as_json)
-
-
 def _show(done: Scan, out: Path, *, to_stderr: bool) -> None:
     """Print the advice to standard error, then summary and error budget."""
     from gpuvision.workflows.scan_errors import budget_line
 
-    for advice in done.advice():
-        echo(f"warning: {advice}", err=True)
+    echo_warnings(done.advice(), err=True)
     lines = (done.summary(), budget_line(done.error_budget()))
     look = f"look at {out / 'picture.png'} and {out / 'report.json'}"
     echo("\n".join([*filter(None, lines), look]), err=to_stderr)
@@ -257,11 +249,9 @@ def _write_preview(
     recording: Path, sensor: Sensor, out: Path, inputs: Sequence[str | Path], device: str | None, overwrite: bool
 ) -> None:
     """Write the preview of a scan and print its line."""
-    from gpuvision.host import Device
-    from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.preview import PREVIEW_FILE, preview_scan
 
-    Outputs("preview", inputs=inputs, overwrite=overwrite).claim_folder(out, (PREVIEW_FILE,))
-    found = preview_scan(recording, sensor, device=None if device is None else Device.named(device))
+    claim_outputs("preview", inputs, (out, (PREVIEW_FILE,)), overwrite=overwrite)
+    found = preview_scan(recording, sensor, device=device_of(device))
     found.write(out, overwrite=overwrite)
     echo(f"{found.summary()}\nlook at {out / PREVIEW_FILE}")

@@ -12,8 +12,11 @@ import typer
 from gpuvision.cli.arguments import (
     LayerNames,
     Overwrite,
+    claim_outputs,
     command_line,
+    device_of,
     echo,
+    echo_warnings,
     layers_of,
     named_path,
     quantities,
@@ -109,8 +112,6 @@ def select(
     standard deviations of the pose at the placement point.
     """
     from gpuvision.formats.features_file import write_features
-    from gpuvision.host import Device
-    from gpuvision.host.outputs import Outputs
     from gpuvision.matching.artwork.artwork import read_artwork
     from gpuvision.matching.features.feature_set import choose_features, edge_clearance
     from gpuvision.plots.board import draw_features
@@ -121,11 +122,9 @@ def select(
         reject_unused("without a --budget in us, the only one that is measured on a device", device=device)
     imaging = _imaging(scale, search_range, contrast, etch_bias, blur_px=blur, width_px=width)
     at = None if placement is None else quantities(placement, "--placement", "m,m")
-    outputs = Outputs("select", inputs=[gerbers], overwrite=overwrite)
-    outputs.claim_folder(out, ("features.toml", "features.png"))
+    outputs = claim_outputs("select", [gerbers], (out, ("features.toml", "features.png")), overwrite=overwrite)
     artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=edge_clearance(imaging))
-    for each in artwork.warnings:
-        echo(f"warning: {each}", err=True)
+    echo_warnings(artwork.warnings, err=True)
     features = choose_features(
         artwork,
         box,
@@ -134,7 +133,7 @@ def select(
         budget=amount,
         unit=unit,
         missing=missing,
-        device=None if device is None else Device.named(device),
+        device=device_of(device),
     )
     with outputs.folder(out) as inside:
         write_features(features, inside / "features.toml")

@@ -13,7 +13,9 @@ from gpuvision.cli.arguments import (
     DeviceLabel,
     Overwrite,
     ReportFile,
+    claim_outputs,
     command_line,
+    device_of,
     echo,
     named_path,
     prints_report,
@@ -183,8 +185,6 @@ def simulate(
     --noise reuses the stored light. With --recording, gpuvision scan can read the simulated frames. With --tolerance,
     light that the range does not need is left out.
     """
-    from gpuvision.host import Device
-    from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
 
     largest = planned_tolerance(tolerance, "the simulated range, such as 5um", only_plan=only_plan)
@@ -201,13 +201,12 @@ def simulate(
     sensors = [Sensor.load(each) for each in described_by]
     read = [part, *described_by, *(each for each in (materials, mask) if each is not None)]
     read += [file for each in sensors for file in each.files]
-    chosen = None if device is None else Device.named(device)
+    chosen = device_of(device)
     if only_plan:
         outputs = claim_plan(out, as_json, read, overwrite=overwrite)
     else:
-        outputs = Outputs("simulate", inputs=read, overwrite=overwrite)
-        outputs.claim_folder(out, _files(len(sensors), has_mask=mask == "best", has_recording=recording))
-        outputs.claim(as_json)
+        names_of_files = _files(len(sensors), has_mask=mask == "best", has_recording=recording)
+        outputs = claim_outputs("simulate", read, (out, names_of_files), as_json, overwrite=overwrite)
     before = _mask(mask)
     loaded = _load_part(part, unit, materials, albedo, sensors[0])
     tasks = _prepare(*loaded, sensors, profiles, paths=names, patch_size=patch_size)

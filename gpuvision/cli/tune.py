@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabels, Overwrite, ReportFile, devices_of, echo, prints_report, write_report
+from gpuvision.cli.arguments import (
+    DeviceLabels,
+    Overwrite,
+    ReportFile,
+    claim_outputs,
+    devices_of,
+    echo,
+    prints_report,
+    write_report,
+)
 
 if TYPE_CHECKING:
     from gpuvision.host import Device
@@ -36,14 +45,12 @@ def tune(
     results) that is bound later uses them, until the driver or the version of gpuvision changes. Other configurations,
     for example a PSD with a triangulation, keep the defaults. GPUVISION_TUNING=off ignores the settings.
     """
-    from gpuvision.host.outputs import Outputs
     from gpuvision.profiling import tuning_inputs
 
     for name in operations or ():
         if name not in tuning_inputs.NAMES:
             raise ValueError(f"no operation {name!r} to tune; expected some of {', '.join(tuning_inputs.NAMES)}")
-    outputs = Outputs("tune", overwrite=overwrite)
-    outputs.claim(as_json)
+    outputs = claim_outputs("tune", (), as_json, overwrite=overwrite)
     devices = devices_of(device)
     results: list[TuningResult] = []
     try:

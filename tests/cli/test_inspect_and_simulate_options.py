@@ -54,10 +54,9 @@ def test_search_range_of_paste() -> None:
 
 
 def test_numbers_of_an_inspection() -> None:
-    assert inspect._sigma(None) is inspect._correlation_area(None) is inspect._pose(None, "") is None
+    assert inspect._sigma(None) is inspect._correlation_area(None) is None
     assert inspect._sigma("2um") == pytest.approx(2e-6)
     assert inspect._correlation_area(1.0) == 1.0
-    assert inspect._pose("1mm,-2mm,90deg", "--pose") == pytest.approx((1e-3, -2e-3, math.pi / 2))
     assert inspect._scale_sigmas("0.002,0.001") == {"height": 0.002, "lateral": 0.001}
     with pytest.raises(ValueError, match=r"--sigma is 0\.0, expected a number > 0"):
         inspect._sigma("0")

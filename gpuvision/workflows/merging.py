@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy.typing as npt
 from gpuvision.formats.height_files import read_heights, scanned_map
 from gpuvision.formats.json import report_text
 from gpuvision.formats.range_image import read_npz, write_npz, write_png16, write_tiff
-from gpuvision.host import Device, to_numpy
+from gpuvision.host import Device, FloatArray, to_numpy
 from gpuvision.host.errors import ReadError
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
@@ -31,6 +32,7 @@ from gpuvision.ranging.merge_heights import (
     MergedHeights,
     common_differences,
     merge_height_maps,
+    placed,
 )
 from gpuvision.status import Status
 
@@ -69,6 +71,9 @@ class HeightMapMerge:
         Second minus first height [m] in the cells in which both maps have a height, see `common_differences`.
     settings : dict
         Parameters of the merge.
+    phase : numpy.ndarray, optional
+        Part of ``heights.sigma`` that neighbouring cells share [m], (rows, columns): the phase of the line in its
+        pixel. Default: None, neither scan has it.
     without_sigma : tuple of float
         Share of the heights of each map that have no finite standard deviation above 0 and are therefore missing in the
         merge; 0 if the merge does not use standard deviations. Default 0.
@@ -79,6 +84,7 @@ class HeightMapMerge:
     grid: Grid
     differences: npt.NDArray[np.float64]
     settings: dict[str, Any]
+    phase: npt.NDArray[np.floating] | None = None
     without_sigma: tuple[float, float] = (0.0, 0.0)
 
     def counts(self) -> dict[str, int]:
@@ -160,6 +166,14 @@ class HeightMapMerge:
             "warnings": list(self.advice()),
         }
 
+    def random_sigma(self) -> FloatArray | None:
+        """Return the standard deviation of the heights without the phase [m]; None without standard deviations."""
+        total = self.heights.sigma
+        if total is None or self.phase is None:
+            return total
+        shared = np.minimum(self.phase / to_numpy(total), 1.0)
+        return np.asarray(to_numpy(total) * np.sqrt((1.0 - shared) * (1.0 + shared)))
+
     def files(self) -> tuple[str, ...]:
         """Return the names of the files that `write` writes."""
         return MERGE_FILES if self.heights.sigma is None else (*MERGE_FILES, SIGMA_FILE)
@@ -199,7 +213,9 @@ class HeightMapMerge:
             }
             if heights.sigma is not None:
                 write_tiff(inside / SIGMA_FILE, heights.sigma, grid, quantity="sigma of height (noise and phase)")
-                held["map_sigma"] = (heights.sigma, "m")
+                held["map_sigma"] = (self.random_sigma(), "m")
+            if self.phase is not None:
+                held["map_phase"] = (self.phase, "m")
             arrays, units = ({name: each[part] for name, each in held.items()} for part in (0, 1))
             write_npz(inside / "range_image.npz", arrays, units)
             shown = HeightMap(heights.z, heights.intensity, heights.status)
@@ -234,6 +250,11 @@ def read_height_map(path: str | Path) -> tuple[HeightMap, Grid]:
     ReadError
         The file holds no height map with a grid.
     """
+    return _read_scan(path)[0]
+
+
+def _read_scan(path: str | Path) -> tuple[tuple[HeightMap, Grid], npt.NDArray[Any] | None]:
+    """Read the height map of a scan, and the part of its standard deviation that neighbouring cells share [m]."""
     file = height_map_file(path)
     if not file.exists():
         raise FileNotFoundError(f"{file}: no such file")
@@ -249,7 +270,7 @@ def read_height_map(path: str | Path) -> tuple[HeightMap, Grid]:
             raise ReadError(f"{file}: {name} has shape {arrays[name].shape}, expected {z.shape} as map_z")
     status = arrays.get("map_status", np.where(np.isfinite(z), Status.OK, Status.NO_DATA)).astype(np.uint8)
     intensity = np.asarray(arrays.get("map_intensity", np.where(np.isfinite(z), 0.0, z)))
-    return HeightMap(z, intensity, status, sigma), read.grid
+    return (HeightMap(z, intensity, status, sigma), read.grid), None if sigma is None else read.phase
 
 
 def merge_scans(
@@ -278,7 +299,8 @@ def merge_scans(
     ValueError
         The cells do not fit together, or neither standard deviations nor a tolerance are given.
     """
-    maps = read_height_map(first), read_height_map(second)
+    one, other = _read_scan(first), _read_scan(second)
+    maps = one[0], other[0]
     if tolerance <= 0.0 and any(each.sigma is None for each, _ in maps):
         raise ValueError(
             "a scan has no standard deviations (a noise model in its sensor file gives them); give a tolerance, the "
@@ -297,8 +319,34 @@ def merge_scans(
         grid=grid,
         differences=common_differences(*maps, merged, grid),
         settings=settings,
+        phase=_merged_phase(maps, (one[1], other[1]), merged, grid),
         without_sigma=(0.0, 0.0) if merged.sigma is None else (_share_missing(maps[0][0]), _share_missing(maps[1][0])),
     )
+
+
+def _merged_phase(
+    maps: Sequence[tuple[HeightMap, Grid]],
+    phases: Sequence[npt.NDArray[Any] | None],
+    merged: MergedHeights,
+    grid: Grid,
+) -> npt.NDArray[Any] | None:
+    """Return the part of the merged standard deviation that neighbouring cells share [m]; None without any.
+
+    The phases of the two maps are independent, as their noise is. A mean has the weight ``merged sigma^2 / sigma^2`` of
+    each map, a height of one map alone has the weight 1.
+    """
+    if merged.sigma is None or all(each is None for each in phases):
+        return None
+    source, total = to_numpy(merged.source), to_numpy(merged.sigma)
+    variance = np.zeros(grid.shape)
+    for bit, (heights, own), phase in zip((FIRST, SECOND), maps, phases, strict=True):
+        if phase is not None:
+            sigma = placed(to_numpy(heights.sigma), own, grid, math.nan, np.dtype(np.float64))
+            sigma[sigma == 0.0] = math.nan  # a missing height
+            shared = placed(np.where(np.isfinite(phase), phase, 0.0), own, grid, 0.0, np.dtype(np.float64))
+            weight = np.where(source & (FIRST | SECOND) == bit, 1.0, (total / sigma) ** 2)
+            variance += np.where(source & bit != 0, (weight * shared) ** 2, 0.0)
+    return np.where(np.isfinite(total), np.sqrt(variance), math.nan).astype(total.dtype)
 
 
 def _share_missing(heights: HeightMap) -> float:

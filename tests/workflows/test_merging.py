@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from gpuvision.cli import main as cli
+from gpuvision.formats.height_files import read_heights
 from gpuvision.formats.range_image import read_npz, read_tiff, write_npz, write_tiff
 from gpuvision.host.errors import ReadError
 from gpuvision.ranging.height_map import Grid
@@ -189,6 +190,36 @@ def test_files_of_sigma_do_not_outlive_their_merge(scans: tuple[Path, Path], tmp
     assert (tmp_path / "out" / SIGMA_FILE).exists()
     dataclasses.replace(merged, heights=merged.heights._replace(sigma=None)).write(tmp_path / "out")
     assert not (tmp_path / "out" / SIGMA_FILE).exists()
+
+
+def test_noise_and_phase_stay_apart(tmp_path: Path) -> None:
+    """A mean of maps with the variances 9 + 16 and 4 + 0 (um^2): weights 4/29 and 25/29; holes of either map."""
+    z = np.full((3, 4), 1e-3)
+    z[0, 0] = z[2, 1] = math.nan
+    first = write_scan(tmp_path / "first", z, sigma=3e-6)
+    second = write_scan(tmp_path / "second", z[:, ::-1].copy(), left=-CELL, sigma=2e-6)
+    arrays, units = read_npz(first / "range_image.npz")
+    arrays["map_phase"] = np.full_like(z, 4e-6)
+    arrays["map_phase"][1, 0] = math.nan  # unknown
+    write_npz(first / "range_image.npz", arrays, units | {"map_phase": "m"}, overwrite=True)
+    merge_scans(first, second).write(tmp_path / "out")
+    found, units = read_npz(tmp_path / "out" / "range_image.npz")
+    assert units["map_phase"] == "m"
+    both = 4.0 / 29.0
+    mean, unknown = math.hypot(3 * both, 2 * 25.0 / 29.0), math.hypot(3 * 4.0 / 13.0, 2 * 9.0 / 13.0)
+    nan, shared = math.nan, 4 * both
+    phase = [[0.0, 0.0, shared, 4.0, 4.0], [0.0, 0.0, shared, shared, 4.0], [0.0, shared, nan, shared, 4.0]]
+    noise = [[2.0, 2.0, mean, 3.0, 3.0], [2.0, unknown, mean, mean, 3.0], [2.0, mean, nan, mean, 3.0]]
+    np.testing.assert_allclose(found["map_phase"], 1e-6 * np.array(phase), rtol=1e-12)
+    np.testing.assert_allclose(found["map_sigma"], 1e-6 * np.array(noise), rtol=1e-12)
+    # Merged again, the heights of the first merge keep both.
+    again = read_heights(tmp_path / "out" / "range_image.npz")
+    assert again.total_sigma is not None
+    np.testing.assert_allclose(merge_scans(first, second).heights.sigma, again.total_sigma, rtol=1e-12)
+    # A phase without sigma gives no weights.
+    del arrays["map_sigma"]
+    write_npz(first / "range_image.npz", arrays, dict.fromkeys(arrays, "m"), overwrite=True)
+    assert merge_scans(first, second, tolerance=1e-6).phase is None
 
 
 def test_heights_without_sigma_need_a_tolerance(rng: np.random.Generator, tmp_path: Path) -> None:

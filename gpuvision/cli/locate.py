@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -32,6 +33,8 @@ from gpuvision.cli.pose_output import POSE_FILES, PoseFolder, report_pose
 from gpuvision.cli.select import Side
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from gpuvision.host.outputs import Outputs
     from gpuvision.matching.artwork.artwork import Artwork
     from gpuvision.matching.board.located_board import LocatedBoard
@@ -199,12 +202,9 @@ def locate(
     that the image does not support is refused with a reason. For robots on a field: gpuvision locate-robot.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size, read_lens
-    from gpuvision.host.image_files import read_image
+    from gpuvision.formats.camera_file import read_lens
     from gpuvision.plots.board import draw_located_board
     from gpuvision.workflows.locating_board import locate_board
-    from gpuvision.workflows.location_plan import FEATURES_FILE
-    from gpuvision.workflows.planning_location import plan_location
 
     check_exists(image)
     largest = planned_tolerance(tolerance, "the pose, such as 2um", only_plan=only_plan)
@@ -212,38 +212,24 @@ def locate(
         reject_unused("without --tolerance", rate=rate)
     else:
         reject_unused("with --tolerance, which chooses the features", features=features, budget=budget)
-    if only_plan:
-        reject_unused("with --plan", gcode=gcode)
-        inputs = [each for each in (image, board, camera) if each is not None]
-        outputs = claim_plan(out, as_json, inputs, overwrite=overwrite, more=(FEATURES_FILE,))
-    else:
-        read = (image, board, camera, features)
-        outputs = claim_outputs("locate", read, as_json, (out, POSE_FILES), gcode, overwrite=overwrite)
+    outputs = _claim((image, board, camera, features), out, as_json, gcode, overwrite=overwrite, only_plan=only_plan)
     machine = _camera_at(camera_at, gcode, gcode_dialect)
     chosen = None if features is None else _features(features, budget, side)
-    pixel = _pixel(scale, chosen)
-    blur_px = blur or (_BLUR_PX if chosen is None else chosen.imaging.blur_px)
     # Check the options before the files, which take longer to read.
-    pose, distance_and_angle = pose_of(initial_pose, "--initial-pose"), _search_range(search_range)
-    etch_bias_sigma = quantities(etch_bias, "--etch-bias", "m")[0]
-    picture = read_image(image)
-    if camera is not None:
-        check_calibrated_size(image, (picture.shape[1], picture.shape[0]), read_calibrated_size(camera))
-    artwork = _artwork(board, chosen, "top" if side is None else side.value, layers, pixel, blur_px)
     options: dict[str, Any] = {
-        "scale": pixel,
-        "initial_pose": pose,
-        "search_range": distance_and_angle,
-        "model": None if camera is None else read_lens(camera),
-        "blur_px": blur_px,
-        "etch_bias_sigma": etch_bias_sigma,
+        "scale": _pixel(scale, chosen),
+        "blur_px": blur or (_BLUR_PX if chosen is None else chosen.imaging.blur_px),
+        "initial_pose": pose_of(initial_pose, "--initial-pose"),
+        "search_range": _search_range(search_range),
+        "etch_bias_sigma": quantities(etch_bias, "--etch-bias", "m")[0],
         "threshold": threshold,
         "copper": copper.value,
-        "device": device_of(device),
     }
+    picture = _picture(image, camera)
+    artwork = _artwork(board, chosen, side, layers, options)
+    options |= {"model": None if camera is None else read_lens(camera), "device": device_of(device)}
     if largest is not None:
-        with planning(image.name) as progress:
-            plan = plan_location(picture, artwork, tolerance=largest, rate=rate, progress=progress, **options)
+        plan = _plan(picture, artwork, image.name, largest, rate, options)
         if only_plan:
             _write_plan(plan, image.name, out, as_json, outputs, overwrite=overwrite)
             return
@@ -256,6 +242,50 @@ def locate(
     if gcode is not None and machine is not None:
         comment = f"gpuvision locate {image.name}".translate(_IN_COMMENTS)
         outputs.write_text(gcode, _gcode(located, machine, gcode_dialect, comment))
+
+
+def _claim(
+    inputs: Sequence[Path | None],
+    out: Path | None,
+    as_json: Path | None,
+    gcode: Path | None,
+    *,
+    overwrite: bool,
+    only_plan: bool,
+) -> Outputs:
+    """Check that the files of a pose, or of a plan alone, may be written, before the work."""
+    from gpuvision.workflows.location_plan import FEATURES_FILE
+
+    if only_plan:
+        reject_unused("with --plan", gcode=gcode)
+        return claim_plan(out, as_json, inputs, overwrite=overwrite, more=(FEATURES_FILE,))
+    return claim_outputs("locate", inputs, as_json, (out, POSE_FILES), gcode, overwrite=overwrite)
+
+
+def _picture(image: Path, camera: Path | None) -> npt.NDArray[Any]:
+    """Read the image, and check that it has the size for which the camera was calibrated."""
+    from gpuvision.formats.camera_file import check_calibrated_size, read_calibrated_size
+    from gpuvision.host.image_files import read_image
+
+    picture = read_image(image)
+    if camera is not None:
+        check_calibrated_size(image, (picture.shape[1], picture.shape[0]), read_calibrated_size(camera))
+    return picture
+
+
+def _plan(
+    picture: npt.NDArray[Any],
+    artwork: Artwork,
+    title: str,
+    tolerance: float,
+    rate: float | None,
+    options: dict[str, Any],
+) -> LocationPlan:
+    """Choose the features that meet a tolerance [m], with a progress bar."""
+    from gpuvision.workflows.planning_location import plan_location
+
+    with planning(title) as progress:
+        return plan_location(picture, artwork, tolerance=tolerance, rate=rate, progress=progress, **options)
 
 
 def _write_plan(
@@ -321,17 +351,16 @@ def _pixel(scale: str | None, features: FeatureSet | None) -> float:
 
 
 def _artwork(
-    board: Path, features: FeatureSet | None, side: Any, layers: list[str] | None, pixel: float, blur_px: float
+    board: Path, features: FeatureSet | None, side: Side | None, layers: list[str] | None, options: dict[str, Any]
 ) -> Artwork:
     """Read the side of the board that the features are on, with the clearance that the imaging needs."""
     from gpuvision.matching.artwork.artwork import read_artwork
     from gpuvision.matching.features.feature_set import edge_clearance
     from gpuvision.matching.features.imaging import Imaging
 
-    imaging = Imaging(pixel=pixel, blur_px=blur_px) if features is None else features.imaging
-    return read_artwork(
-        board,
-        side=side if features is None else features.side,
-        layers=layers_of(layers),
-        clearance=edge_clearance(imaging),
-    )
+    if features is not None:
+        imaging, of_board = features.imaging, features.side
+    else:
+        imaging = Imaging(pixel=options["scale"], blur_px=options["blur_px"])
+        of_board = "bottom" if side is Side.bottom else "top"
+    return read_artwork(board, side=of_board, layers=layers_of(layers), clearance=edge_clearance(imaging))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -32,6 +32,7 @@ from gpuvision.cli.select import Side
 if TYPE_CHECKING:
     from gpuvision.host.outputs import Outputs
     from gpuvision.matching.artwork.artwork import Artwork
+    from gpuvision.servoing.placement.machine import Machine
     from gpuvision.workflows.placement_cell import Repeatability
     from gpuvision.workflows.placement_plan import PlacementSettingsPlan
     from gpuvision.workflows.placing import PlacementResult
@@ -132,19 +133,11 @@ def place(
     machine. The report has the error at the release and its prediction, and the number of frames in which the true
     error settles, with its value by theory. The machine file chooses observer, controller and release rule.
     """
-    from gpuvision.formats.json import json_tree, report_text
     from gpuvision.formats.machine_file import named_files, read_machine
-    from gpuvision.host.files import write_text_atomic
-    from gpuvision.matching.artwork.artwork import read_artwork
-    from gpuvision.matching.features.feature_set import edge_clearance
-    from gpuvision.servoing.placement.plan import placement_imaging
     from gpuvision.workflows.placement_cell import measure_repeatability
     from gpuvision.workflows.placing import simulate_placements
-    from gpuvision.workflows.planning_placement import plan_placement_settings
 
-    target = quantities(at, "--at", "m,m,rad")
-    if max(abs(target[0]), abs(target[1])) > _LARGEST_BOARD:
-        raise ValueError(f"--at is {at!r}, expected at most {_LARGEST_BOARD:g} m; numbers need units: 9mm,9mm,90deg")
+    target = _target(at)
     largest = planned_tolerance(tolerance, "the placement, such as 5um", only_plan=only_plan)
     if largest is None:
         reject_unused("without --tolerance", rate=rate, part_radius=part_radius, time_vision=time_vision)
@@ -155,42 +148,67 @@ def place(
     else:
         outputs = claim_outputs("place", inputs, as_json, (out, _FILES), overwrite=overwrite)
     described = read_machine(machine, rate=frame_rate)
-    clearance = edge_clearance(placement_imaging(described))
-    artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=clearance)
-    echo_warnings(artwork.warnings, err=True)
+    artwork = _artwork(gerbers, side, layers, described)
     chosen = device_of(device)
     if largest is not None:
-        with planning(f"placements at {at}") as progress:
-            plan = plan_placement_settings(
-                artwork,
-                target,
-                described,
-                tolerance=largest,
-                rate=rate,
-                part_radius=length_of(part_radius, "--part-radius"),
-                budget=budget,
-                times_vision=time_vision,
-                device=chosen,
-                progress=progress,
-            )
+        radius = length_of(part_radius, "--part-radius")
+        given = {"rate": rate, "part_radius": radius, "budget": budget, "times_vision": time_vision}
+        plan = _plan(artwork, target, described, f"placements at {at}", tolerance=largest, device=chosen, **given)
         if only_plan:
             _write_plan(plan, machine, out, as_json, outputs, overwrite=overwrite)
             return
         echo(f"plan: {plan}", err=prints_report(as_json))
         described, budget = plan.chosen.machine, plan.chosen.budget
     count, seed = _COUNT if count is None else count, 0 if seed is None else seed
+    how = {"count": count, "budget": budget, "seed": seed}
     with progress_bar("placing") as progress:
-        result = simulate_placements(
-            artwork,
-            target,
-            described,
-            count=count,
-            budget=budget,
-            seed=seed,
-            device=chosen,
-            progress=progress,
-        )
+        result = simulate_placements(artwork, target, described, device=chosen, progress=progress, **how)
     resting = measure_repeatability(artwork, result.machine, result.plan, seed=seed, device=chosen)
+    _write(artwork, result, resting, out, as_json, outputs)
+
+
+def _target(text: str) -> tuple[float, ...]:
+    """Parse ``--at``: x, y [m] and angle [rad]."""
+    target = quantities(text, "--at", "m,m,rad")
+    if max(abs(target[0]), abs(target[1])) > _LARGEST_BOARD:
+        raise ValueError(f"--at is {text!r}, expected at most {_LARGEST_BOARD:g} m; numbers need units: 9mm,9mm,90deg")
+    return target
+
+
+def _artwork(gerbers: Path, side: Side, layers: list[str] | None, machine: Machine) -> Artwork:
+    """Read the side of the board, with the clearance that the camera of the machine needs; print the warnings."""
+    from gpuvision.matching.artwork.artwork import read_artwork
+    from gpuvision.matching.features.feature_set import edge_clearance
+    from gpuvision.servoing.placement.plan import placement_imaging
+
+    clearance = edge_clearance(placement_imaging(machine))
+    artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=clearance)
+    echo_warnings(artwork.warnings, err=True)
+    return artwork
+
+
+def _plan(
+    artwork: Artwork, target: tuple[float, ...], machine: Machine, description: str, **given: Any
+) -> PlacementSettingsPlan:
+    """Choose the settings that meet a tolerance, with a progress bar."""
+    from gpuvision.workflows.planning_placement import plan_placement_settings
+
+    with planning(description) as progress:
+        return plan_placement_settings(artwork, target, machine, progress=progress, **given)
+
+
+def _write(
+    artwork: Artwork,
+    result: PlacementResult,
+    resting: Repeatability,
+    out: Path,
+    as_json: Path | None,
+    outputs: Outputs,
+) -> None:
+    """Write report and pictures of placements, and print the summary."""
+    from gpuvision.formats.json import json_tree, report_text
+    from gpuvision.host.files import write_text_atomic
+
     report = result.report() | {"repeatability": resting.report()}
     write_report(as_json, report, outputs)
     with outputs.folder(out) as inside:

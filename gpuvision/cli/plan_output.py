@@ -42,7 +42,12 @@ def planned_tolerance(text: str | None, error_of: str, *, only_plan: bool) -> fl
 
 
 def claim_plan(
-    out: Path | None, as_json: Path | None, inputs: Sequence[str | Path], *, overwrite: bool, more: Sequence[str] = ()
+    out: Path | None,
+    as_json: Path | None,
+    inputs: Sequence[str | Path | None],
+    *,
+    overwrite: bool,
+    more: Sequence[str] = (),
 ) -> Outputs:
     """Check that the files of a plan may be written, before it is made.
 
@@ -52,8 +57,8 @@ def claim_plan(
         Folder of the picture; None: no picture.
     as_json : Path or None
         File of the report.
-    inputs : sequence of str or Path
-        Files that are read.
+    inputs : sequence of str, Path or None
+        Files that are read; None is skipped.
     overwrite : bool
         Whether a file may be replaced that no earlier plan wrote.
     more : sequence of str

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -27,7 +27,9 @@ from gpuvision.cli.arguments import (
 from gpuvision.cli.plan_output import claim_plan, planned_tolerance, planning, report_plan
 
 if TYPE_CHECKING:
+    from gpuvision.host import Device
     from gpuvision.sensor.sensor import Sensor
+    from gpuvision.workflows.scan_plan import ScanPlan
     from gpuvision.workflows.scan_result import Scan
 
 
@@ -166,47 +168,30 @@ def scan(
     # Silence OpenCV: the command reports a bad image in one line.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.sensor.sensor import Sensor
-    from gpuvision.workflows.planning_scan import plan_scan
     from gpuvision.workflows.scan_result import SCAN_FILES, SIGMA_FILES, surface_files
     from gpuvision.workflows.scanning import scan as run
 
     described = Sensor.load(sensor, encoder=encoder)
     inputs: list[str | Path] = [recording, sensor, *described.files]
+    unused_ply = None if ply is PlyPoints.organised else ply
+    given = {"precision": precision, "rate": rate, "policy": policy, "format": formats, "ply": unused_ply}
     if preview:
-        reject_unused(
-            "with --preview",
-            precision=precision,
-            rate=rate,
-            policy=policy,
-            format=formats,
-            ply=None if ply is PlyPoints.organised else ply,
-            json=as_json,
-            tolerance=tolerance,
-            plan=only_plan,
-        )
+        reject_unused("with --preview", **given, json=as_json, tolerance=tolerance, plan=only_plan)
         _write_preview(recording, described, out, inputs, device, overwrite)
         return
     largest = planned_tolerance(tolerance, "the heights, such as 20um", only_plan=only_plan)
     chosen_formats = [each.value for each in formats or ()]
     if only_plan:
-        reject_unused(
-            "with --plan",
-            precision=precision,
-            policy=policy,
-            format=formats,
-            ply=None if ply is PlyPoints.organised else ply,
-        )
+        reject_unused("with --plan", **given | {"rate": None})  # the plan keeps up with the rate
         outputs = claim_plan(out, as_json, inputs, overwrite=overwrite)
     else:
         names = (*SCAN_FILES, *SIGMA_FILES, *surface_files(chosen_formats).values())
         outputs = claim_outputs("scan", inputs, (out, names), as_json, overwrite=overwrite)
     chosen = device_of(device)
     plan = None
-    asked: Literal["single", "double"] | None = None if precision is None else precision.value
     if largest is not None:
         reject_unused("with --tolerance, which chooses it", precision=precision)
-        with planning(recording.name) as progress:
-            plan = plan_scan(recording, described, tolerance=largest, rate=rate, device=chosen, progress=progress)
+        plan = _plan(recording, described, largest, rate, chosen)
         if only_plan:
             plan.write(out, overwrite=overwrite)
             report_plan(plan, out, as_json, outputs)
@@ -217,7 +202,7 @@ def scan(
             recording,
             described,
             device=chosen,
-            precision=asked,
+            precision=None if precision is None else precision.value,
             rate=rate,
             policy=None if policy is None else policy.value,
             stream_plan=None if plan is None else plan.stream,
@@ -233,6 +218,14 @@ def scan(
     _show(done, out, to_stderr=prints_report(as_json))
     if problems:
         raise ValueError(f"{'; '.join(problems.values())}; all other files are written")
+
+
+def _plan(recording: Path, sensor: Sensor, tolerance: float, rate: float | None, device: Device | None) -> ScanPlan:
+    """Choose the readout that meets a tolerance [m] on a sample of the recording, with a progress bar."""
+    from gpuvision.workflows.planning_scan import plan_scan
+
+    with planning(recording.name) as progress:
+        return plan_scan(recording, sensor, tolerance=tolerance, rate=rate, device=device, progress=progress)
 
 
 def _show(done: Scan, out: Path, *, to_stderr: bool) -> None:

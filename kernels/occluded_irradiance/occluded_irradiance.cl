@@ -12,7 +12,7 @@
 //          INTERVALS (exact visibility, visible.h), CONVEX_PARTS (INTERVALS in the vector variant: some leaves belong to
 //          convex parts), RAYS (shadow rays to `samples` parts of a segment); without both:
 //          no occlusion.
-// Variants: vector: a work-item per share of the strips, 16 receivers in a vector (receiver_blocks.h); work-item: a
+// Variants: vector: strips in turn for each work-item, 16 receivers in a vector (receiver_blocks.h); work-item: a
 //          work-group per strip, a pair of a receiver and a segment per item (lit_pairs.h).
 
 // Number of receivers that share a list of picked segments.
@@ -48,7 +48,10 @@ AS_IT_IS kernel void occluded_irradiance(
 #endif
     const ulong group = get_group_id(0), groups = get_num_groups(0);
     const uint of_strip = (each + LANES - 1) / LANES; // blocks of a strip
-    const ulong end_block = strips * (group + 1) / groups * of_strip;
+    // Strips group, group + groups, ...: neighbouring strips need about the same time, so all groups do. (PoCL gives half of
+    // the groups to the first of two workers at once: with contiguous strips, a scene with parts on one side took 1.65
+    // times as long.)
+    const ulong end_block = (strips - group + groups - 1) / groups * of_strip;
     chunk lit;
     block blocks[BATCH];
     packet packed;
@@ -57,18 +60,20 @@ AS_IT_IS kernel void occluded_irradiance(
     waiting.count = 0;
     place to_left = 0, to_right = 0;
     int loaded = -1; // first segment of the chunk that is loaded
-    for (ulong begin = strips * group / groups * of_strip; begin < end_block; begin += BATCH) {
+    for (ulong begin = 0; begin < end_block; begin += BATCH) {
         const uint count = (uint)min((ulong)BATCH, end_block - begin);
         uchar flag = STATUS_OK;
         for (uint n = 0; n < count; n++) {
             const uint first = (begin + n) % of_strip * LANES;
-            const ulong row = (begin + n) / of_strip * each + first;
-            load_block(receivers + 6 * row, middle, min((uint)LANES, each - first), blocks + n);
+            const ulong row = ((begin + n) / of_strip * groups + group) * each + first;
+            const ulong present = (ulong)strips * each - row;
+            load_block(receivers + 6 * row, middle, min((uint)LANES, each - first), present, blocks + n);
         }
 #ifdef SELECTED
-        if (starts[begin] < 0 || starts[begin + 1] > (int)pick_count) flag |= STATUS_OUT_OF_RANGE;
-        const int end = min(starts[begin + 1], (int)pick_count);
-        for (int next = max(starts[begin], 0); next < end;) {
+        const ulong list = (begin / of_strip * groups + group) * of_strip + begin % of_strip;
+        if (starts[list] < 0 || starts[list + 1] > (int)pick_count) flag |= STATUS_OUT_OF_RANGE;
+        const int end = min(starts[list + 1], (int)pick_count);
+        for (int next = max(starts[list], 0); next < end;) {
             next = load_selected(segments, selected, next, end, segment_count, middle, &lit, &flag);
             light_chunk(&tree, &lit, clearance, samples, blocks, count, &packed, &waiting, &flag);
         }
@@ -82,7 +87,7 @@ AS_IT_IS kernel void occluded_irradiance(
         finish(&waiting);
         for (uint n = 0; n < count; n++) {
             const uint first = (begin + n) % of_strip * LANES;
-            const ulong strip = (begin + n) / of_strip, row = strip * each + first;
+            const ulong strip = (begin + n) / of_strip * groups + group, row = strip * each + first;
             if (first == 0) to_left = 0, to_right = 0;
             store_block(blocks + n, flag, irradiance + row, status + row, weights + 2 * row, &to_left, &to_right);
             if (first + LANES >= each) left[strip] = (real)to_left, right[strip] = (real)to_right;

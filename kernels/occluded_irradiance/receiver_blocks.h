@@ -15,6 +15,10 @@
 #error a list of segments serves the receivers of one vector
 #endif
 
+#define COLUMN_TYPE places
+#define CONVERT_COLUMN LANED(convert_place)
+#include "common/six_columns.h"
+
 // Number of blocks of a batch. Receivers with their own lists of segments are processed block by block.
 #ifdef SELECTED
 #define BATCH 1
@@ -137,19 +141,31 @@ typedef struct {
     uint none, bad;
 } block;
 
-// Load a block; repeat the last receiver to fill the lanes.
-static inline void load_block(global const INPUT *receivers, constant place *middle, uint count, block *here) {
+// Load the positions and normals of LANES receivers, of which `present` ones are in the memory; repeat the last one.
+static inline void load_receivers(global const INPUT *rows, ulong present, places *columns) {
+    if (present >= LANES) {
+        load_columns(rows, columns);
+        return;
+    }
+    for (int k = 0; k < 6; k++) {
+        place column[LANES];
+        for (uint lane = 0; lane < LANES; lane++) column[lane] = (place)rows[6 * min((ulong)lane, present - 1) + k];
+        columns[k] = load_places(column);
+    }
+}
+
+// Load a block of `count` receivers. The lanes behind them hold any receivers.
+static inline void load_block(global const INPUT *rows, constant place *middle, uint count, ulong present, block *here) {
     packet *to = &here->lanes;
-    place normals[3][LANES];
+    places columns[6];
+    load_receivers(rows, present, columns);
     to->count = count;
     for (int lane = 0; lane < LANES; lane++) {
-        global const INPUT *row = receivers + 6 * min((uint)lane, count - 1);
-        for (int k = 0; k < 3; k++) to->wide[k][lane] = (place)row[k], normals[k][lane] = (place)row[k + 3];
         here->sums[lane] = 0, here->flags[lane] = STATUS_OK;
         to->sum[lane] = here->sums + lane, to->flag[lane] = here->flags + lane;
     }
-    for (int k = 0; k < 3; k++) store_places(load_places(to->wide[k]) - middle[k], to->wide[k]);
-    places nx = load_places(normals[0]), ny = load_places(normals[1]), nz = load_places(normals[2]);
+    for (int k = 0; k < 3; k++) store_places(columns[k] - middle[k], to->wide[k]);
+    places nx = columns[3], ny = columns[4], nz = columns[5];
     const places zero = (places)0, longest = fmax(fmax(fabs(nx), fabs(ny)), fabs(nz));
     here->none = lane_bits(mask_of_places(nx == zero) & mask_of_places(ny == zero) & mask_of_places(nz == zero));
     nx /= longest, ny /= longest, nz /= longest;

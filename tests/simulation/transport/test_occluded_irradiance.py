@@ -486,16 +486,20 @@ def selected_of(
     return operation(receivers, weights, segments.astype(dtype), starts, selected, device=device)
 
 
-@pytest.mark.parametrize("variant", ["vector", "work_item"])
-def test_selected_segments(device: Device, variant: Any, rng: np.random.Generator) -> None:
-    """Each block has a list of segments: tested for visibility, taken without test, or omitted."""
-    corners, segments, receivers = soup(rng, 40, 0.3), segments_of(rng, 6), receivers_of(rng, 2, 37).astype(np.float32)
+@pytest.mark.parametrize(("variant", "strips"), [("vector", 2), ("vector", 200), ("work_item", 2)])
+def test_selected_segments(device: Device, variant: Any, strips: int, rng: np.random.Generator) -> None:
+    """Each block has a list of segments: tested for visibility, taken without test, or omitted.
+
+    With 200 strips a work-item of the vector variant has several strips (on fewer than 25 cores).
+    """
+    corners, segments = soup(rng, 40, 0.3), segments_of(rng, 6)
+    receivers = receivers_of(rng, strips, 37).astype(np.float32)
     seen = [light_of(corners, receivers, segments[[k]], device, variant=variant).irradiance for k in range(6)]
     free = [
         light_of(corners, receivers, segments[[k]], device, variant=variant, visibility="none").irradiance
         for k in range(6)
     ]
-    lists = [rng.permutation(6)[: rng.integers(0, 7)] for _ in range(6)]
+    lists = [rng.permutation(6)[: rng.integers(0, 7)] for _ in range(3 * strips)]
     lists = [np.where(rng.random(len(some)) < 0.3, ~some, some) for some in lists]
     result = selected_of(corners, receivers, segments, lists, device, variant, room=5)
     for number, some in enumerate(lists):

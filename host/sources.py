@@ -23,6 +23,8 @@ Arrivals = NDArray[np.int64]
 # Last part of a wait [ns] in which the processor is yielded, because sleeping overshoots: by some 80 us on a common
 # kernel (measured).
 _SPIN_NS = 200_000
+# Lowest rate of a clock [1/s]. Derived: its wait of 1e9 s for a frame is below the longest one of a lock, 9.2e9 s.
+_SLOWEST = 1e-9
 
 _yield = getattr(os, "sched_yield", lambda: time.sleep(0))
 
@@ -293,7 +295,7 @@ class PacedSource(Source):
     Raises
     ------
     ValueError
-        The rate is not between 0 and 1e9.
+        The rate is not between 1e-9 and 1e9.
     """
 
     def __init__(
@@ -304,8 +306,8 @@ class PacedSource(Source):
         clock: Clock = time.perf_counter_ns,
         sleep: Callable[[float], object] | None = None,
     ) -> None:
-        if not 0.0 < rate < 1e9:
-            raise ValueError(f"rate is {rate}, expected frames per second between 0 and 1e9")
+        if not _SLOWEST <= rate < 1e9:
+            raise ValueError(f"rate is {rate}, expected frames per second between {_SLOWEST:g} and 1e9")
         self.shape, self.dtype, self.length, self.rate = source.shape, source.dtype, source.length, rate
         self.exposure_delay = source.exposure_delay
         self.late = 0

@@ -114,8 +114,8 @@ def fit_models(
     Raises
     ------
     ValueError
-        Shapes differ, a point is not finite or lies beyond the fold of the lens, or the points determine no
-        model.
+        Shapes differ, a point is not finite or lies beyond the fold of the lens, a model is unknown, or the points
+        determine no model.
 
     Notes
     -----
@@ -125,6 +125,8 @@ def fit_models(
     sensor, sheet = _points(sensor_points, "sensor_points"), _points(sheet_points, "sheet_points")
     if len(sensor) != len(sheet):
         raise ValueError(f"got {len(sensor)} sensor points and {len(sheet)} sheet points, expected pairs")
+    for unknown in set(models or ()) - set(MODELS):
+        raise ValueError(f"the model is {unknown!r}, expected one of {', '.join(MODELS)}")
     data = _calibration(sensor, sheet, sigma, symmetry, distortion)
     frame = shift_and_scale(*centre_and_half_extent(bounding_box(sensor) if region is None else region))
     fits: list[tuple[ModelFit, float]] = []

@@ -305,6 +305,7 @@ def test_four_points_fix_eight_parameters_without_a_covariance() -> None:
         (SHEET[:3], {"model": "H8"}, "too few"),
         (SHEET[::9], {"model": "H8"}, "do not fix"),
         (np.repeat(SHEET[:1], 9, axis=0), {"model": "C4"}, "do not fix"),
+        (SHEET, {"model": "C8"}, "the model is 'C8', expected one of C3, C4, D6, H8"),
         (SHEET, {"sigma": 0.0}, "sigma must be positive"),
         (SHEET, {"lens": Lens(k1=-1e6)}, "beyond the fold"),
     ],

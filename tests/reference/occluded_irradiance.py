@@ -106,16 +106,6 @@ def irradiance(corners: Float64, receivers: Float64, segments: Float64, clearanc
     return total, largest
 
 
-def symmetric_difference(some: Float64, others: Float64) -> float:
-    """Return the length of the points that are in only one of two sets of intervals."""
-    edges = np.unique(np.concatenate([some.ravel(), others.ravel(), [0.0, 1.0]]))
-    middles = 0.5 * (edges[1:] + edges[:-1])
-    inside = [
-        ((middles[:, None] > each[:, 0]) & (middles[:, None] < each[:, 1])).any(axis=1) for each in (some, others)
-    ]
-    return float(np.sum((edges[1:] - edges[:-1])[inside[0] != inside[1]]))
-
-
 def single(values: Any) -> Float64:
     """Return numbers rounded to float32, so that both precisions see the same scene."""
     return np.asarray(values).astype(np.float32).astype(np.float64)

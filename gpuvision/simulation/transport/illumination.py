@@ -208,7 +208,7 @@ class LightSheet:
         transports = np.atleast_1d(np.asarray(transports, np.float64))
         cuts = SheetIndex.of(scene, self.transport).cuts(transports)
         cuts, x, height = self._to_light_coordinates(cuts)
-        lit = self._clip_to_limits(upper_envelope(cuts.sheet, x, height), x)
+        lit = self._clip_to_limits(upper_envelope(cuts.sheet, x, height))
         sheet_ends, arriving, lit = self._split_evenly(lit, cuts, x, height)
         sheet, triangle = cuts.sheet[lit.segment], cuts.triangle[lit.segment]
         ends = self._to_scene(sheet_ends, transports[sheet])
@@ -276,7 +276,7 @@ class LightSheet:
             np.take_along_axis(H, order, axis=1),
         )
 
-    def _clip_to_limits(self, pieces: Pieces, x: Float64) -> Pieces:
+    def _clip_to_limits(self, pieces: Pieces) -> Pieces:
         """Clip pieces to the light's limits, and split them at the knots of its profile."""
         knots = self._knots
         if knots is None:

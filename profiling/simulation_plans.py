@@ -30,12 +30,14 @@ from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.simulated import require_light
+from gpuvision.simulation.light_paths import SolverKey
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert, Phong
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.sensors.readings import PATHS
+from gpuvision.simulation.sensors.readings import PATHS, Reading
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.simulation.transport.direct import DirectLimits
+from gpuvision.simulation.transport.radiosity import Radiosity
 from gpuvision.status import Status
 from gpuvision.workflows.light_cache import SimulationTask
 from gpuvision.workflows.planning_simulation import plan_task
@@ -53,7 +55,30 @@ _LARGE = 0.5  # share of the large parts
 _MIN_LARGE, _MAX_LARGE = 100, 400  # profiles of a large part
 _THIRD = 3  # of three profiles with multi-bounce light, one is compared with truth, because that light takes minutes
 _TURNS = 5  # of the times of the chosen and of the best light: the machine may be busy
+INDIRECT = ("diffuse-diffuse", "multi-bounce")
 _BOUNCES = 0.5  # share of the PSD's jobs with multi-bounce light, which takes most of the time
+
+
+class TrueRays(NamedTuple):
+    """Rays of truth per bin along u and along v, as factors of those of the sensor file.
+
+    Attributes
+    ----------
+    diffuse, bounces : pair of ints
+        Rays of light of two diffuse reflections, in bins of half the size, and of multi-bounce light.
+    """
+
+    diffuse: tuple[int, int]
+    bounces: tuple[int, int]
+
+    def times(self, factor: int) -> TrueRays:
+        """Return the rays with a factor along v."""
+        return TrueRays(*((u, factor * v) for u, v in self))
+
+
+# In bins of half the size two rays along u are four. Multi-bounce light has the bins of the options, but other places.
+_TRUE_RAYS = (TrueRays((2, 16), (4, 3)), TrueRays((2, 12), (3, 4)))
+_MORE_RAYS = 4  # factor of the rays along v where these two differ
 
 
 class Job(NamedTuple):
@@ -182,19 +207,21 @@ def judge(rng: np.random.Generator, device: Device, limits: SimulationPlanLimits
     try:
         plan = plan_task(job.task, tolerance=job.tolerance, rate=rate, device=device, limits=limits)
     except PlanError as refusal:
-        return Outcome(None, job.tolerance, possible=bool(meeting), room=room, note=note_of(job, str(refusal)))
+        return Outcome(None, job.tolerance, possible=bool(meeting), room=room, note=note_of(truth, str(refusal)))
     chosen = plan.chosen.settings
     light = truth.sample.light(chosen)
     error = truth.error(light.exposures, max_moved)
     cost = math.nan if best is None else time_ratio(truth.sample, options, chosen, best)
     keeps_up = None if rate is None else (light.seconds + options.preparation_of(chosen)) * rate <= 1.0
-    return Outcome(plan, job.tolerance, error, bool(meeting), cost, keeps_up, room, note_of(job))
+    return Outcome(plan, job.tolerance, error, bool(meeting), cost, keeps_up, room, note_of(truth))
 
 
-def note_of(job: Job, reason: str = "") -> str:
-    """Return the number of profiles of the part, and the reason of a refusal."""
-    count = f"{len(job.task.transports)} profiles"
-    return f"{count}; {reason}" if reason else count
+def note_of(truth: Truth, reason: str = "") -> str:
+    """Return the number of profiles of the part, of samples without truth, and the reason of a refusal."""
+    notes = [f"{len(truth.sample.task.transports)} profiles"]
+    if truth.left_out:
+        notes.append(f"{truth.left_out} of {truth.heights.size} samples without truth left out")
+    return "; ".join([*notes, reason] if reason else notes)
 
 
 def time_ratio(
@@ -211,37 +238,73 @@ def time_ratio(
 class Truth:
     """Readings of a job's profiles by a finer computation.
 
+    Indirect light is computed with two numbers of rays. Profiles in which the heights differ by more than the
+    tolerance are computed again with more rays. Samples that still differ are left out: their truth is not known.
+
     Parameters
     ----------
     job : Job
         The job.
     device : Device
         Device of the kernels.
+
+    Attributes
+    ----------
+    heights : numpy.ndarray
+        (profiles, samples): heights [m]; NaN where nothing is read.
+    is_clear : numpy.ndarray
+        (profiles, samples): whether the sample is compared.
+    left_out : int
+        Number of samples that two numbers of rays read differently.
     """
 
     def __init__(self, job: Job, device: Device) -> None:
         task = job.task  # with all profiles: they share the preparation of multi-bounce light
         self.sample = dataclasses.replace(ProfileSample.of(task, len(job.places), device), places=job.places)
-        settings = SimulationSettings.of(task)
-        u, v = settings.nodes
-        finer = dataclasses.replace(
-            settings,
-            paths=tuple(each for each in task.paths if each != "multi-bounce"),
-            sub_sheets=2 * (2 * settings.sub_sheets + 1),
-            nodes=(2 * u, 16 * v),  # in bins of half the size: four rays along u
-        )
+        self._settings, self._solvers = SimulationSettings.of(task), dict[SolverKey, Radiosity]()
+        slabs = 2 * (2 * self._settings.sub_sheets + 1)
+        direct = tuple(each for each in task.paths if each not in INDIRECT)
+        self._direct = self._halved(job.places, direct, sub_sheets=slabs)
+        found, other = self._readings(np.arange(len(job.places)), 1)
+        self.heights, status = found.h.copy(), found.status.copy()
+        differs = differ(found.h, other.h, job.tolerance)
+        unsure = np.flatnonzero(differs.any(axis=1))
+        if len(unsure):
+            found, other = self._readings(unsure, _MORE_RAYS)
+            self.heights[unsure], status[unsure] = found.h, found.status
+            differs[unsure] = differ(found.h, other.h, job.tolerance)
+        self.left_out = int(np.count_nonzero(differs))
+        self.is_clear = ((status & Status.AMBIGUOUS) == 0) & ~differs
+
+    def _readings(self, chosen: npt.NDArray[np.int64], more: int) -> list[Reading]:
+        """Read chosen profiles with two numbers of rays, of which there are ``more`` times as many along v."""
+        direct = {name: Exposure(each.power[chosen], each.moment[chosen]) for name, each in self._direct.items()}
+        places, reader = self.sample.places[chosen], self.sample.reader
+        return [reader.read(direct | self._indirect(places, each.times(more))) for each in _TRUE_RAYS]
+
+    def _indirect(self, places: Float64, rays: TrueRays) -> dict[str, Exposure]:
+        """Return the diffuse light and the multi-bounce light of some profiles."""
+        light, (u, v) = dict[str, Exposure](), self._settings.nodes
+        for name, (along_u, along_v) in zip(INDIRECT, rays, strict=True):
+            if name not in self.sample.task.paths:
+                continue
+            paths, nodes = ("direct", name), (along_u * u, along_v * v)
+            if name == "diffuse-diffuse":
+                found = self._halved(places, paths, sub_sheets=1, nodes=nodes)
+            else:
+                size = 0.5 * self._settings.patch_size
+                finer = dataclasses.replace(self._settings, paths=paths, sub_sheets=1, nodes=nodes, patch_size=size)
+                found = self.sample.light(finer, places, runs=1, solvers=self._solvers).exposures
+            light[name] = found[name]
+        return light
+
+    def _halved(self, places: Float64, paths: tuple[str, ...], **changes: Any) -> dict[str, Exposure]:
+        """Return light of bins of half the size, spread rays, and smaller parts of lobes and steps in mirrors."""
+        settings = dataclasses.replace(self._settings, paths=paths, **changes)
         limits = {"direct_limits": DirectLimits(lobe_turn=0.5 * DirectLimits.lobe_turn), "mirror_steps": 4.0}
-        light = divided_light(finer.applied(task), self.sample.places, device, 2, spreads_rays=True, **limits)
-        if "multi-bounce" in task.paths:
-            smaller = dataclasses.replace(
-                settings,
-                paths=("direct", "multi-bounce"),
-                nodes=(4 * u, 3 * v),  # the same bins, but other places than in the options
-                patch_size=0.5 * settings.patch_size,
-            )
-            light["multi-bounce"] = self.sample.light(smaller, solvers={}).exposures["multi-bounce"]
-        reading = self.sample.reader.read(light)
-        self.heights, self.is_clear = reading.h, (reading.status & Status.AMBIGUOUS) == 0
+        task = settings.applied(self.sample.task)
+        light = divided_light(task, places, self.sample.device, 2, spreads_rays=True, **limits)
+        return {name: each for name, each in light.items() if name in paths}
 
     def error(self, light: Mapping[str, Exposure], max_moved: float) -> float:
         """Return the root mean square error of heights read from light [m]; infinite if too many are of other lines."""
@@ -264,6 +327,11 @@ class Truth:
         move = abs(readout.axes.position_pitch) * readout.window
         ends = [view.sheet_coordinates(view.points_in_sheet(u + each, v))[1] for each in (-0.5 * move, 0.5 * move)]
         return abs(float(ends[1] - ends[0]))
+
+
+def differ(found: Float64, other: Float64, largest: float) -> npt.NDArray[np.bool_]:
+    """Return which heights differ by more than a limit [m], or are read only once."""
+    return np.asarray((np.isfinite(found) != np.isfinite(other)) | (np.abs(found - other) > largest))
 
 
 if __name__ == "__main__":

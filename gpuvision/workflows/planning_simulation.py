@@ -38,8 +38,8 @@ Progress = Callable[[int, int | None], object]
 # Profiles of a part up to which planning takes longer than it saves, with and without multi-bounce light. Measured on
 # PoCL beside other work: planning without it took the time of 484 to 1067 profiles of the sensor file's light (two
 # sensors, two tolerances). A plan of half of that light's time then saves time from 968 to 2134 profiles on. With it,
-# planning took the time of 115 profiles (one part). That was before settings were tried on up to 48 more profiles: it
-# takes longer now where it does that, which was not measured.
+# planning took the time of 115 profiles (one part). That was before settings, and the errors of the reference, were
+# tried on more profiles: it takes longer now. The limits were not measured again.
 _WORTH_BOUNCES, _WORTH = 120, 2000
 # A setting whose error is undecided is worth more profiles if the fastest certain setting takes this many times its
 # time or more. Chosen: the largest ratio to the best setting that a plan should have, 1.5, less the scatter of times.
@@ -108,8 +108,9 @@ def plan_simulation(
     The noiseless readings of each setting are compared with the readings of a reference on the same profiles. The range
     error is the distance of the readings on the sensor times the derivative dH/du of the height. The reference has the
     finest options, and diffuse light with four times as many rays, which are spread (see `ViewRays`). The error of the
-    reference is added to the error of every setting. It is estimated from the change by the last refinement. The error
-    of its rays per bin is often the largest part; `Combinations.ray_error` estimates it. Estimates add up as squares.
+    reference is added to the error of every setting. It is estimated from the change by the last refinement, on all
+    profiles on which the reference was computed. The error of its rays per bin is often the largest part;
+    `gpuvision.workflows.simulation_reference.SimulationReference` estimates it. Estimates add up as squares.
     That error and the change by the rays of a setting may have the same sign: these two add up linearly. Proven bounds
     add up linearly: the bound of clustered pairs, and the bound of multi-bounce light, which is left out for a PSD if
     this bound in the sample is a tenth of the tolerance or less.
@@ -117,7 +118,8 @@ def plan_simulation(
     The mean square error over the profiles is raised by twice its standard error. Lowered by as much, it is a lower
     limit. A setting is undecided if its lower limit meets the tolerance and its upper limit does not. It is compared
     on more profiles, with all light computed as the simulation does, if the fastest setting that certainly meets the
-    tolerance takes 1.25 times its time or more. The chosen setting is compared on all sampled profiles. A setting that
+    tolerance takes 1.25 times its time or more. The chosen setting is compared on all checked profiles. If no setting
+    certainly meets the tolerance, undecided ones are compared on added profiles before the plan refuses. A setting that
     reads other lines than the reference is not chosen. The fraction of such samples has limits too. Not covered:
     samples that are flagged as ambiguous, light paths that are not in ``paths`` or not modelled, and edges that no
     sampled profile meets.
@@ -160,12 +162,12 @@ def plan_task(
     limit = time_limit(rate, latency, limits.rate_margin, SimulationPlan.unit)  # refuses wrong values before the work
     start = time.perf_counter()
     device = Device.best() if device is None else device
-    sample = ProfileSample.of(task, limits.profiles, device, others=_groups(limits.checked))
+    sample = ProfileSample.of(task, limits.profiles, device, others=_groups(limits))
     tried = Combinations(LightOptions(sample, tolerance, progress), limits.max_moved)
     trials = tried.trials()
     while (closer := _undecided(trials, tried, tolerance, limits, limit)) is not None:
-        found = tried.look_closer(closer)
-        trials = [found if each is closer else each for each in trials]
+        tried.look_closer(closer)
+        trials = tried.trials()
     usable = usable_settings(trials, limits)
     if not usable:
         message = "each setting reads other lines than the finest one; raise SimulationPlanLimits.max_moved"
@@ -188,9 +190,9 @@ def plan_task(
     )
 
 
-def _groups(checked: int) -> tuple[int, int]:
-    """Return the sizes of two groups of other profiles: a quarter is enough to reject most settings."""
-    return checked // 4, checked - checked // 4
+def _groups(limits: SimulationPlanLimits) -> tuple[int, int, int]:
+    """Return the sizes of the groups of other profiles: a quarter of the checked ones rejects most settings."""
+    return limits.checked // 4, limits.checked - limits.checked // 4, limits.added
 
 
 def _undecided(
@@ -203,9 +205,11 @@ def _undecided(
     """Return a setting that more profiles may show to be the one to choose; None if the choice is certain.
 
     A setting is undecided if the lower limits of its error and of the moved samples are small enough, and it was not
-    tried on all profiles. Only the fastest setting whose upper limit meets the tolerance matters, and faster ones.
-    Settings on few profiles come first, and of these the fastest.
+    tried on all checked profiles. Only the fastest setting whose upper limit meets the tolerance matters, and faster
+    ones; without such a setting all undecided ones are tried on the added profiles, which takes long, before the plan
+    refuses. Settings on few profiles come first, and of these the fastest.
     """
+    needed = limits.profiles + limits.checked
     longest = math.inf if limit is None else limit.seconds
     quick = [each for each in trials if each.seconds <= longest]
     certain = [each for each in usable_settings(quick, limits) if limits.margin * each.error <= tolerance]
@@ -215,7 +219,10 @@ def _undecided(
     undecided = [
         each
         for each in quick
-        if limits.margin * each.least <= tolerance and each.least_moved <= limits.max_moved and tried.has_more(each)
+        if limits.margin * each.least <= tolerance
+        and each.least_moved <= limits.max_moved
+        and (fastest is None or each.profiles < needed)
+        and tried.has_more(each)
     ]
     return min(undecided, key=lambda each: (each.profiles, each.seconds), default=None)
 

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 from gpuvision.simulation.sensors.readings import Reading
-from gpuvision.workflows.simulation_errors import ErrorPart, PartEstimate, total_error
+from gpuvision.workflows.simulation_errors import ErrorPart, total_error
 from gpuvision.workflows.simulation_options import LightOptions, Option, light_of_options
 from gpuvision.workflows.simulation_plan import SettingsTrial
+from gpuvision.workflows.simulation_reference import SimulationReference
 from gpuvision.workflows.simulation_sample import Difference, SimulationSettings, join_readings
+
+
+class _Kept(NamedTuple):
+    """Selected combination: time [s], bound of its pairs [m], and change of the readings by its rays [m]."""
+
+    seconds: float
+    pairs: float
+    by_rays: float
 
 
 class Combinations:
@@ -26,19 +36,24 @@ class Combinations:
     def __init__(self, options: LightOptions, max_moved: float) -> None:
         self._max_moved = max_moved
         self._options, self._axes, self._sample = options, options.axes, options.sample
-        finest = [axis[-1] for axis in self._axes]
-        self._estimate = PartEstimate(self._sample, options.settings_of(finest), options.reference())
+        self._reference = SimulationReference(options)
+        self._errors = self._reference.errors()
         # Readings of the sample, and of each group of other profiles that was needed.
-        self._references = [self._estimate.reading]
         self._readings: dict[SimulationSettings, list[Reading]] = {}
-        self._by_rays: dict[SimulationSettings, float] = {}  # part of the change that rays of diffuse light cause
-        self.finest = self._finest_errors()
+        self._kept: dict[SimulationSettings, _Kept] = {}
+        self._select()
+
+    @property
+    def finest(self) -> dict[str, ErrorPart]:
+        """Errors of the reference by parts; upper limits."""
+        return self._errors.most
 
     def trials(self) -> list[SettingsTrial]:
-        """Return the combinations that no usable one beats in time and error, fastest first.
+        """Return the selected combinations, fastest first, by their readings up to now."""
+        return [self.judged(settings) for settings in self._kept]
 
-        They are selected by the errors of their options, and then read.
-        """
+    def _select(self) -> None:
+        """Keep the combinations that no usable one beats in time and error, by the errors of their options."""
         errors = {id(each): found for axis in self._axes for each, found in self._errors_of(axis)}
         rated = []
         for options in self._options.combinations():
@@ -46,47 +61,48 @@ class Combinations:
             error = math.hypot(*(each.error for each in found)) + sum(each.pairs for each in options)
             moved = sum(each.changed for each in found)
             rated.append((self._options.seconds_of(options), error, moved, options))
-        kept, least = [], math.inf
+        least = math.inf
         for _, error, moved, options in sorted(rated, key=lambda each: each[:2]):
             if error < least:
                 by_rays = (errors[id(each)].error for each in options if "nodes" in each.changes)
-                kept.append(self.trial(options, next(by_rays, 0.0)))
+                self.keep(options, next(by_rays, 0.0))
                 least = error if moved <= self._max_moved else least
-        return kept
 
-    def trial(self, options: Sequence[Option], by_rays: float) -> SettingsTrial:
+    def keep(self, options: Sequence[Option], by_rays: float) -> SettingsTrial:
         """Read a combination of options on the sample; the rays of its diffuse light change readings by `by_rays`."""
         settings = self._options.settings_of(options)
-        self._by_rays[settings] = by_rays
+        pairs = sum(each.pairs for each in options)
+        self._kept[settings] = _Kept(self._options.seconds_of(options), pairs, by_rays)
         self._readings[settings] = [self._sample.reader.read(light_of_options(options))]
-        return self._judged(settings, self._options.seconds_of(options), sum(each.pairs for each in options))
+        return self.judged(settings)
 
     def has_more(self, trial: SettingsTrial) -> bool:
         """Return whether there are profiles on which settings were not read."""
         return len(self._readings[trial.settings]) <= len(self._sample.others)
 
-    def look_closer(self, trial: SettingsTrial) -> SettingsTrial:
+    def look_closer(self, trial: SettingsTrial) -> None:
         """Read settings on one more group of profiles, with all light computed as the simulation does.
 
         They are also read on the groups on which other settings were read: the light of the reference is known there.
+        The errors of the reference are estimated on its groups too.
         """
         readings, read = self._readings[trial.settings], self._sample.reader.read
-        groups = self._sample.others
-        if len(self._references) == len(readings):
-            self._references.append(read(self._options.reference_at(groups[len(readings) - 1])))
-        for places in groups[len(readings) - 1 : len(self._references) - 1]:
+        groups, reference = self._sample.others, self._reference
+        if len(reference.readings) == len(readings):
+            reference.read_at(groups[len(readings) - 1])
+            self._errors = reference.errors()
+        for places in groups[len(readings) - 1 : len(reference.readings) - 1]:
             readings.append(read(self._options.compute(trial.settings, places, runs=1).exposures))
-        return self._judged(trial.settings, trial.seconds, trial.pairs)
 
-    def _judged(self, settings: SimulationSettings, seconds: float, pairs: float) -> SettingsTrial:
+    def judged(self, settings: SimulationSettings) -> SettingsTrial:
         """Return the trial of settings: the reference gives the readings to compare with, on the same profiles."""
-        readings = self._readings[settings]
-        found, reference = join_readings(readings), join_readings(self._references[: len(readings)])
+        readings, (seconds, pairs, by_rays) = self._readings[settings], self._kept[settings]
+        found, reference = join_readings(readings), join_readings(self._reference.readings[: len(readings)])
         difference = self._sample.reader.compare(found, reference)
         bound = ErrorPart(pairs, math.nan, is_bound=True)
         error, least = (
-            total_error([*self.finest.values(), ErrorPart(self._added(change, settings), difference.signal), bound])
-            for change in (difference.error, difference.least)
+            total_error([*parts.values(), ErrorPart(_added(change, by_rays, parts), difference.signal), bound])
+            for change, parts in ((difference.error, self._errors.most), (difference.least, self._errors.least))
         )
         return SettingsTrial(
             settings=settings,
@@ -103,53 +119,20 @@ class Combinations:
             profiles=len(found.position),
         )
 
-    def _added(self, change: float, settings: SimulationSettings) -> float:
-        """Return a change such that its square and that of the error of the reference's rays add up to the total.
-
-        The error of the reference's rays may have the sign of the change by rays: these two add up linearly, which
-        happens in parts whose profiles are alike.
-        """
-        rays = self.finest["nodes"].error if "nodes" in self.finest else 0.0
-        return math.sqrt(change**2 + 2.0 * min(change, self._by_rays[settings]) * rays)
-
     def _errors_of(self, axis: Sequence[Option]) -> Iterator[tuple[Option, Difference]]:
         """Yield the change of the reading by each option of an axis, with the reference's light of the others."""
         paths, reader = axis[-1].exposures, self._sample.reader
         others = {name: each for name, each in self._options.reference().items() if name not in paths}
         for each in axis:
             reading = reader.read(others | each.exposures)
-            yield each, reader.compare(reading, self._estimate.reading)
-
-    def _finest_errors(self) -> dict[str, ErrorPart]:
-        """Return the errors of the reference: of first order, the change by the last refinement at most."""
-        found = dict(self._options.proven)
-        for name, part, factor in (
-            ("sub_sheets", "slabs", 1.0),
-            # From a quarter of the rays. Measured on four parts: 0.19 to 0.30 of the change.
-            ("bounce_nodes", "nodes of multi-bounce light", 0.5),
-            ("patch_size", "patches", 1.0),
-        ):
-            light = light_of_options([each for axis in self._axes for each in _last_coarser(axis, name)])
-            if light:
-                found[part] = self._estimate.change(light, factor)
-        if self._options.rays:
-            found["nodes"] = self.ray_error()
-        return found | self._estimate.others()
-
-    def ray_error(self) -> ErrorPart:
-        """Return the error by the reference's rays per bin.
-
-        It is half of the smaller change from the two finest options. Errors of spread rays are independent: then the
-        reference, with four times the rays of the finest option and half of its error (measured: a half to a quarter),
-        has 0.45 of that change. A change from an option is large also if one of its rays lies beside a lit line; so the
-        smaller change counts.
-        """
-        changes = [self._estimate.change({"diffuse-diffuse": each}, 0.5) for each in self._options.rays[-3:-1]]
-        return min(changes)
+            yield each, reader.compare(reading, self._reference.readings[0])
 
 
-def _last_coarser(axis: Sequence[Option], name: str) -> list[Option]:
-    """Return the last option of an axis that differs from the finest one only in the field `name`, if there is any."""
-    finest = axis[-1].changes
-    options = [each for each in axis if not each.pairs and each.changes.keys() == finest.keys()]
-    return [each for each in options if {key for key in finest if each.changes[key] != finest[key]} == {name}][-1:]
+def _added(change: float, by_rays: float, parts: Mapping[str, ErrorPart]) -> float:
+    """Return a change such that its square and that of the error of the reference's rays add up to the total.
+
+    The error of the reference's rays may have the sign of the change by rays: these two add up linearly, which happens
+    in parts whose profiles are alike.
+    """
+    rays = parts["nodes"].error if "nodes" in parts else 0.0
+    return math.sqrt(change**2 + 2.0 * min(change, by_rays) * rays)

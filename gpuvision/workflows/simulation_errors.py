@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 from gpuvision.accuracy.trial import micrometres
 from gpuvision.host import Device
 from gpuvision.sensor.simulated import require_light
-from gpuvision.simulation.sensors.readings import PATHS
+from gpuvision.simulation.sensors.readings import PATHS, Reading
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.simulation.transport.direct import DirectLimits
 from gpuvision.workflows.light_cache import SimulationTask
-from gpuvision.workflows.simulation_sample import Difference, ProfileSample, SimulationSettings, divided_light
+from gpuvision.workflows.simulation_sample import ProfileSample, SimulationSettings, divided_light
 
 PAIRS_BOUND = "bound of pairs left out [m]"
 BOUNCES_BOUND = "bound of multi-bounce left out [m]"
@@ -175,6 +175,21 @@ def scene_paths(task: SimulationTask) -> tuple[str, ...]:
     return tuple(name for name in PATHS if not missing.get(name, False))
 
 
+class Refined(NamedTuple):
+    """Reading of light with a refined discretisation.
+
+    Attributes
+    ----------
+    reading : Reading
+        The reading.
+    factor : float
+        Error of the discretisation over the change of the reading.
+    """
+
+    reading: Reading
+    factor: float
+
+
 class PartEstimate:
     """Errors of the discretisations of sampled light, by the readings with one of them refined.
 
@@ -193,6 +208,10 @@ class PartEstimate:
         self.reading = sample.reader.read(exposures)
         self.changed = 0.0
 
+    def read(self, exposures: Mapping[str, Exposure]) -> Reading:
+        """Read light that replaces or adds paths."""
+        return self.sample.reader.read(self.exposures | dict(exposures))
+
     def change(self, exposures: Mapping[str, Exposure], factor: float = _FIRST_ORDER) -> ErrorPart:
         """Return the change of the reading by light that replaces or adds paths, times a factor.
 
@@ -201,9 +220,7 @@ class PartEstimate:
         ValueError
             Nothing is read.
         """
-        return self._part(
-            self.sample.reader.compare(self.reading, self.sample.reader.read(self.exposures | dict(exposures))), factor
-        )
+        return self._part(Refined(self.read(exposures), factor))
 
     def refined(
         self,
@@ -214,31 +231,40 @@ class PartEstimate:
         **changes: Any,
     ) -> ErrorPart:
         """Return the error of a discretisation, from the light of some paths with a finer one."""
-        settings = replace(self.settings, paths=tuple(dict.fromkeys(("direct", *paths))), **changes)
-        light = self.sample.light(settings, runs=1, **(limits or {})).exposures
-        return self.change({name: light[name] for name in paths if name in light and name in self.exposures}, factor)
+        return self._part(self._refine(paths, factor, limits or {}, **changes))
 
     def others(self) -> dict[str, ErrorPart]:
         """Return the errors of bins and blur, lobes, mirrors and rounding."""
+        return {name: self._part(each) for name, each in self.refine_others().items()}
+
+    def refine_others(self) -> dict[str, Refined]:
+        """Return readings with refined bins and blur, lobes, mirrors and precision of the readout."""
         sample = self.sample
         blurred = replace(self.settings, paths=tuple(each for each in BLURRED if each in self.exposures))
         light = divided_light(blurred.applied(sample.task), sample.places, sample.device, 2)
-        found = {"bins and blur": self.change(light, _SECOND_ORDER)}
+        found = {"bins and blur": Refined(self.read(light), _SECOND_ORDER)}
         if any(each.gloss is not None for each in sample.task.materials):
             finer = {"direct_limits": DirectLimits(lobe_turn=0.5 * DirectLimits.lobe_turn)}
-            found["lobes"] = self.refined(DIRECT, limits=finer)
+            found["lobes"] = self._refine(DIRECT, _FIRST_ORDER, finer)
         if "diffuse-specular" in self.exposures:
-            found["mirrors"] = self.refined(("diffuse-specular",), limits={"mirror_steps": 4.0})
+            found["mirrors"] = self._refine(("diffuse-specular",), _FIRST_ORDER, {"mirror_steps": 4.0})
         if sample.device.has_double:
-            double = sample.reader.read_in_double(self.exposures)
-            found["rounding"] = self._part(sample.reader.compare(self.reading, double), 1.0)
+            found["rounding"] = Refined(sample.reader.read_in_double(self.exposures), 1.0)
         return found
 
-    def _part(self, difference: Difference, factor: float) -> ErrorPart:
+    def _refine(self, paths: tuple[str, ...], factor: float, limits: Mapping[str, Any], **changes: Any) -> Refined:
+        """Return the reading with a finer discretisation of some paths."""
+        settings = replace(self.settings, paths=tuple(dict.fromkeys(("direct", *paths))), **changes)
+        light = self.sample.light(settings, runs=1, **limits).exposures
+        kept = {name: light[name] for name in paths if name in light and name in self.exposures}
+        return Refined(self.read(kept), factor)
+
+    def _part(self, refined: Refined) -> ErrorPart:
+        difference = self.sample.reader.compare(self.reading, refined.reading)
         if not math.isfinite(difference.error):
             raise ValueError(f"nothing is read in {len(self.sample.places)} profiles of the part")
         self.changed = max(self.changed, difference.changed)
-        return ErrorPart(factor * difference.error, factor * difference.signal)
+        return ErrorPart(refined.factor * difference.error, refined.factor * difference.signal)
 
 
 def _words(error: float, *, is_bound: bool) -> str:

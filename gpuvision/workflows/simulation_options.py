@@ -66,16 +66,15 @@ class LightOptions:
         size, which a simulation prepares as well, count only with the largest ones; see `preparation_of`.
     proven : dict of str to ErrorPart
         Errors of paths that are left out by a proven bound.
-    rays : list of Exposure
-        Light of two diffuse reflections for the numbers of rays per bin, ascending. The last is the reference of all
-        others: four times the rays of the finest option, spread (`ViewRays`). Empty without such light.
     """
 
     def __init__(self, sample: ProfileSample, tolerance: float, progress: Progress) -> None:
         self.sample, self.settings = sample, SimulationSettings.of(sample.task)
         self.setups: dict[float, float] = {}
         self.proven: dict[str, ErrorPart] = {}
-        self.rays: list[Exposure] = []
+        # Light of two diffuse reflections of the reference: four times the rays of the finest option, spread
+        # (`ViewRays`). Empty without such light.
+        self._reference_rays: dict[str, Exposure] = {}
         self._finest: list[tuple[SimulationSettings, dict[str, Any]]] = []
         self._paths = [each for each in scene_paths(sample.task) if each in sample.task.paths]
         self._tolerance, self._progress, self._done = tolerance, progress, 0
@@ -86,7 +85,7 @@ class LightOptions:
         # tenth).
         finer = ((2 * u, 2 * v), (2 * u, 4 * v)) if self._has_bounds else ((u, 4 * v), (u, 8 * v))
         self._nodes = ((u, v), (u, 2 * v), *finer)
-        self._reference = (4 * u, 8 * v)
+        self._reference_nodes = (4 * u, 8 * v)
         direct = self._direct()
         self._least = min(each.seconds for each in direct)
         axes = [direct, self._mirrors(), self._diffuse(), self._bounces()]
@@ -100,7 +99,7 @@ class LightOptions:
     def reference(self) -> dict[str, Exposure]:
         """Return the light with which all options are compared: of the finest ones, with more rays of diffuse light."""
         light = light_of_options([axis[-1] for axis in self.axes])
-        return light | ({"diffuse-diffuse": self.rays[-1]} if self.rays else {})
+        return light | self._reference_rays
 
     def reference_at(self, places: npt.NDArray[np.float64]) -> dict[str, Exposure]:
         """Compute the light of the reference on profiles that are not in the sample.
@@ -114,6 +113,21 @@ class LightOptions:
         for settings, more in self._finest:  # the direct light of the first one is the finest
             light = self.compute(settings, places, **{"runs": 1, **more}).exposures | light
         return light
+
+    def light_at(self, option: Option, places: npt.NDArray[np.float64]) -> dict[str, Exposure]:
+        """Compute the light of an option, with all pairs, on profiles that are not in the sample.
+
+        Parameters
+        ----------
+        option : Option
+            Option of an axis.
+        places : numpy.ndarray
+            (profiles,): transports [m].
+        """
+        paths = tuple(dict.fromkeys(("direct", *option.changes["paths"])))
+        settings = replace(self.settings, **{"sub_sheets": 1, "tolerance": 0.0, **option.changes, "paths": paths})
+        light = self.compute(settings, places, runs=1).exposures
+        return {name: light[name] for name in option.exposures}
 
     def compute(
         self, settings: SimulationSettings, places: npt.NDArray[np.float64] | None = None, **more: Any
@@ -177,10 +191,9 @@ class LightOptions:
             exact = self._option(name, light, nodes=nodes)
             self._bound_of_bounces = light.statistics.get(BOUNCES_BOUND, math.inf)
             options += [*self._clustered(light, exact, given), exact]
-            self.rays.append(light.exposures[name])
         paths = ("direct", name)
-        reference = self._light(is_finest=True, is_reference=True, paths=paths, nodes=self._reference)
-        self.rays.append(reference.exposures[name])
+        reference = self._light(is_finest=True, is_reference=True, paths=paths, nodes=self._reference_nodes)
+        self._reference_rays = {name: reference.exposures[name]}
         return options
 
     def _clustered(self, light: SampledLight, exact: Option, given: dict[str, Any]) -> list[Option]:

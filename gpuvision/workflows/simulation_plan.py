@@ -36,17 +36,23 @@ class SimulationPlanLimits(AccuracyLimits):
         Number of other profiles on which the chosen setting is tried, and faster settings that may meet the tolerance,
         1 or more. Default 48: a ray beside a lit line, or a sheet that grazes an edge, makes a large error in few
         profiles. With 4 and with 12 such profiles were missed (true errors of 3.3 and 1.7 tolerances).
+    added : int
+        Number of further profiles on which settings are tried before the plan refuses, if their error is undecided, 0
+        or more. Default 96: twice as many again. Chosen: if few profiles of a large part have a large error, its limits
+        are far apart.
     """
 
     max_moved: float = 0.005
     profiles: int = 6
     checked: int = 48
+    added: int = 96
 
     def __post_init__(self) -> None:
         super().__post_init__()
         finite(self.max_moved, "SimulationPlanLimits.max_moved", minimum=0.0, maximum=1.0)
         integer(self.profiles, "SimulationPlanLimits.profiles", minimum=2)
         integer(self.checked, "SimulationPlanLimits.checked", minimum=1)
+        integer(self.added, "SimulationPlanLimits.added", minimum=0)
 
 
 class SettingsTrial(NamedTuple):

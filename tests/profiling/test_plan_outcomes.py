@@ -18,9 +18,10 @@ from gpuvision.profiling import location_plans, placement_plans, plan_outcomes, 
 from gpuvision.profiling.location_plans import Measured
 from gpuvision.profiling.plan_outcomes import Outcome, cost_of, room_of, summary
 from gpuvision.sensor.sensor import Sensor
+from gpuvision.sensor.simulated import require_light
 from gpuvision.workflows import planning_scan
 from gpuvision.workflows.simulation_options import LightOptions
-from gpuvision.workflows.simulation_sample import SimulationSettings
+from gpuvision.workflows.simulation_sample import ProfileSample, SimulationSettings
 
 
 def plan_of(seconds: float) -> Any:
@@ -599,8 +600,11 @@ def test_outcome_of_a_simulation(
         moved.add(max_moved)
         return SETTINGS[str(light)][2]
 
-    truth = SimpleNamespace(sample=SimpleNamespace(light=light), error=error)
-    job: Any = SimpleNamespace(task=SimpleNamespace(transports=range(120)), tolerance=tolerance, rate=rate)
+    task = SimpleNamespace(transports=range(120))
+    truth = SimpleNamespace(
+        sample=SimpleNamespace(light=light, task=task), error=error, left_out=3, heights=np.zeros((2, 5))
+    )
+    job: Any = SimpleNamespace(task=task, tolerance=tolerance, rate=rate)
     monkeypatch.setattr(simulation_plans, "random_job", lambda rng: job)
     monkeypatch.setattr(simulation_plans, "Truth", lambda job, device: truth)
     monkeypatch.setattr(simulation_plans, "LightOptions", Options)
@@ -614,10 +618,10 @@ def test_outcome_of_a_simulation(
     assert found.room == pytest.approx(room)
     if chosen is None:
         assert found.plan is None
-        assert found.note == "120 profiles; none"
+        assert found.note == "120 profiles; 3 of 10 samples without truth left out; none"
         return
     assert found.plan is not None
-    assert found.note == "120 profiles"
+    assert found.note == "120 profiles; 3 of 10 samples without truth left out"
     assert (found.plan.chosen.settings, found.error, found.keeps_up) == (chosen, SETTINGS[chosen][2], keeps_up)
     assert found.cost == pytest.approx(1.0 if found.possible else math.nan, nan_ok=True)
 
@@ -655,6 +659,58 @@ def test_truth_of_a_third_of_the_profiles_shares_the_preparation_among_all(devic
     options.setups = {1.0: 48.0, 2.0: 24.0}
     settings = SimulationSettings.of(dataclasses.replace(task, paths=("direct", "multi-bounce"), patch_size=1.0))
     assert options.preparation_of(settings) == 3.0  # 72 s of 24 profiles
+
+
+def test_profiles_with_different_heights_are_computed_again(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
+    """Two numbers of rays differ in profile 1 of 3, and with more rays only in its last sample, which is left out."""
+    task = dataclasses.replace(simulation_plans.random_job(np.random.default_rng(1)).task, paths=("direct",))
+    one = np.array([[1.0, 2.0, np.nan], [3.0, 4.0, 5.0], [6.0, 7.0, 8.0]]) * 1e-6
+    other = one + np.array([[0.9, 0.9, 0.0], [1.1, np.nan, 0.9], [0.0, 0.0, 0.0]]) * 1e-6
+    read = list[tuple[list[int], int]]()
+
+    def readings(truth: simulation_plans.Truth, chosen: Any, more: int) -> list[Any]:
+        read.append((chosen.tolist(), more))
+        heights = (one, other) if more == 1 else (one[1:2] + 10e-6, one[1:2] + np.array([10e-6, 10e-6, 12e-6]))
+        return [SimpleNamespace(h=each, status=np.zeros(each.shape, np.uint8)) for each in heights]
+
+    monkeypatch.setattr(simulation_plans.Truth, "_readings", readings)
+    truth = simulation_plans.Truth(simulation_plans.Job(task, task.transports[:3], 1e-6, 0.5), device)
+    assert read == [([0, 1, 2], 1), ([1], 4)]
+    np.testing.assert_array_equal(truth.heights, [one[0], one[1] + 10e-6, one[2]])
+    np.testing.assert_array_equal(truth.is_clear, [[True] * 3, [True, True, False], [True] * 3])
+    assert truth.left_out == 1
+
+
+def test_truth_has_more_rays_than_the_reference_of_a_plan(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
+    """With one ray per bin in the sensor file: spread, in two halves of each bin, and again with four times as many."""
+    drawn = (simulation_plans.random_job(np.random.default_rng((1, number))) for number in range(24))
+    job = next(each for each in drawn if "multi-bounce" in each.task.paths)
+    used, whole, halved = list[tuple[str, tuple[int, int]]](), ProfileSample.light, simulation_plans.divided_light
+
+    def light(sample: ProfileSample, settings: SimulationSettings, *more: Any, **changes: Any) -> Any:
+        used.append((settings.paths[-1], settings.nodes))
+        return whole(sample, dataclasses.replace(settings, nodes=(1, 1)), *more, **changes)
+
+    def divided(task: Any, places: Any, *more: Any, **changes: Any) -> Any:
+        assert changes["spreads_rays"]
+        used.append((task.paths[-1], require_light(task.sensor).nodes))
+        light = dataclasses.replace(require_light(task.sensor), nodes=(1, 1))
+        return halved(
+            dataclasses.replace(task, sensor=dataclasses.replace(task.sensor, light=light)), places, *more, **changes
+        )
+
+    monkeypatch.setattr(ProfileSample, "light", light)
+    monkeypatch.setattr(simulation_plans, "divided_light", divided)
+    monkeypatch.setattr(simulation_plans, "differ", lambda one, other, largest: np.ones(one.shape, bool))
+    simulation_plans.Truth(job._replace(places=job.places[:1]), device)
+    nodes = require_light(job.task.sensor).nodes
+    assert nodes == (1, 1)
+    assert [each for each in used if each[0] == "diffuse-diffuse"] == [
+        ("diffuse-diffuse", each) for each in ((2, 16), (2, 12), (2, 64), (2, 48))
+    ]
+    assert [each for each in used if each[0] == "multi-bounce"] == [
+        ("multi-bounce", each) for each in ((4, 3), (3, 4), (4, 12), (3, 16))
+    ]
 
 
 class _Name(str):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from typing import Any, ClassVar
@@ -27,6 +28,7 @@ from gpuvision.workflows.simulating import prepare_simulation, simulate
 from gpuvision.workflows.simulation_errors import ErrorPart, SimulationErrors, estimate_errors, total_error
 from gpuvision.workflows.simulation_options import LightOptions
 from gpuvision.workflows.simulation_plan import SettingsTrial, SimulationPlan, SimulationPlanLimits, usable_settings
+from gpuvision.workflows.simulation_reference import SimulationReference
 from gpuvision.workflows.simulation_sample import ProfileSample, SampledLight, SampleReader, SimulationSettings
 
 MM = 1e-3
@@ -112,7 +114,9 @@ def test_the_true_error_of_each_setting_is_at_most_the_predicted_one(monkeypatch
     sample = ProfileSample.of(task, 3, device, others=(6,))
     tried = Combinations(LightOptions(sample, 1.0, lambda done, of: None), FEW.max_moved)
     trials = tried.trials()
-    usable = [tried.look_closer(each) for each in usable_settings(trials, FEW)]  # others read other lines
+    for each in usable_settings(trials, FEW):  # others read other lines
+        tried.look_closer(each)
+    usable = [each for each in tried.trials() if each.profiles == 9]
     assert len(usable) > 2
     for each in usable:
         found = heights_of(each.settings.applied(task), device, places)
@@ -167,6 +171,7 @@ class Looks:
 
     def __init__(self, seconds: float, errors: dict[int, list[tuple[float, float]]], moved: float = 0.0) -> None:
         self.seconds, self.errors, self.moved, self.looks = {1: 1.0, 2: seconds}, errors, moved, list[int]()
+        self.profiles, self.most = {1: 1, 2: 1}, 3
 
     def _trial(self, number: int, profiles: int) -> SettingsTrial:
         error, least = self.errors[number][profiles - 1]
@@ -177,14 +182,14 @@ class Looks:
         )
 
     def trials(self) -> list[SettingsTrial]:
-        return [self._trial(number, 1) for number in (1, 2)]
+        return [self._trial(number, profiles) for number, profiles in self.profiles.items()]
 
     def has_more(self, trial: SettingsTrial) -> bool:
-        return trial.profiles < 3
+        return trial.profiles < self.most
 
-    def look_closer(self, trial: SettingsTrial) -> SettingsTrial:
+    def look_closer(self, trial: SettingsTrial) -> None:
         self.looks.append(trial.settings.sub_sheets)
-        return self._trial(trial.settings.sub_sheets, trial.profiles + 1)
+        self.profiles[trial.settings.sub_sheets] += 1
 
 
 UNDECIDED, MET, MISSED = (
@@ -231,6 +236,30 @@ def test_undecided_settings_are_tried_on_more_profiles(
     assert tried.looks == looks
 
 
+@pytest.mark.parametrize(
+    ("one", "other", "looks"),
+    [
+        (MET, MISSED, [1]),
+        (MISSED, MISSED, [1]),
+        (UNDECIDED, MISSED, [1, 1]),
+        (UNDECIDED, MET, [1, 2]),
+        (UNDECIDED, UNDECIDED, [1, 2, 1]),
+    ],
+)
+def test_added_profiles_are_for_undecided_settings_before_a_refusal(
+    monkeypatch: pytest.MonkeyPatch, one: tuple[float, float], other: tuple[float, float], looks: list[int]
+) -> None:
+    """Of four profiles the last one is an added one, on which setting 1 meets the tolerance."""
+    tried = Looks(4.0, {1: [UNDECIDED, UNDECIDED, one, MET], 2: [other] * 3})
+    tried.profiles, tried.most = {1: 2, 2: 2}, 4
+    monkeypatch.setattr(planning_simulation, "LightOptions", lambda *_: None)
+    monkeypatch.setattr(planning_simulation, "Combinations", lambda *_: tried)
+    limits = SimulationPlanLimits(profiles=2, checked=1)
+    with contextlib.suppress(PlanError):
+        plan_task(task_of(), tolerance=10.0, limits=limits)
+    assert tried.looks == looks
+
+
 def test_settings_that_are_too_slow_are_not_tried_on_more_profiles(monkeypatch: pytest.MonkeyPatch) -> None:
     """The slow one meets the tolerance; the fast one may, and keeps up with the rate."""
     tried = Looks(4.0, {1: [UNDECIDED, UNDECIDED, MET], 2: [MET]})
@@ -247,24 +276,30 @@ def test_more_profiles_are_compared_together_with_the_sample() -> None:
     options = LightOptions(sample, 1e-9, lambda done, of: None)
     combinations = Combinations(options, 1.0)
     # The only difference from the reference is that of the rays.
-    given = combinations.trial([axis[-1] for axis in options.axes], math.inf)
-    rays = combinations.finest["nodes"].error
-    assert rays > 0.0
-    found, places = given, sample.places
+    found = combinations.keep([axis[-1] for axis in options.axes], math.inf)
+    settings, places = found.settings, sample.places
     for group in sample.others:
         assert combinations.has_more(found)
-        found, places = combinations.look_closer(found), np.append(places, group)
+        combinations.look_closer(found)
+        found, places = combinations.judged(settings), np.append(places, group)
         one, finest = (
             sample.reader.read(light)
-            for light in (sample.light(given.settings, places).exposures, options.reference_at(places))
+            for light in (sample.light(settings, places).exposures, options.reference_at(places))
         )
         expected = sample.reader.compare(one, finest)
         assert found.profiles == len(places)
         assert found.change == pytest.approx(expected.error, rel=1e-3)
-        for error, change in ((found.error, expected.error), (found.least, expected.least)):
-            assert error == pytest.approx(math.sqrt(found.finest**2 + change**2 + 2.0 * change * rays), rel=1e-3)
+        # The errors of the reference are those of a sample of all these profiles.
+        alone = LightOptions(dataclasses.replace(sample, places=places, others=()), 1e-9, lambda done, of: None)
+        errors = SimulationReference(alone).errors()
+        assert found.finest == pytest.approx(total_error(errors.most.values()), rel=1e-3)
+        limits = (found.error, expected.error, errors.most), (found.least, expected.least, errors.least)
+        for error, change, parts in limits:
+            rays, finest = parts["nodes"].error, total_error(parts.values())
+            assert error == pytest.approx(math.sqrt(finest**2 + change**2 + 2.0 * change * rays), rel=1e-3)
     assert not combinations.has_more(found)
     assert expected.least < expected.error
+    assert 0.0 < errors.least["nodes"].error < errors.most["nodes"].error
 
 
 def test_the_plan_of_a_job_simulates(tmp_path: Any) -> None:
@@ -356,17 +391,17 @@ def test_times_of_a_combination_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_progress_counts_the_light_on_more_profiles() -> None:
-    """The light of the setting, and the direct and the diffuse light of the reference."""
+    """The light of the setting; of the reference, direct and diffuse light; coarser slabs, and two numbers of rays."""
     done = list[tuple[int, int | None]]()
     sample = ProfileSample.of(task_of(), 1, Device.best(), others=(1,))
     options = LightOptions(sample, 1.0, lambda *each: done.append(each))
     tried = Combinations(options, FEW.max_moved)
     first = len(done)
     assert done == [(count, None) for count in range(1, first + 1)]
-    trial = tried.trial([axis[-1] for axis in options.axes], 0.0)
+    trial = tried.keep([axis[-1] for axis in options.axes], 0.0)
     assert len(done) == first
     tried.look_closer(trial)
-    assert done[first:] == [(first + count, None) for count in (1, 2, 3)]
+    assert done[first:] == [(first + count, None) for count in range(1, 7)]
 
 
 def test_the_reference_has_the_finest_options_with_more_rays_of_diffuse_light() -> None:
@@ -389,17 +424,17 @@ def test_the_reference_has_the_finest_options_with_more_rays_of_diffuse_light() 
             np.testing.assert_allclose(light[name].moment, each.moment, rtol=1e-4, atol=1e-5 * abs(each.moment).max())
 
 
-def test_the_error_of_rays_is_half_of_the_smaller_change_from_the_two_finest_options() -> None:
-    """Without the coarser options."""
+def test_the_error_of_rays_is_half_of_the_mean_change_from_the_two_finest_options() -> None:
+    """Root mean square of both changes, without the coarser options."""
     sample = ProfileSample.of(task_of(), 2, Device.best())
     options = LightOptions(sample, 1e-6, lambda done, of: None)
-    combinations, reader, light = Combinations(options, 0.005), sample.reader, options.reference()
-    few, many = options.rays[0], options.rays[-1]
-    change = reader.compare(reader.read(light | {"diffuse-diffuse": few}), reader.read(light)).error
+    reader, light, name = sample.reader, options.reference(), "diffuse-diffuse"
+    few, many = options.axes[1][1], options.axes[1][-1]._replace(exposures={name: light[name]})
+    change = reader.compare(reader.read(light), reader.read(light | few.exposures)).error
     assert change > 1e-6
-    for rays, expected in (((few, few, many), 0.5 * change), ((few, many, many), 0.0), ((many, few, many), 0.0)):
-        options.rays[:] = [few, few, *rays]
-        assert combinations.ray_error().error == pytest.approx(expected, rel=1e-3)  # slopes at either reading
+    for rays, expected in (((few, few), 0.5 * change), ((few, many), math.sqrt(0.125) * change)):
+        options.axes[1][1:] = [few, few, *rays]
+        assert SimulationReference(options).errors().most["nodes"].error == pytest.approx(expected, rel=1e-3)
 
 
 def test_rays_of_a_camera_are_doubled_along_v() -> None:
@@ -410,7 +445,8 @@ def test_rays_of_a_camera_are_doubled_along_v() -> None:
     nodes = [each.changes["nodes"] for each in options.axes[1][1:]]
     assert nodes == [(1, 1), (1, 2), (1, 4), (1, 8)]
     settings = SimulationSettings.of(task)
-    for rays, light, more in ((nodes[2], options.rays[2], {}), ((4, 8), options.rays[-1], {"spreads_rays": True})):
+    third, finest = (each["diffuse-diffuse"] for each in (options.axes[1][3].exposures, options.reference()))
+    for rays, light, more in ((nodes[2], third, {}), ((4, 8), finest, {"spreads_rays": True})):
         expected = sample.light(dataclasses.replace(settings, nodes=rays), **more).exposures["diffuse-diffuse"]
         np.testing.assert_allclose(light.power, expected.power, rtol=1e-5, atol=1e-6 * expected.power.max())
 

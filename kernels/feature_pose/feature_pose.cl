@@ -91,7 +91,8 @@ kernel void feature_pose(global const WIDE *restrict expected, global const real
                          const int steps, const real min_scale, const real rank_tolerance,
                          const real min_inlier_fraction, const real max_leverage, const real max_shift,
                          const real max_turn, const real etch_certainty, const real ruler_sigma_px,
-                         const real matched_sigma_px, const real drilled_sigma_px, const real tolerance) {
+                         const real matched_sigma_px, const real drilled_sigma_px, const real tolerance,
+                         const real min_share, const real max_residual) {
     if (get_global_id(0)) return;
     const int count = ruler_count + 2 * (matched_count + drilled_count);
     real numbers[POSE_COLUMNS][CAPACITY];
@@ -135,7 +136,9 @@ kernel void feature_pose(global const WIDE *restrict expected, global const real
     const real factor = fit.covariance_factor;
     if (factor < 1) fit.covariance_factor = 1;
 #endif
-    store_pose(&fit, rows, centred, is_pose_finite, 0, count, limits, at_x, at_y, outputs);
+    const int is_other = is_another_board(&fit, rows, centred.size, ruler_count, matched_count + drilled_count,
+                                          feature_status, room, min_share, max_residual);
+    store_pose(&fit, rows, centred, is_pose_finite, is_other, 0, count, limits, at_x, at_y, outputs);
 #ifdef GIVEN_SCALE
     const real smallest = 1;
 #else

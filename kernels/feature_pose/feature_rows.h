@@ -144,6 +144,25 @@ static inline uchar put_fiducial(pose_rows rows, int row, FeatureFiducial from, 
     return blob.status | (is_wrong ? STATUS_AMBIGUOUS : 0);
 }
 
+// Return whether the features show another board, or none: fewer than a share of the rows in the image are inliers, or
+// the scale of the residuals, times the median sigma of the rows, is above a limit [m].
+//
+// Features outside the image do not count. `size` is the unit of the rows [m]; `distances` is overwritten.
+static inline int is_another_board(private const solved_pose *fit, pose_rows rows, real size, int ruler_count,
+                                   int fiducial_count, global const uchar *status, pose_room room, real min_share,
+                                   real max_residual) {
+    int in_image = 0;
+    for (int i = 0; i < ruler_count + fiducial_count; i++)
+        in_image += status[i] & STATUS_OUT_OF_RANGE ? 0 : i < ruler_count ? 1 : 2;
+    private real *sigmas = (private real *)room.distances;
+    for (int i = 0; i < rows.count; i += LANES) {
+        const reals certainty = row_of(rows, i).certainty;
+        *(private reals_at *)(sigmas + i) = certainty > (reals)0 ? (reals)1 / certainty : (reals)INFINITY;
+    }
+    const real sigma = group_ranked(sigmas, rows.count, fit->present / 2 + 1, BITS_TO_ONE_PERCENT, room.sums);
+    return fit->inliers < min_share * in_image || fit->scale * sigma * size > max_residual;
+}
+
 // Change a motion of the board and its covariance into the pose of the camera and its covariance, in place.
 //
 // The rows give the board's motion q = R p + t as the expected camera at c sees it; the camera is then at

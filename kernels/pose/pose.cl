@@ -67,5 +67,5 @@ kernel void pose_sets(global const PoseRow *restrict rows,
                                   scale,  residual_scale,      condition, rank,       inliers,   status,     etch,
                                   inlier_fraction, leverage};
     const pose_limits limits = {min_inlier_fraction, max_leverage, max_shift, max_turn};
-    store_pose(&fit, all, frame, all_finite, item, count, limits, place_x, place_y, outputs);
+    store_pose(&fit, all, frame, all_finite, 0, item, count, limits, place_x, place_y, outputs);
 }

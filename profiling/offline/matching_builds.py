@@ -123,6 +123,8 @@ def _feature_poses() -> Iterator[Example]:
         "matched_sigma_px": 0.003,
         "drilled_sigma_px": 0.02,
         "size_tolerance": 0.2,
+        "min_share": 0.5,
+        "max_residual_px": 0.5,
     }
     for name, features in sets.items():
         yield Example(f"place, {name}", PlaceFeatures(features=features), (3,), np.float64)

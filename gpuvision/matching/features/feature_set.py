@@ -170,6 +170,8 @@ class FeatureSet:
         search_px: float | None = None,
         model: Lens | Camera | None = None,
         solver: SolvePose | None = None,
+        min_share: float = EstimateFeaturePose.min_share,
+        max_residual_px: float = EstimateFeaturePose.max_residual_px,
         queue: Any = None,
     ) -> BoundFeatures:
         """Bind the features to a device and a frame size: ``bound(frame, predicted_pose) -> FeaturePose``.
@@ -208,6 +210,12 @@ class FeatureSet:
         solver : SolvePose, optional
             None: Tukey's loss with the scale from the residuals, 64 start candidates, an unknown etch bias where there
             are single edges, and twice the search range as limit.
+        min_share : float
+            Least share of the features in the image, a fiducial counted twice, that must agree with the pose, 0 to 1:
+            with fewer another pose could gather as many, and the status is AMBIGUOUS. Default 0.5.
+        max_residual_px : float
+            Largest accepted scale of the residuals [px], above 0: more is another board or a wrong scale, and the
+            status is AMBIGUOUS. Default 0.5 (chosen).
         queue : pyopencl.CommandQueue, optional
             Queue to run in; see `BoundFeatures`.
 
@@ -254,6 +262,8 @@ class FeatureSet:
             matched_sigma_px=limits.matched_sigma_px,
             drilled_sigma_px=limits.edges_sigma_px,
             size_tolerance=limits.size_tolerance_px * scale + limits.size_sigmas * etch,
+            min_share=min_share,
+            max_residual_px=max_residual_px,
         )
         return BoundFeatures(operation, Device.best() if device is None else device, shape, dtype, queue)
 

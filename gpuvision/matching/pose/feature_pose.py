@@ -67,6 +67,7 @@ class FeaturePose(NamedTuple):
         without double precision.
     status : uint16
         `Status` flags, as in `BoardPose`: NO_DATA, AMBIGUOUS, OUT_OF_RANGE, NOT_FINITE, NOT_CONVERGED (with a pose).
+        AMBIGUOUS also where too few features in the image agree, or too badly (`SolveFeatures`).
     residuals, weights : float32, (rows,)
         Residual along the normal in the artwork [m], and weight in the pose, 0 to 1: of each ruler, then of the two
         principal axes of each fiducial.
@@ -261,6 +262,10 @@ class SolveFeatures(VisionOperation[FeaturePose]):
         Standard deviations that are added to the predicted ones of each kind [px].
     size_tolerance : float
         Largest difference between the measured and the drawn radius of a fiducial [m].
+    min_share : float
+        Least share of the rows in the image that must be inliers: fewer are another board.
+    max_residual_px : float
+        Largest accepted scale of the residuals [px]: more is another board or a wrong scale.
     """
 
     Result: ClassVar[type[Any]] = FeaturePose
@@ -271,6 +276,8 @@ class SolveFeatures(VisionOperation[FeaturePose]):
     matched_sigma_px: float
     drilled_sigma_px: float
     size_tolerance: float
+    min_share: float
+    max_residual_px: float
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -293,6 +300,7 @@ class SolveFeatures(VisionOperation[FeaturePose]):
         types |= {"rank": np.int32, "inliers": np.int32}
         sigmas = (self.ruler_sigma_px, self.matched_sigma_px, self.drilled_sigma_px)
         limits = (solver.min_scale, *solver.limits(real), solver.etch_bias_certainty, *sigmas, self.size_tolerance)
+        limits += (self.min_share, self.max_residual_px * of.pixel_size)
         return build.launch(
             "feature_pose/feature_pose.cl",
             "feature_pose",
@@ -335,6 +343,9 @@ class EstimateFeaturePose(OperationSequence[FeaturePose]):
         As in `SolveFeatures`.
     ruler_sigma_px, matched_sigma_px, drilled_sigma_px, size_tolerance : float
         As in `SolveFeatures`.
+    min_share, max_residual_px : float
+        As in `SolveFeatures`. Defaults 0.5, a majority (with fewer, another pose could gather as many), and 0.5 px
+        (chosen).
 
     Raises
     ------
@@ -365,9 +376,13 @@ class EstimateFeaturePose(OperationSequence[FeaturePose]):
     matched_sigma_px: float = 0.0
     drilled_sigma_px: float = 0.0
     size_tolerance: float = math.inf
+    min_share: float = 0.5
+    max_residual_px: float = 0.5
 
     def __post_init__(self) -> None:
         solver = self.solver
+        finite(self.min_share, "EstimateFeaturePose.min_share", minimum=0.0, maximum=1.0)
+        finite(self.max_residual_px, "EstimateFeaturePose.max_residual_px [px]", above=0.0)
         if solver.transform != "rigid" or solver.precision == "double" or solver.with_initial_pose:
             raise ValueError(
                 "EstimateFeaturePose.solver: expected a rigid transform, single precision, and no initial pose"
@@ -396,6 +411,8 @@ class EstimateFeaturePose(OperationSequence[FeaturePose]):
             matched_sigma_px=self.matched_sigma_px,
             drilled_sigma_px=self.drilled_sigma_px,
             size_tolerance=self.size_tolerance,
+            min_share=self.min_share,
+            max_residual_px=self.max_residual_px,
         )
         stages.append(Stage("solve", solve, ("pose", "corner", *measured)))
         return Layout(inputs, stages, {name: f"solve.{name}" for name in FeaturePose._fields})

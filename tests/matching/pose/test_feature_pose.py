@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,18 @@ from gpuvision.matching.pose.feature_pose import CameraFeatures, EstimateFeature
 from gpuvision.matching.pose.pose import SolvePose, line_rows
 from gpuvision.reference import robust
 from gpuvision.status import Status
-from round_boards import NOISE, PIXEL, SHAPE, TRACES, moved_picture, round_artwork, round_board, round_picture
+from round_boards import (
+    FIDUCIALS,
+    LANDS,
+    NOISE,
+    PIXEL,
+    SHAPE,
+    TRACES,
+    moved_picture,
+    round_artwork,
+    round_board,
+    round_picture,
+)
 
 NEAR = np.array([*BOARD_MIDDLE, 0.0])
 BLUR, THRESHOLD = 1.04, 12.0
@@ -327,6 +339,8 @@ def test_a_radius_at_the_tolerance_is_the_fiducials(features: FeatureSet, device
         ruler_sigma_px=0.0,
         matched_sigma_px=0.0,
         drilled_sigma_px=0.0,
+        min_share=0.0,
+        max_residual_px=1.0,
     )
     pose = np.zeros(3, np.float64 if device.has_double else np.float32)
     covariance = np.broadcast_to(np.float32(1e-4) * np.eye(3, dtype=np.float32), (count, 3, 3)).copy()
@@ -336,7 +350,7 @@ def test_a_radius_at_the_tolerance_is_the_fiducials(features: FeatureSet, device
 
 
 def test_nothing_is_added_to_the_predicted_sigmas_by_default() -> None:
-    """Any radius of a fiducial is taken, and the solver is the default one."""
+    """Any radius of a fiducial is taken, and the solver and its limits are the default ones."""
     features = CameraFeatures(
         rulers=((0.0, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0),) * 3,
         matched=(),
@@ -355,7 +369,85 @@ def test_nothing_is_added_to_the_predicted_sigmas_by_default() -> None:
         matched_sigma_px=0.0,
         drilled_sigma_px=0.0,
         size_tolerance=math.inf,
+        min_share=0.5,
+        max_residual_px=0.5,
     )
+
+
+def solved(position: np.ndarray, sigma: np.ndarray, status: np.ndarray, device: Device, **limits: float) -> Any:
+    """Return the pose from positions and sigmas [px] of rulers on a circle of 1 mm, and two fiducials that agree."""
+    count, pixel = len(position), 1e-5
+    angle = 2 * np.pi * np.arange(count) / count
+    c, s = np.cos(angle), np.sin(angle)
+    none, one = np.zeros(count), np.ones(count)
+    rulers = np.column_stack([1e-3 * (c - s), 1e-3 * (s + c), c, s, one, none, none, none])
+    operation = SolveFeatures(
+        features=CameraFeatures(
+            rulers=tuple(map(tuple, rulers)),
+            matched=((1e-3, 0.0, 1e-4), (-1e-3, 0.0, 1e-4)),
+            drilled=(),
+            placement=(0.0, 0.0),
+            pixel_size=pixel,
+            frame_shape=SHAPE,
+        ),
+        solver=SolvePose(scale=None, min_scale=1.0),
+        size_tolerance=pixel,
+        ruler_sigma_px=0.0,
+        matched_sigma_px=0.0,
+        drilled_sigma_px=0.0,
+        **{"min_share": 0.0, "max_residual_px": 100.0} | limits,
+    )
+    covariance = np.broadcast_to(np.float32(1e-2) * np.eye(3, dtype=np.float32), (2, 3, 3)).copy()
+    blobs = (np.zeros((2, 2), np.float32), np.full(2, 10.0, np.float32), covariance, np.zeros(2, np.uint8))
+    edges = (position.astype(np.float32), sigma.astype(np.float32), status, np.zeros((count, 7), np.float32))
+    pose = np.zeros(3, np.float64 if device.has_double else np.float32)
+    places = np.zeros((2, 3), np.float32)
+    return operation(pose, np.zeros(2, np.float32), *edges, *blobs, places, device=device)
+
+
+def test_a_share_of_the_features_in_the_image_must_agree(device: Device) -> None:
+    """12 rulers, 3 outside the image, 4 without an edge: 5 of 9 agree, with the fiducials 9 of 13 rows."""
+    position, status = np.zeros(12), np.zeros(12, np.uint8)
+    status[[0, 4, 8]], status[[1, 2, 5, 6]] = Status.OUT_OF_RANGE, Status.LOW_SIGNAL
+    position[status > 0] = np.nan
+    sigma = np.where(status > 0, np.nan, 0.1)
+    found = solved(position, sigma, status, device, min_share=9 / 13 - 1e-6)
+    assert found.status == Status.OK
+    assert found.inliers == 9
+    refused = solved(position, sigma, status, device, min_share=9 / 13 + 1e-6)
+    assert refused.status == Status.AMBIGUOUS
+    assert np.isnan(refused.pose).all()
+    assert np.isnan(refused.covariance).all()
+    assert np.isnan(refused.residuals).all()
+
+
+def test_residuals_must_be_below_a_limit(device: Device) -> None:
+    """The limit is compared with the scale times the median sigma of the rows, found to 1 %."""
+    rng = np.random.default_rng(4)
+    sigma = rng.uniform(0.05, 0.3, 61)
+    position, status = rng.normal(0.0, 3 * sigma), np.zeros(61, np.uint8)
+    found = solved(position, sigma, status, device)
+    assert found.scale > 2.0
+    residual_px = found.scale * np.median(np.concatenate([sigma, np.full(4, 0.1)]))
+    assert solved(position, sigma, status, device, max_residual_px=1.02 * residual_px).status == Status.OK
+    refused = solved(position, sigma, status, device, max_residual_px=0.98 * residual_px)
+    assert refused.status == Status.AMBIGUOUS
+    assert np.isnan(refused.pose).all()
+
+
+def test_other_boards_are_refused(features: FeatureSet, tmp_path: Path, device: Device) -> None:
+    """Boards whose pads and fiducials lie up to 0.4 mm from the places of the features."""
+    bound, accepted, rng = bind(features, device), 0, np.random.default_rng(11)
+    for number in range(6):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        pads, fiducials = (np.array(each) + rng.uniform(-0.4, 0.4, (len(each), 2)) for each in (LANDS, FIDUCIALS))
+        ends = np.array(TRACES) + rng.uniform(-0.4, 0.4, (len(TRACES), 4))
+        picture = round_picture(round_artwork(round_board(folder, pads=pads, fiducials=fiducials, traces=ends)))
+        for _ in range(4):
+            found = bound(moved_picture(picture, rng)[0], NEAR)
+            accepted += int(found.status) == 0
+    assert accepted == 0
 
 
 @pytest.mark.parametrize("count", [3, 8])

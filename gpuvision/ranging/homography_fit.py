@@ -288,6 +288,7 @@ def _fit_model(data: _Calibration, model: Model, frame: Float64, rank_tolerance:
     excess = len(x) * len(rows) - len(elements)
     if excess < 0:
         raise DegenerateError(f"{len(x)} points are too few for the model {model}; measure more")
+    _check_places(points, free, rows, model, rank_tolerance)
     start = _direct_linear(x, points, free, rows, model, rank_tolerance)
     problem = _ModelProblem(x, points, elements, rows, _whitening(data.sigma_factor, to_sensor, model))
     matrix, squares, slopes = problem.minimise(start)
@@ -316,6 +317,24 @@ def _conditioning(points: Float64, fixed: tuple[float | None, float | None]) -> 
     return shift_and_scale(origin, np.where(unit > 0.0, unit, 1.0))
 
 
+def _check_places(
+    points: Float64, free: npt.NDArray[np.bool_], rows: tuple[int, ...], model: Model, rank_tolerance: float
+) -> None:
+    """Check that the places on the sheet alone determine a model: noise of repeated readings adds false rank.
+
+    The rank of the equations for exact readings is the same for all homographies N of a model: the quotients of two of
+    them are closed under products. The simplest member of every model swaps G and H.
+    """
+    values, _ = _singular_vectors(points[:, 1::-1], points, free, rows)
+    needed = np.count_nonzero(free) - 1
+    if values[needed - 1] <= rank_tolerance * values[0]:
+        # C3 reads H only.
+        count = len(np.unique(points[:, 1:] if model == "C3" else points, axis=0))
+        least = -(-needed // len(rows))
+        reason = f"which needs {least} or more" if count < least else "as too many of them lie on one line"
+        raise DegenerateError(f"{count} places on the sheet do not fix the model {model}, {reason}")
+
+
 def _direct_linear(
     x: Float64,
     points: Float64,
@@ -325,6 +344,20 @@ def _direct_linear(
     rank_tolerance: float,
 ) -> Float64:
     """Return N (sheet to sensor) from the right singular vector of the smallest singular value (algebraic error)."""
+    values, vectors = _singular_vectors(x, points, free, rows)
+    if values[np.count_nonzero(free) - 2] <= rank_tolerance * values[0]:
+        raise DegenerateError(f"the points do not fix the model {model}; spread them over the sheet")
+    matrix = np.zeros((3, 3))
+    matrix[free] = vectors[-1]
+    if abs(matrix[2, 2]) <= rank_tolerance:
+        raise DegenerateError(_BOTH_SIDES_MESSAGE)
+    return np.asarray(matrix / matrix[2, 2])
+
+
+def _singular_vectors(
+    x: Float64, points: Float64, free: npt.NDArray[np.bool_], rows: tuple[int, ...]
+) -> tuple[Float64, Float64]:
+    """Return the singular values and right singular vectors of the linear equations for the free elements of N."""
     blocks = []
     for row in rows:
         equations = np.zeros((len(points), 3, 3))
@@ -334,13 +367,7 @@ def _direct_linear(
     # With one equation fewer than elements, a row of zeros makes the decomposition also return the null vector.
     blocks.append(np.zeros((1, np.count_nonzero(free))))
     _, values, vectors = np.linalg.svd(np.concatenate(blocks), full_matrices=False)
-    if values[np.count_nonzero(free) - 2] <= rank_tolerance * values[0]:
-        raise DegenerateError(f"the points do not fix the model {model}; spread them over the sheet")
-    matrix = np.zeros((3, 3))
-    matrix[free] = vectors[-1]
-    if abs(matrix[2, 2]) <= rank_tolerance:
-        raise DegenerateError(_BOTH_SIDES_MESSAGE)
-    return np.asarray(matrix / matrix[2, 2])
+    return values, vectors
 
 
 def _invert_model(

@@ -315,6 +315,38 @@ def test_points_that_do_not_fix_a_model(points: np.ndarray, options: dict[str, A
         Triangulation.fit(psd().to_sensor(points), points, **options)
 
 
+@pytest.mark.parametrize(
+    ("places", "model", "message"),
+    [
+        ([0, 8, -9], "H8", "3 places on the sheet do not fix the model H8, which needs 4 or more"),
+        ([0, 1, 2, -9], "H8", "4 places on the sheet do not fix the model H8, as too many of them lie on one line"),
+        ([0, 8], "D6", "2 places on the sheet do not fix the model D6, which needs 3 or more"),
+        ([0, 8], "C3", r"[12] places on the sheet do not fix the model C3, which needs 3 or more"),
+    ],
+)
+def test_repeated_readings_do_not_replace_places(
+    places: list[int], model: Any, message: str, rng: np.random.Generator
+) -> None:
+    """Noise gives the equations of repeated readings full rank; their solution has no meaning."""
+    points = np.repeat(SHEET[places], 5, axis=0)
+    for _ in range(20):
+        seen = rolled(psd().to_sensor(points)) + rng.normal(0.0, SIGMA, points.shape)
+        with pytest.raises(ValueError, match=f"^{message}$"):
+            Triangulation.fit(seen, points, model=model)
+        assert model != "H8" or Triangulation.fit(seen, points).model != "H8"
+
+
+@pytest.mark.parametrize(("count", "model"), [(2, "C4"), (3, "D6"), (4, "H8")])
+def test_least_number_of_places(count: int, model: Any, rng: np.random.Generator) -> None:
+    """Oracle: with as many equations as parameters the fit meets the mean readings at the places."""
+    corners = SHEET[{2: [0, -1], 3: [0, 31, -9], 4: [0, 8, -9, -1]}[count]]
+    points = np.repeat(corners, 5, axis=0)
+    seen = CASES[model](psd().to_sensor(points)) + rng.normal(0.0, SIGMA, points.shape)
+    fitted = Triangulation.fit(seen, points, model=model)
+    means = seen.reshape(count, 5, 2).mean(axis=1)
+    np.testing.assert_allclose(fitted.to_sensor(corners), means, rtol=0, atol=1e-3 * SIGMA)
+
+
 def test_points_behind_the_horizon_are_refused() -> None:
     matrix = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 0.0, 1.0]])
     seen = np.stack(np.meshgrid([-1.0, 0.0, 0.5, 2.0, 3.0], [-1.0, 0.0, 1.0]), -1).reshape(-1, 2)

@@ -18,7 +18,7 @@ from gpuvision.host.errors import RecordingError
 from gpuvision.host.image_header import image_size, is_tiff
 from gpuvision.host.reading import check_pixels, reading
 from gpuvision.host.sources import FrameSource, check_frame
-from gpuvision.host.tiff_files import TIFF_SUFFIXES, check_tiff_page, open_tiff
+from gpuvision.host.tiff_files import TIFF_SUFFIXES, check_photometric, check_tiff_page, open_tiff
 
 _JPEG = (".jpg", ".jpeg")
 _IMAGES = (".png", ".bmp", *_JPEG, ".pgm", ".ppm", ".pnm", ".webp", *TIFF_SUFFIXES)
@@ -129,7 +129,11 @@ def _check_image(path: Path) -> None:
         with open_tiff(path) as stack:
             if len(stack.pages) != 1:
                 raise RecordingError(f"{path}: {len(stack.pages)} pages in one image; open the file by itself instead")
-            check_tiff_page(stack.pages[0], str(path))
+            page: Any = stack.pages[0]
+            check_tiff_page(page, str(path))
+            # OpenCV converts palettes, other colours and inverted grey levels of up to 8 bits.
+            if page.bitspersample > 8:
+                check_photometric(page, str(path))
         return
     if size is None:
         raise RecordingError(f"{path}: not a readable image; expected the content of a {' '.join(_IMAGES)} file")

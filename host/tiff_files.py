@@ -28,6 +28,11 @@ _PACKBITS, _LZMA, _ZSTD = 32773, 34925, (34926, 50000)
 _LARGEST_RATIO = {8: 1032, 32946: 1032, 50013: 1032, _PACKBITS: 64, _LZMA: 10_000, **dict.fromkeys(_ZSTD, 1 << 15)}
 _SMALL_SEGMENT = 1 << 26  # bytes: smaller segments are not counted before they are decoded
 _CHUNK = 1 << 20
+# Photometric interpretations whose stored numbers are the grey levels, or red, green and blue: also raw pixels of
+# sensors. tifffile converts YCbCr to RGB in JPEG pages only.
+_PHOTOMETRIC = tifffile.PHOTOMETRIC
+_DIRECT = (_PHOTOMETRIC.MINISBLACK, _PHOTOMETRIC.RGB, _PHOTOMETRIC.CFA, _PHOTOMETRIC.LINEAR_RAW)
+_JPEG = 7
 
 # Exceptions name the defect of a file. Messages of tifffile itself appear only where the application sets up logging.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
@@ -39,10 +44,12 @@ def open_stack(path: Path, channel: Channel) -> Source:
     Raises
     ------
     RecordingError
-        The file is damaged or truncated, or a page is too large.
+        The file is damaged or truncated, a page is too large, or its numbers are not grey levels or colours; see
+        `check_photometric`.
     """
     file = open_tiff(path)
     with reading(path, "TIFF file", RecordingError):
+        check_photometric(file.pages[0], f"{path}, page 0")
         series = file.series
         planes = len(series) == 1 and series[0].axes.endswith("YX") and set(series[0].axes[:-2]) <= set("TZQI")
         if not (planes and series[0].ndim >= 3 and series[0].dataoffset is not None):
@@ -101,6 +108,7 @@ class TiffStack(FrameSource):
         with reading(what, "TIFF page", RecordingError):
             page = self._file.pages[self._next]
             check_tiff_page(page, what)
+            check_photometric(page, what)
             frame = page.asarray()
         check_frame(frame, self._page_shape, self.dtype, what)
         # The channel order is red, green, blue in TIFF, and blue, green, red in the channel functions.
@@ -132,6 +140,23 @@ def check_tiff_page(page: Any, what: str) -> None:
             page.parent.filehandle.seek(offset)
             if _unpacks_beyond(page.parent.filehandle.read(count), int(page.compression), expected):
                 raise RecordingError(f"{what}: a segment unpacks to more than the {expected} bytes expected")
+
+
+def check_photometric(page: Any, what: str) -> None:
+    """Check that the numbers of a TIFF page are grey levels, or red, green and blue.
+
+    Raises
+    ------
+    RecordingError
+        The photometric interpretation is another one, such as inverted grey levels (MinIsWhite) or a palette.
+    """
+    tag = page.tags.get("PhotometricInterpretation")
+    jpeg_colours = page.photometric == _PHOTOMETRIC.YCBCR and page.compression == _JPEG
+    if tag is not None and page.photometric not in _DIRECT and not jpeg_colours:
+        name = getattr(page.photometric, "name", page.photometric)
+        raise RecordingError(
+            f"{what}: its photometric interpretation is {name}, expected MINISBLACK or RGB; convert the file"
+        )
 
 
 def _unpacks_beyond(packed: bytes, compression: int, size: int) -> bool:

@@ -15,6 +15,7 @@ import tifffile
 
 from gpuvision.host import tiff_files
 from gpuvision.host.errors import RecordingError
+from gpuvision.host.image_files import read_image
 from gpuvision.host.tiff_files import _unpacks_beyond, check_tiff_page, open_stack
 
 PACKBITS, DEFLATE, LZMA = 32773, 8, 34925
@@ -130,3 +131,39 @@ def test_pages_are_frames(tmp_path: Path, rng: np.random.Generator, channels: in
     source.close()
     assert count == 4
     np.testing.assert_array_equal(frames[:4], pages[..., 1])
+
+
+@pytest.mark.parametrize("contiguous", [True, False])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("photometric", ["miniswhite", "cielab"])
+def test_inverted_grey_levels_are_refused(tmp_path: Path, photometric: str, dtype: Any, contiguous: bool) -> None:
+    """The numbers as stored would be taken for light: both as mapped planes and as pages."""
+    pages = np.zeros((2, 16, 16, 3), dtype) if photometric == "cielab" else np.zeros((2, 16, 16), dtype)
+    with tifffile.TiffWriter(tmp_path / "stack.tif") as file:
+        for page in pages:
+            file.write(page, photometric=photometric, contiguous=contiguous)
+    message = f"page 0: its photometric interpretation is {photometric.upper()}, expected MINISBLACK or RGB"
+    with pytest.raises(RecordingError, match=message):
+        open_stack(tmp_path / "stack.tif", "grey")
+
+
+def test_interpretation_of_a_later_page(tmp_path: Path) -> None:
+    with tifffile.TiffWriter(tmp_path / "stack.tif") as file:
+        for photometric in ("minisblack", "miniswhite"):
+            file.write(np.zeros((16, 16), np.uint8), photometric=photometric, contiguous=False)
+    source = open_stack(tmp_path / "stack.tif", "grey")
+    frames, arrived = np.zeros((1, 16, 16), np.uint8), np.zeros(1, np.int64)
+    assert source.read_into(frames, arrived) == 1
+    with pytest.raises(RecordingError, match="page 1: its photometric interpretation is MINISWHITE"):
+        source.read_into(frames, arrived)
+
+
+def test_images_with_inverted_grey_levels(tmp_path: Path, rng: np.random.Generator) -> None:
+    """OpenCV inverts 8 bits, which TIFF 6.0, section 3, defines as 255 less the number; not 16 bits."""
+    stored = rng.integers(0, 256, (16, 16)).astype(np.uint8)
+    tifffile.imwrite(tmp_path / "8.tif", stored, photometric="miniswhite")
+    np.testing.assert_array_equal(read_image(tmp_path / "8.tif"), 255 - stored)
+    for dtype in (np.uint16, np.float32):
+        tifffile.imwrite(tmp_path / "16.tif", stored.astype(dtype), photometric="miniswhite")
+        with pytest.raises(RecordingError, match=r"16\.tif: its photometric interpretation is MINISWHITE"):
+            read_image(tmp_path / "16.tif")

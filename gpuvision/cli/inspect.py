@@ -238,6 +238,7 @@ def inspect(
     else:
         reject_unused("without --leads", centre=centre, maximum_gap=maximum_gap)
         found = _inspect_paste(common, paste)
+    echo_warnings(found.warnings(), err=True)
     found.write(out, overwrite=overwrite)
     write_report(as_json, found.report(), outputs)
     picture = out / ("volume.png" if leads is None else "coplanarity.png")
@@ -349,7 +350,7 @@ def _inspect_leads(
 
 
 def _inspect_paste(common: _Common, options: _PasteOptions) -> PasteInspection:
-    """Measure the solder paste of a board, and print the warnings."""
+    """Measure the solder paste of a board."""
     from gpuvision.formats.height_files import read_heights
     from gpuvision.inspection.apertures import read_apertures
     from gpuvision.matching.artwork.artwork import read_artwork
@@ -366,7 +367,7 @@ def _inspect_paste(common: _Common, options: _PasteOptions) -> PasteInspection:
     scales = None if options.scale_sigma is None else ScaleSigma(**_scale_sigmas(options.scale_sigma))
     reach, layers = options.reach, layers_of(common.layers)
     pads = read_artwork(board, side=common.side, layers=layers).pads if options.pin_names else ()
-    found = inspect_paste(
+    return inspect_paste(
         read_heights(common.heights, common.scale),
         read_apertures(board, side=common.side, layers=layers, pads=pads),
         settings,
@@ -380,8 +381,6 @@ def _inspect_paste(common: _Common, options: _PasteOptions) -> PasteInspection:
         scale_sigma=scales,
         files={"height_map": str(common.heights), "board": str(board)},
     )
-    echo_warnings(found.warnings(), err=True)
-    return found
 
 
 def _regions(

@@ -44,6 +44,8 @@ class LeadInspection:
         Largest gap that passes [m]; None without a limit.
     files : mapping of str to str
         Names of the input files for the report, such as ``height_map`` and ``board``. Default: none.
+    sigma_estimated : bool
+        Whether the standard deviation of the heights was estimated from neighbouring cells. Default False.
     """
 
     heights: HeightMapFile
@@ -51,6 +53,17 @@ class LeadInspection:
     leads: Coplanarity
     maximum: float | None
     files: Mapping[str, str] = field(default_factory=dict)
+    sigma_estimated: bool = False
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what may be wrong with the inspection, one sentence each."""
+        if not self.sigma_estimated:
+            return ()
+        return (
+            "the sigma of the heights is estimated from differences of neighbouring cells, which does not see errors "
+            "that neighbours share, such as the phase of a laser line: the sigmas of gaps can be several times too "
+            "small; give the range_image.npz of a scan with a noise model, or --sigma and --correlation-area",
+        )
 
     def verdicts(self) -> tuple[str, ...]:
         """Return "pass" or "high" of each lead by its gap, or "holes" of a lead without a top."""
@@ -91,6 +104,7 @@ class LeadInspection:
             "gpuvision": version("gpuvision"),
             "files": dict(self.files),
             "summary": self.summary(),
+            "warnings": list(self.warnings()),
             "coplanarity_m": self.leads.coplanarity,
             "coplanarity_sigma_m": self.leads.coplanarity_sigma,
             "lowest": self.leads.lowest,
@@ -193,4 +207,11 @@ def inspect_leads(
         correlation_area=correlation_area,
         centre=None if gravity is None else (float(gravity[0]), float(gravity[1])),
     )
-    return LeadInspection(heights=heights, regions=moved, leads=leads, maximum=maximum, files=files)
+    return LeadInspection(
+        heights=heights,
+        regions=moved,
+        leads=leads,
+        maximum=maximum,
+        files=files,
+        sigma_estimated=sigma is None and heights.sigma is None,
+    )

@@ -150,13 +150,11 @@ def test_regions_of_leads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("full", [False, True])
-def test_an_inspection_of_paste(
-    full: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_inspection_of_paste(full: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(height_files, "read_heights", lambda *given: given)
     monkeypatch.setattr(artwork, "read_artwork", lambda board, **how: SimpleNamespace(pads=("pads", how["side"])))
     monkeypatch.setattr(apertures, "read_apertures", lambda board, **how: (board, how["side"], how["pads"]))
-    result = SimpleNamespace(warnings=lambda: ["rough", "tilted"])
+    result = SimpleNamespace()
     asked: list[Any] = []
     monkeypatch.setattr(inspecting_paste, "inspect_paste", lambda *given, **how: asked.append((given, how)) or result)
     options: dict[str, Any] = {"stencil": "0.1mm"}
@@ -185,6 +183,18 @@ def test_an_inspection_of_paste(
         "sigma": more.get("sigma"),
         "correlation_area": more.get("correlation_area"),
     }
+
+
+@pytest.mark.parametrize("kind", ["paste", "leads"])
+def test_warnings_are_printed(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = SimpleNamespace(
+        warnings=lambda: ["rough", "tilted"], write=lambda *given, **how: None, summary=lambda: "done", report=dict
+    )
+    monkeypatch.setattr(inspect, f"_inspect_{kind}", lambda *given, **how: result)
+    (tmp_path / "h.tiff").touch()
+    inspect.inspect(tmp_path / "h.tiff", tmp_path / "out", leads="U1" if kind == "leads" else None)
     assert capsys.readouterr().err.splitlines() == ["warning: rough", "warning: tilted"]
 
 

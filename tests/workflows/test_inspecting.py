@@ -20,7 +20,7 @@ from gpuvision.inspection.paste import PasteSettings
 from gpuvision.workflows import inspecting_leads, inspecting_paste
 from gpuvision.workflows.inspecting_leads import inspect_leads
 from gpuvision.workflows.inspecting_paste import inspect_paste
-from paste_maps import Box, Cap, board_grid, circle, paste_map
+from paste_maps import Box, Cap, board_grid, circle, paste_map, rectangle
 from scanning import Ran, check_refused
 
 HEAD = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
@@ -143,7 +143,7 @@ def test_the_leads_of_a_component(gerbers: Path, tmp_path: Path, run: Any, by_pa
         (tmp_path / "leads.csv").write_text("name,x,y,width,height,angle\n" + "\n".join(lines) + "\n")
         chosen = ["--leads", tmp_path / "leads.csv"]
     ran = run(tmp_path / "map.tiff", *chosen, "--out", tmp_path / "out", "--maximum-gap=20um", "--sigma=1um")
-    assert ran.code == 0, ran.err
+    assert (ran.code, ran.err) == (0, "")
     rows = rows_of(tmp_path / "out" / "leads.csv")
     np.testing.assert_allclose([float(each["gap_m"]) for each in rows], lows, atol=1e-6)
     assert [each["verdict"] for each in rows] == ["pass", "high", "pass", "pass", "pass"]
@@ -156,6 +156,28 @@ def test_the_leads_of_a_component(gerbers: Path, tmp_path: Path, run: Any, by_pa
     assert report["files"]["height_map"] == str(tmp_path / "map.tiff")
     assert report["files"]["leads"] == str(chosen[0].removeprefix("--leads=") if by_part else chosen[1])
     assert ("board" in report["files"]) == by_part
+
+
+@pytest.mark.parametrize("source", ["map", "option", "estimate"])
+def test_estimated_sigmas_of_leads_are_named(rng: np.random.Generator, source: str) -> None:
+    """Neighbours that share their error: the estimate of the sigma does not see it, and a warning says so."""
+    grid = board_grid(220, 180, cell=20e-6)
+    common = np.repeat(rng.normal(0.0, 20e-6, (grid.rows // 20, grid.columns // 20)), 20, axis=0).repeat(20, axis=1)
+    z = common + rng.normal(0.0, 1e-6, grid.shape)
+    places = [(0.3e-3, 0.3e-3), (3.9e-3, 0.3e-3), (0.3e-3, 3.1e-3), (3.9e-3, 3.1e-3)]
+    regions = [rectangle(str(k), place, (0.4e-3, 0.4e-3)) for k, place in enumerate(places)]
+    sigma = np.full(grid.shape, 20e-6) if source == "map" else None
+    found = inspect_leads(
+        HeightMapFile(z, grid, sigma), regions, sigma=20e-6 if source == "option" else None, correlation_area=400.0
+    )
+    warned = found.report()["warnings"]
+    assert list(found.warnings()) == warned
+    if source == "estimate":
+        assert found.leads.noise < 2e-6
+        (sentence,) = warned
+        assert sentence.startswith("the sigma of the heights is estimated from differences of neighbouring cells")
+    else:
+        assert not warned
 
 
 @pytest.mark.parametrize(

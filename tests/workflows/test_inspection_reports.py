@@ -215,6 +215,7 @@ def test_report_of_leads() -> None:
         "gpuvision": version("gpuvision"),
         "files": {"height_map": "map.tiff"},
         "summary": f"{summary}; 2 leads fail",
+        "warnings": [],
         "coplanarity_m": 6e-5,
         "coplanarity_sigma_m": 2e-6,
         "lowest": "3",

@@ -245,6 +245,12 @@ class ServoLoop:
             Longest time [s]. Range: above 0.
         settling : SettlingRule, optional
             Rule that ends the loop. Default: the loop runs for the duration.
+
+        Raises
+        ------
+        ValueError
+            The duration is not above 0; or the target's function or the controller returns a number that is not finite:
+            the head is then stopped.
         """
         goal = target if callable(target) else _resting(target)
         return _Run(self, goal, settling, finite(duration, "duration", above=0.0)).finish()
@@ -356,6 +362,8 @@ class _Run:
             if now - self.guard.exposed > self.limits.hold_after:
                 velocity = np.zeros(3)
             velocity = self.guard.limit(now, velocity, target, loop.period)
+        if not np.all(np.isfinite(velocity)):
+            raise ValueError(f"the velocity at {now:.6f} s is {velocity}, expected finite numbers from the controller")
         loop.plant.command(now, velocity)
         loop.observer.command(now, velocity)
         loop.controller.applied(velocity)

@@ -209,6 +209,27 @@ def test_head_stops_when_the_time_is_over_and_when_the_camera_fails() -> None:
     assert np.array_equal(after[0], after[1])
 
 
+def test_a_target_that_is_not_a_number_stops_the_head() -> None:
+    """The plant gets finite velocities only, and the head rests at its place."""
+
+    class Checked(SimulatedPlant):
+        def command(self, time: float, velocity: np.ndarray) -> None:
+            assert np.isfinite(velocity).all()
+            super().command(time, velocity)
+
+    observer = PoseObserver(MODEL)
+    observer.reset(-DELAY, np.zeros(3), COVARIANCE)
+    plant = Checked()
+    sensor = SimulatedPoseSensor(plant.pose, period=PERIOD, delay=DELAY, covariance=COVARIANCE)
+    controller = PidController(PidGains(proportional=150.0))
+    loop = ServoLoop(plant, sensor, observer, controller, SimulatedClock(), period=PERIOD, limits=LIMITS)
+    with pytest.raises(ValueError, match="finite numbers from the controller"):
+        loop.run(lambda time: (TARGET if time < 6e-3 else np.array([np.nan, 0.0, 0.0]), np.zeros(3)), 0.2)
+    after = plant.pose([0.0065, 0.5])
+    assert after[0, 0] > 1e-4
+    assert np.array_equal(after[0], after[1])
+
+
 def test_blocked_axis_ends_the_loop() -> None:
     """Friction that the drive does not overcome: the camera sees no motion, nor does the encoder."""
     stuck = Axis(lag=1e-3, coulomb=1e9)

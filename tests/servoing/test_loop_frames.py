@@ -298,6 +298,23 @@ def test_an_error_stops_the_head() -> None:
         np.testing.assert_array_equal(script.calls[part][-1], (START + 0.5, 0.0, 0.0, 0.0))
 
 
+@pytest.mark.parametrize("limits", [None, LoopLimits(hold_after=9.0, abort_after=9.0)])
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_a_velocity_that_is_not_finite_stops_the_head(limits: LoopLimits | None, wrong: float) -> None:
+    """The guards cut an infinite velocity to their bound; without guards it is refused, as a NaN always is."""
+    seen = {0: [(measured(START), Verdict.ACCEPTED)]}
+    script = Script(wanted=lambda frame: np.array([wrong, 0.5, 0.0]) if frame == 2 else WANTED, seen=seen)
+    loop = script.loop(limits)
+    if limits is not None and math.isinf(wrong):
+        assert loop.run(POSE, 1.0).outcome is Outcome.TIME_OVER
+    else:
+        with pytest.raises(ValueError, match=r"velocity at 2\.500000 s is \[\s*(nan|inf)"):
+            loop.run(POSE, 9.0)
+        np.testing.assert_array_equal(script.calls["plant"][-1], (START + 0.5, 0.0, 0.0, 0.0))
+    assert np.isfinite(script.calls["plant"]).all()
+    assert np.isfinite(script.calls["observer"]).all()
+
+
 def test_wrong_arguments_of_a_run_are_refused() -> None:
     loop = Script().loop(None)
     for duration in (0.0, -1.0, math.nan):

@@ -295,6 +295,45 @@ def test_history_keeps_the_newest_entries(count: int) -> None:
         assert observer.add(measured(oldest + 1e-6, np.zeros(3))) is Verdict.ACCEPTED
 
 
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
+def test_a_command_that_is_not_finite_leaves_the_observer_as_it_was(wrong: float) -> None:
+    observer, other = PoseObserver(MODEL), PoseObserver(MODEL)
+    for each in (observer, other):
+        each.reset(0.0, np.zeros(3), NOISE)
+        each.command(1e-3, np.array([1e-2, 2e-2, -1e-2]))
+    for axis in range(3):
+        velocity = np.zeros(3)
+        velocity[axis] = wrong
+        with pytest.raises(ValueError, match="expected finite numbers"):
+            observer.command(2e-3, velocity)
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        observer.command(wrong, np.zeros(3))
+    for given, expected in zip(observer.estimate(3e-3), other.estimate(3e-3), strict=True):
+        np.testing.assert_array_equal(given, expected)
+
+
+@pytest.mark.parametrize(("correlation", "factor"), [(0.0, 1.0), (0.5, 1.4), (0.9, 1.8)])
+def test_errors_that_are_correlated_from_frame_to_frame(correlation: float, factor: float) -> None:
+    """The factors of the docstring: root of the mean squared error over the predicted variance, to 10 %."""
+    rng, step, noise, density = np.random.default_rng(7), 2e-3, 1e-6, 1e-6
+    transition, _, motion = MotionModel(lag=(0.02,) * 3, acceleration_noise=(density,) * 3).transition(step)
+    root = np.linalg.cholesky(motion)
+    squares = []
+    for _ in range(10):
+        observer = PoseObserver(MotionModel(lag=(0.02,) * 3, acceleration_noise=(density,) * 3))
+        observer.reset(0.0, np.zeros(3), noise**2 * np.eye(3))
+        state, error = np.zeros(6), rng.normal(0.0, noise, 3)
+        for k in range(1, 300):
+            state = transition @ state + root @ rng.normal(size=6)
+            error = correlation * error + math.sqrt(1.0 - correlation**2) * rng.normal(0.0, noise, 3)
+            observer.add(PoseMeasurement(k * step, k * step, state[:3] + error, noise**2 * np.eye(3), 0))
+            found = observer.estimate(k * step)
+            if k > 50:
+                away = found.pose - state[:3]
+                squares.append(away @ np.linalg.solve(found.covariance, away) / 3.0)
+    assert math.sqrt(np.mean(squares)) == pytest.approx(factor, rel=0.1)
+
+
 def test_a_measurement_takes_the_command_before_it() -> None:
     """Two measurements in a frame: the motion after them is that of the command, up to the next one."""
     model = MotionModel(lag=(0.0, 0.0, 0.0), position_noise=(1e9,) * 3)  # each measurement counts alone

@@ -238,6 +238,11 @@ class RulerEdges(VisionOperation[Edges]):
     edge at right angles to the ruler; below 0.0035 px and 0.0015 px remain at any angle. With a model there is no such
     correction.
 
+    A gradient of the illumination moves edges of both polarities towards the brighter side. Where the light changes by
+    the fraction g per pixel along the ruler, the grey levels are (1 + g x) (m + h Phi(x / b)) for a blur b. The maximum
+    of their gradient, smoothed by a, lies at g (a^2 + 2 b^2), whatever the levels m and h are; measured positions agree
+    within 10 %. ``sigma`` does not contain this shift: 0.006 px for 75 % over 640 px, a = 2 and b = 0.8 px.
+
     ``sigma`` is the noise of the gradient at the maximum divided by the curvature there, for white noise and rulers at
     random sub-pixel positions. It agrees within 5 % with measured values from noise 0.5 at a step of 100 on, at any
     angle. At `best_smoothing` both are at most 1.2 times the Cramer-Rao bound of isolated edges (1.17 to 1.18 from a

@@ -14,6 +14,7 @@ import pyopencl.array
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from scipy.special import erf
 
 from canary import Guarded
 from gpuvision.camera.camera import Camera
@@ -635,6 +636,26 @@ def test_wrong_input(device: Device) -> None:
 def test_wrong_parameters(options: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         RulerEdges(**{"threshold": 20.0, **options})
+
+
+@VARIANTS
+@pytest.mark.parametrize("polarity", [1, -1])
+@pytest.mark.parametrize(("smoothing", "blur", "per_px"), [(2.0, 1.0, 2e-3), (1.8, 0.8, -2e-3), (3.0, 1.2, 1e-3)])
+def test_light_gradient_moves_edges_to_the_brighter_side(
+    device: Device, variant: Any, polarity: int, smoothing: float, blur: float, per_px: float
+) -> None:
+    """The shift is g (a^2 + 2 b^2) to 10 %, for both polarities; an oracle in closed form."""
+    operation = RulerEdges(threshold=10.0, length=41, width=5, smoothing_px=smoothing, variant=variant)
+    shifts = []
+    for place in np.linspace(63.5, 64.5, 11):
+        away = np.arange(128.0) - place
+        image = 100.0 + polarity * 60.0 * erf(away / (math.sqrt(2.0) * blur))
+        lit, even = (
+            operation(np.tile(each, (24, 1)).astype(np.float32), one_ruler(64.0, 12.0), device=device).position[0]
+            for each in (image * (1.0 + per_px * away), image)
+        )
+        shifts.append(lit - even)
+    assert np.mean(shifts) == pytest.approx(per_px * (smoothing**2 + 2.0 * blur**2), rel=0.1)
 
 
 def test_the_recommended_smoothing() -> None:

@@ -32,6 +32,7 @@ from gpuvision.workflows.simulation_plan import (
     usable_settings,
 )
 from gpuvision.workflows.simulation_sample import ProfileSample
+from gpuvision.workflows.simulation_survey import profile_shares
 
 Progress = Callable[[int, int | None], object]
 
@@ -115,6 +116,10 @@ def plan_simulation(
     add up linearly: the bound of clustered pairs, and the bound of multi-bounce light, which is left out for a PSD if
     this bound in the sample is a tenth of the tolerance or less.
 
+    Of a part with more profiles than the plan tries, a survey by coarse light shows where errors may be large
+    (`gpuvision.workflows.simulation_survey.profile_shares`): these profiles are tried with larger chances, and count
+    with one over their chance.
+
     The mean square error over the profiles is raised by twice its standard error. Lowered by as much, it is a lower
     limit. A setting is undecided if its lower limit meets the tolerance and its upper limit does not. It is compared
     on more profiles, with all light computed as the simulation does, if the fastest setting that certainly meets the
@@ -162,7 +167,9 @@ def plan_task(
     limit = time_limit(rate, latency, limits.rate_margin, SimulationPlan.unit)  # refuses wrong values before the work
     start = time.perf_counter()
     device = Device.best() if device is None else device
-    sample = ProfileSample.of(task, limits.profiles, device, others=_groups(limits))
+    is_sampled = len(task.transports) > limits.profiles + limits.checked
+    shares = profile_shares(task, limits.surveyed, device) if is_sampled and limits.surveyed else None
+    sample = ProfileSample.of(task, limits.profiles, device, others=_groups(limits), shares=shares)
     tried = Combinations(LightOptions(sample, tolerance, progress), limits.max_moved)
     trials = tried.trials()
     while (closer := _undecided(trials, tried, tolerance, limits, limit)) is not None:

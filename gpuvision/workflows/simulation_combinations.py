@@ -98,7 +98,8 @@ class Combinations:
         """Return the trial of settings: the reference gives the readings to compare with, on the same profiles."""
         readings, (seconds, pairs, by_rays) = self._readings[settings], self._kept[settings]
         found, reference = join_readings(readings), join_readings(self._reference.readings[: len(readings)])
-        difference = self._sample.reader.compare(found, reference)
+        chances = self._sample.chances(len(readings) - 1)
+        difference = self._sample.reader.compare(found, reference, chances)
         bound = ErrorPart(pairs, math.nan, is_bound=True)
         error, least = (
             total_error([*parts.values(), ErrorPart(_added(change, by_rays, parts), difference.signal), bound])

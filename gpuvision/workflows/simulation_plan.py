@@ -40,12 +40,17 @@ class SimulationPlanLimits(AccuracyLimits):
         Number of further profiles on which settings are tried before the plan refuses, if their error is undecided, 0
         or more. Default 96: twice as many again. Chosen: if few profiles of a large part have a large error, its limits
         are far apart.
+    surveyed : int
+        Number of profiles of a part with more than ``profiles`` and ``checked`` profiles whose coarsest light shows
+        where errors are large, so that more of these profiles are tried, 0 or more; 0: evenly spaced ones are tried.
+        Default 200: a wall of 1/100 of the part is met.
     """
 
     max_moved: float = 0.005
     profiles: int = 6
     checked: int = 48
     added: int = 96
+    surveyed: int = 200
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,6 +58,7 @@ class SimulationPlanLimits(AccuracyLimits):
         integer(self.profiles, "SimulationPlanLimits.profiles", minimum=2)
         integer(self.checked, "SimulationPlanLimits.checked", minimum=1)
         integer(self.added, "SimulationPlanLimits.added", minimum=0)
+        integer(self.surveyed, "SimulationPlanLimits.surveyed", minimum=0)
 
 
 class SettingsTrial(NamedTuple):

@@ -120,7 +120,9 @@ class SimulationReference:
         """Return the changes of all readings by the refinements of a part of the error, and the factor to the error."""
         reader, reference = self._options.sample.reader, join_readings(self.readings)
         groups = zip(*(each[name] for each in self._refined), strict=True)  # one for each refinement
-        found = [reader.compare(reference, join_readings([each.reading for each in group])) for group in groups]
+        chances = self._options.sample.chances(len(self.readings) - 1)
+        refined = (join_readings([each.reading for each in group]) for group in groups)
+        found = [reader.compare(reference, each, chances) for each in refined]
         if not all(math.isfinite(each.error) for each in found):
             raise ValueError(f"nothing is read in {len(reference.h)} profiles of the part")
         return found, self._refined[0][name][0].factor

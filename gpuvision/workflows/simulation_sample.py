@@ -251,28 +251,28 @@ class SampleReader:
         double: Simulator = replace(simulator, readout=replace(simulator.readout, precision="double"))
         return double.read(exposures, device=self.device)
 
-    def compare(self, found: Reading, reference: Reading) -> Difference:
+    def compare(self, found: Reading, reference: Reading, chances: Float64 | None = None) -> Difference:
         """Return the difference of a reading from a reference.
 
         The range error is the distance of the positions on the sensor times the derivative dH/du of the height at the
         position of the reference. Samples that the reference flags as ambiguous are not compared: two lines compete.
+
+        Parameters
+        ----------
+        found, reference : Reading
+            Readings of the same profiles.
+        chances : numpy.ndarray, optional
+            (profiles,): chance of each profile to be in the sample, above 0, to 1: a profile stands for one over its
+            chance of the part's profiles. None: all profiles of the part have the same chance.
         """
-        view, readout = self.simulator.view, getattr(self.simulator, "readout", None)
-        moved = np.abs(found.position - reference.position)
-        is_clear = (reference.status & Status.AMBIGUOUS) == 0
-        read, expected = is_clear & np.isfinite(found.position), is_clear & np.isfinite(reference.position)
-        # The centroid of a window moves by less than the window unless another line is read.
-        jump = abs(readout.axes.position_pitch) * readout.window if isinstance(readout, LineReadout) else math.inf
-        same = read & expected & ~(moved > jump)
-        u = np.where(expected, reference.position, 0.0)
-        slope = np.abs(height_secant(view.triangulation, u, u, view.v_centres))
-        error = np.where(same, slope * moved, 0.0)
-        counted = read | expected
+        error, same, counted = self._range_errors(found, reference)
         strength = np.where(same, reference.strength, 0.0)
         change = np.where(same, found.strength - reference.strength, 0.0)
         total = float(np.sum(strength**2))
-        least, most = self._root_mean_square(error, same)
-        changed, deviation = self._mean(counted & ~same, counted)
+        if chances is None:
+            chances = np.full(len(error), min(len(error) / self.profiles, 1.0))
+        least, most = self._root_mean_square(error, same, chances)
+        changed, deviation = self._mean(counted & ~same, counted, chances)
         return Difference(
             error=most,
             least=least,
@@ -282,27 +282,49 @@ class SampleReader:
             least_changed=max(changed - deviation, 0.0),
         )
 
-    def _root_mean_square(self, error: Float64, same: npt.NDArray[np.bool_]) -> tuple[float, float]:
+    def mean_squares(self, found: Reading, reference: Reading) -> Float64:
+        """Return the mean square range error of each profile (profiles,) [m^2]; 0 where nothing is compared."""
+        error, same, _ = self._range_errors(found, reference)
+        return np.asarray(np.sum(error**2, axis=-1) / np.maximum(np.sum(same, axis=-1), 1))
+
+    def _range_errors(
+        self, found: Reading, reference: Reading
+    ) -> tuple[Float64, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """Return range errors [m], which samples both readings read on the same line, and which ones count."""
+        view, readout = self.simulator.view, getattr(self.simulator, "readout", None)
+        moved = np.abs(found.position - reference.position)
+        is_clear = (reference.status & Status.AMBIGUOUS) == 0
+        read, expected = is_clear & np.isfinite(found.position), is_clear & np.isfinite(reference.position)
+        # The centroid of a window moves by less than the window unless another line is read.
+        jump = abs(readout.axes.position_pitch) * readout.window if isinstance(readout, LineReadout) else math.inf
+        same = read & expected & ~(moved > jump)
+        u = np.where(expected, reference.position, 0.0)
+        slope = np.abs(height_secant(view.triangulation, u, u, view.v_centres))
+        return np.where(same, slope * moved, 0.0), same, read | expected
+
+    def _root_mean_square(self, error: Float64, same: npt.NDArray[np.bool_], chances: Float64) -> tuple[float, float]:
         """Return limits of the root mean square (profiles, samples) over the counted samples, by its standard error."""
         if not same.any():
             return math.nan, math.nan
-        mean, deviation = self._mean(error**2, same)
+        mean, deviation = self._mean(error**2, same, chances)
         return math.sqrt(max(mean - deviation, 0.0)), math.sqrt(mean + deviation)
 
-    def _mean(self, values: npt.NDArray[Any], counted: npt.NDArray[np.bool_]) -> tuple[float, float]:
+    @staticmethod
+    def _mean(values: npt.NDArray[Any], counted: npt.NDArray[np.bool_], chances: Float64) -> tuple[float, float]:
         """Return the mean of values (profiles, samples) over the counted samples, and twice its standard error.
 
-        All other values are 0. There is no standard error of a single profile, and of all profiles of the part.
+        All other values are 0. There is no standard error of a single profile, and of profiles that are certainly in
+        the sample. Otherwise it is that of a sample with unequal chances (Hajek, 1964).
         """
-        sums, counts = np.sum(values, axis=-1), np.sum(counted, axis=-1)
+        sums, counts = np.sum(values, axis=-1) / chances, np.sum(counted, axis=-1) / chances
         if not counts.any():
             return 0.0, 0.0
-        mean = float(sums.sum() / counts.sum())
-        if len(counts) < 2:
+        mean, number = float(sums.sum() / counts.sum()), len(counts)
+        if number < 2:
             return mean, 0.0
         shares = sums - mean * counts  # residuals of the ratio estimate of the mean
-        variance = float(np.sum(shares**2)) / (len(counts) - 1) / len(counts) / float(counts.mean()) ** 2
-        return mean, _STANDARD_ERRORS * math.sqrt(variance * max(1.0 - len(counts) / self.profiles, 0.0))
+        variance = float(np.sum((1.0 - chances) * shares**2)) * number / (number - 1)
+        return mean, _STANDARD_ERRORS * math.sqrt(variance) / float(counts.sum())
 
 
 def join_readings(readings: Sequence[Reading]) -> Reading:
@@ -322,6 +344,10 @@ class ProfileSample:
         (profiles,): transports of the sample [m].
     others : tuple of numpy.ndarray
         (others,) each: transports of groups of other profiles, to judge settings more closely [m].
+    numbers : tuple of numpy.ndarray
+        Numbers of the profiles of the sample and of each group, among the transports of the task.
+    shares : numpy.ndarray
+        (transports,): shares of all profiles in the groups, as `of` takes them.
     reader : SampleReader
         Reader of the light.
     device : Device
@@ -333,12 +359,22 @@ class ProfileSample:
     task: SimulationTask
     places: Float64
     others: tuple[Float64, ...]
+    numbers: tuple[npt.NDArray[np.int64], ...]
+    shares: Float64
     reader: SampleReader
     device: Device
     solvers: dict[SolverKey, Radiosity] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, task: SimulationTask, profiles: int, device: Device, *, others: Sequence[int] = ()) -> ProfileSample:
+    def of(
+        cls,
+        task: SimulationTask,
+        profiles: int,
+        device: Device,
+        *,
+        others: Sequence[int] = (),
+        shares: Float64 | None = None,
+    ) -> ProfileSample:
         """Return evenly spaced profiles of a task; all if it has fewer.
 
         Parameters
@@ -350,22 +386,44 @@ class ProfileSample:
         device : Device
             Device of the kernels.
         others : sequence of int
-            Largest number of profiles of each group of other profiles, evenly spaced among the rest. Groups without
-            profiles are left out. Default: no groups.
+            Largest number of profiles of each group of other profiles, out of the rest. Groups without profiles are
+            left out. Default: no groups.
+        shares : numpy.ndarray, optional
+            (transports,): shares of the profiles in the groups, with the sum 1: systematic samples with these chances.
+            None: evenly spaced ones.
         """
-        rest = np.arange(len(task.transports))
-        groups = []
-        for count in (profiles, *others):
-            chosen = _spaced(rest, count)
-            rest = np.setdiff1d(rest, chosen)
-            groups.append(task.transports[chosen])
+        every = np.arange(len(task.transports))
+        shares = np.full(len(every), 1.0 / len(every)) if shares is None else shares
+        chosen = [spaced(every, profiles)]
+        for count in others:
+            rest = np.setdiff1d(every, np.concatenate(chosen))
+            chosen.append(rest[_drawn(shares[rest], count)])
+        kept = [each for number, each in enumerate(chosen) if len(each) or not number]
+        places = [task.transports[each] for each in kept]
         return cls(
             task=task,
-            places=groups[0],
-            others=tuple(each for each in groups[1:] if len(each)),
+            places=places[0],
+            others=tuple(places[1:]),
+            numbers=tuple(kept),
+            shares=shares,
             reader=SampleReader.of(task, device),
             device=device,
         )
+
+    def chances(self, groups: int) -> Float64:
+        """Return the chances of the profiles of the sample and of the first groups to be in any of these.
+
+        Parameters
+        ----------
+        groups : int
+            Number of groups of other profiles, 0 or more.
+        """
+        even = min(len(self.places) / len(self.shares), 1.0)
+        drawn = sum(map(len, self.numbers[1 : groups + 1]))
+        if not drawn:
+            return np.full(len(self.places), even)
+        chances = even + (1.0 - even) * _chances(self.shares, drawn / (1.0 - even))  # drawn from the rest
+        return np.asarray(chances[np.concatenate(self.numbers[: groups + 1])])
 
     def light(self, settings: SimulationSettings, places: Float64 | None = None, **changes: Any) -> SampledLight:
         """Compute the light of settings, on other places than those of the sample if given.
@@ -377,8 +435,28 @@ class ProfileSample:
         return sample_light(settings.applied(self.task), where, self.device, **{"solvers": self.solvers, **changes})
 
 
-def _spaced(numbers: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
+def spaced(numbers: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
     """Return evenly spaced elements, each in the middle of its part; all if there are fewer."""
     count = min(count, len(numbers))
     places: npt.NDArray[np.int64] = ((np.arange(count) + 0.5) * len(numbers) / max(count, 1)).astype(np.int64)
     return np.take(numbers, places)
+
+
+def _drawn(shares: Float64, count: int) -> npt.NDArray[np.int64]:
+    """Return the numbers of about ``count`` elements: a systematic sample with chances in proportion to the shares."""
+    if not (count := min(count, len(shares))):
+        return np.zeros(0, np.int64)
+    picks = np.searchsorted(np.cumsum(_chances(shares, count)), np.arange(count) + 0.5, side="right")
+    return np.unique(np.minimum(picks, len(shares) - 1))
+
+
+def _chances(shares: Float64, count: float) -> Float64:
+    """Return chances in proportion to shares, 1 at most, with the sum ``count``."""
+    certain = np.zeros(len(shares), bool)
+    while True:  # chances above 1 become certain, which raises the others
+        free = shares[~certain].sum()
+        left = max(count - np.count_nonzero(certain), 0.0) / free if free > 0.0 else 0.0
+        chances = np.where(certain, 1.0, left * shares)
+        if not np.any(chances > 1.0):
+            return chances
+        certain |= chances > 1.0

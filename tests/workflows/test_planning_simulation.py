@@ -567,10 +567,10 @@ def test_few_profiles_widen_the_limits_of_the_error() -> None:
     error, same = np.sqrt(np.array([[1.0, 1.0], [3.0, 3.0]])), np.ones((2, 2), bool)
     move = 2.0 * math.sqrt(0.75)
     for profiles, least, most in ((8, 2.0 - move, 2.0 + move), (2, 2.0, 2.0)):
-        limits = dataclasses.replace(reader, profiles=profiles)._root_mean_square(error, same)
+        limits = reader._root_mean_square(error, same, np.full(2, 2.0 / profiles))
         assert limits == pytest.approx((math.sqrt(least), math.sqrt(most)))
     error[0] = 0.0  # mean 1.5, standard error 1.5: the lower limit is not below 0
-    assert dataclasses.replace(reader, profiles=2000)._root_mean_square(error, same)[0] == 0.0
+    assert reader._root_mean_square(error, same, np.full(2, 1e-3))[0] == 0.0
 
 
 def test_a_sample_is_spread_over_the_part() -> None:

@@ -13,6 +13,12 @@ from gpuvision.host.arrays import DeviceArray
 from gpuvision.host.device import Device
 
 
+def mixed_kinds(name: str, inputs: Sequence[Any]) -> TypeError:
+    """Return the error of an operation whose inputs are neither all NumPy arrays nor all device arrays."""
+    kinds = ", ".join(type(each).__name__ for each in inputs) or "none"
+    return TypeError(f"{name}: expected NumPy arrays or pyopencl arrays, all of one kind, got {kinds}")
+
+
 def check_on_device(array: Any, shape: tuple[int, ...], dtype: np.dtype[Any], device: Device) -> None:
     """Check that an array lies on a device and has the shape and dtype of a bound operation.
 

@@ -187,8 +187,7 @@ class Bound(Generic[R]):
     @functools.cached_property
     def _input_names(self) -> list[str]:
         """Names of the inputs in messages."""
-        count, kind = len(self.inputs), type(self.operation).__name__
-        return [f"{kind}: input {number} of {count}" for number in range(1, count + 1)]
+        return self.operation.input_names(len(self.inputs))
 
     def allocate(self) -> R:
         """Return new device arrays for the outputs."""

@@ -239,6 +239,9 @@ class Launchable(Protocol):
     def launch(self, device: Device, shape: Shape, dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape and dtype."""
 
+    def input_names(self, count: int) -> list[str]:
+        """Return the names of the inputs in messages."""
+
 
 def uses_vectors(variant: Variant, device: Device) -> bool:
     """Decide between the vector variant of a kernel and one work-item per element."""

@@ -18,6 +18,7 @@ import pyopencl as cl
 import pyopencl.array
 from numpy.typing import DTypeLike
 
+from gpuvision.host.array_checks import mixed_kinds
 from gpuvision.host.arrays import DeviceArray, HostArray
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
@@ -214,9 +215,17 @@ class Operation(Generic[R]):
             return self._on_device(inputs, device, out)
         if inputs and all(isinstance(each, np.ndarray) for each in inputs):
             return self._bound(_device(device), None, inputs[0]).on_host(inputs, out)
-        kinds = ", ".join(type(each).__name__ for each in inputs) or "none"
-        name = type(self).__name__
-        raise TypeError(f"{name}: expected NumPy arrays or pyopencl arrays, all of one kind, got {kinds}")
+        raise mixed_kinds(type(self).__name__, inputs)
+
+    def input_names(self, count: int) -> list[str]:
+        """Return the names of the inputs in messages.
+
+        Parameters
+        ----------
+        count : int
+            Number of inputs.
+        """
+        return [f"{type(self).__name__}: input {number} of {count}" for number in range(1, count + 1)]
 
     def _on_device(self, inputs: Sequence[DeviceArray], device: Device | None, out: R | None) -> R:
         home = Device.of(inputs[0])

@@ -14,6 +14,8 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+import pyopencl as cl
+import pyopencl.array
 
 from gpuvision.host import (
     Bound,
@@ -31,6 +33,7 @@ from gpuvision.host import (
     type_defines,
     vector_work,
 )
+from gpuvision.host.array_checks import mixed_kinds
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging.height_map import Grid, HeightMap
 from gpuvision.validation import finite
@@ -151,6 +154,9 @@ class Regrid:
             raise TypeError(f"Regrid.sigma is {self.sigma}; expected the standard deviation of z if it is True")
         along, across = (x, y) if self.along[-1] == "x" else (y, x)
         more = () if sigma is None else (sigma,)
+        inputs = (x, y, z, intensity, status, *more)
+        if not any(all(isinstance(each, kind) for each in inputs) for kind in (np.ndarray, cl.array.Array)):
+            raise mixed_kinds("Regrid", inputs)
         along_samples, along_profiles = self.passes
         lines = along_samples(along, z, intensity, status, across, *more, device=device)
         kept = () if sigma is None else (lines.sigma,)
@@ -344,6 +350,11 @@ class _AlongSamples(_Pass[_Lines]):
     """First pass: a line is a profile; the other coordinate is also interpolated."""
 
     Result: ClassVar[type[Any]] = _Lines
+
+    def input_names(self, count: int) -> list[str]:
+        """Return the names of the inputs of `Regrid` in the order of the pass."""
+        along, across = ("x", "y") if self.direction[-1] == "x" else ("y", "x")
+        return [f"Regrid: {name}" for name in (along, "z", "intensity", "status", across, "sigma")[:count]]
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""

@@ -372,6 +372,24 @@ def test_wrong_input_is_refused(device):
 
 @pytest.mark.double
 @pytest.mark.parametrize("along", ["x", "-y"])
+def test_wrong_arrays_are_named_as_given(device, along):
+    """The names of the two passes and the order of their inputs do not appear."""
+    op, names = dataclasses.replace(OP, along=along), ("x", "y", "z", "intensity", "status")
+    given = [np.ascontiguousarray(each) for each in flat((4, 5))]
+    for number, name in enumerate(names):
+        wrong = [each if k != number else each.tolist() for k, each in enumerate(given)]
+        kinds = ", ".join(type(each).__name__ for each in wrong)
+        message = f"^Regrid: expected NumPy arrays or pyopencl arrays, all of one kind, got {kinds}$"
+        with pytest.raises(TypeError, match=message):
+            op(*wrong, device=device)
+        if name != along[-1]:  # the first input of the first pass gives the shape
+            wrong = [each if k != number else each[:3] for k, each in enumerate(given)]
+            with pytest.raises(ValueError, match=rf"^Regrid: {name}: expected shape \(4, 5\), got \(3, 5\)$"):
+                op(*wrong, device=device)
+
+
+@pytest.mark.double
+@pytest.mark.parametrize("along", ["x", "-y"])
 def test_sigma_is_the_effect_of_every_sample(device, rng, along):
     """The oracle perturbs one height after the other: the sum of (weight sigma)^2, by the float64 reference."""
     grid = Grid(left=-1.0, top=0.9, cell_x=0.31, cell_y=0.29, columns=7, rows=6)

@@ -106,6 +106,21 @@ def estimate_pixel_noise(image: npt.NDArray[Any]) -> float:
     return _deviation(np.abs(differences[np.isfinite(differences)]))
 
 
+def finite_percentiles(image: npt.NDArray[Any], percentiles: tuple[float, float]) -> tuple[float, float]:
+    """Return two percentiles of the finite pixels of an image [grey levels]; zeros if no pixel is finite.
+
+    Parameters
+    ----------
+    image : numpy.ndarray
+        Any shape, any real pixel type.
+    percentiles : tuple of float
+        Low and high, 0 to 100.
+    """
+    finite = image[np.isfinite(image)]
+    low, high = np.percentile(finite, percentiles) if finite.size else (0.0, 0.0)
+    return float(low), float(high)
+
+
 class PixelNoise(NamedTuple):
     """Noise of the pixels of a camera.
 

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from matplotlib.path import Path as Outline
 
+from gpuvision.camera.image import finite_percentiles
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.artwork.shapes import Shape, area, capsule
@@ -227,5 +228,5 @@ def _show(axes: Any, image: npt.NDArray[Any]) -> None:
         axes.imshow(grey, interpolation="nearest")
         return
     grey = grey if grey.ndim == 2 else grey.mean(axis=2)
-    low, high = np.nanpercentile(grey, [0.5, 99.5])
+    low, high = finite_percentiles(grey, (0.5, 99.5))
     axes.imshow(grey, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="nearest")

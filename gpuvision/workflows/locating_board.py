@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
-from gpuvision.camera.image import estimate_pixel_noise, grey_image
+from gpuvision.camera.image import estimate_pixel_noise, finite_percentiles, grey_image
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.camera.undistort_image import UndistortImage
@@ -172,8 +172,8 @@ def locate_board(
 def _levels(grey: npt.NDArray[Any], noise: float | None, threshold: float | None) -> tuple[float, float]:
     """Return the noise of a pixel and the least height of an edge [grey levels], given or estimated from the image."""
     level = estimate_pixel_noise(grey) if noise is None else noise
-    low, high = np.percentile(grey, [1, 99])
-    return level, max(4.0 * level, 0.05 * float(high - low), 1e-6) if threshold is None else threshold
+    low, high = finite_percentiles(grey, (1.0, 99.0))
+    return level, max(4.0 * level, 0.05 * (high - low), 1e-6) if threshold is None else threshold
 
 
 def _initial_view(

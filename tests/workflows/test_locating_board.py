@@ -999,3 +999,15 @@ def test_a_mirrored_side_is_seen_from_below(artwork: Artwork) -> None:
     located = locate_board(below, replace(artwork, side="bottom"), scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0))
     assert located.reason == ""
     assert np.abs(errors_in_sigmas(located, pose)).max() < SIGMAS
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
+def test_levels_of_an_image_with_pixels_that_are_not_finite(value: float) -> None:
+    """Two percentiles of the finite pixels, which are half dark and half bright: a twentieth of their difference."""
+    grey = np.full((40, 40), 100.0, np.float32)
+    grey[:, 20:] = 300.0
+    expected = locating_board._levels(grey, None, None)
+    assert expected == (0.0, 10.0)
+    grey[5:12, 8:30] = value
+    assert locating_board._levels(grey, None, None) == expected
+    assert locating_board._levels(np.full_like(grey, value), None, None) == (0.0, 1e-6)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.ground_plane import MountedCamera
-from gpuvision.camera.image import estimate_pixel_noise
+from gpuvision.camera.image import estimate_pixel_noise, finite_percentiles
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device, to_numpy
@@ -123,8 +123,8 @@ def scan_top_view(
 
 def default_threshold(white: npt.NDArray[Any]) -> float:
     """Return the default threshold [grey levels]: 4 times the noise, at least a tenth of the image's range."""
-    low, high = np.percentile(white, [1, 99])
-    return max(4.0 * estimate_pixel_noise(white), 0.1 * float(high - low), 1e-6)
+    low, high = finite_percentiles(white, (1.0, 99.0))
+    return max(4.0 * estimate_pixel_noise(white), 0.1 * (high - low), 1e-6)
 
 
 def stripe_ruler(white: npt.NDArray[Any], width_px: float, threshold: float, model: Lens | Camera | None) -> RulerEdges:

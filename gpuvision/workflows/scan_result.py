@@ -358,6 +358,10 @@ def scan_advice(status: npt.NDArray[np.uint8], sensor: Sensor) -> tuple[str, ...
         sentences.append(
             'many frames are damaged: copy it again, or keep their samples with [recording] damaged = "keep"'
         )
+    if Status.NOT_FINITE in frequent:
+        sentences.append(
+            "most samples have light that is not finite (infinity or NaN): check the program that wrote the recording"
+        )
     if Status.LOW_SIGNAL in frequent and isinstance(sensor.readout, LineReadout):
         threshold = "a lower [line] threshold" if sensor.auto_threshold else '[line] threshold = "auto"'
         sentences.append(

@@ -24,9 +24,10 @@ FOCUS = Sensor.from_section(
         "sensor.toml",
     )
 )
-FLAGS = ("NO_DATA", "LOW_SIGNAL", "AMBIGUOUS", "HORIZON", "OUT_OF_RANGE")
+FLAGS = ("NO_DATA", "NOT_FINITE", "LOW_SIGNAL", "AMBIGUOUS", "HORIZON", "OUT_OF_RANGE")
 WORDS = {
     "NO_DATA": "many frames are damaged",
+    "NOT_FINITE": "most samples have light that is not finite (infinity or NaN)",
     "camera, LOW_SIGNAL": "most samples are dark at a threshold of",
     "focus, LOW_SIGNAL": "most pixels have no texture",
     "psd, LOW_SIGNAL": "try a lower [psd] minimum_total",
@@ -69,7 +70,7 @@ def test_names_of_the_keys() -> None:
 
 def test_several_flags_in_their_order() -> None:
     status = np.full((2, 2), sum(Status[each] for each in FLAGS), np.uint8)
-    for sensor, count in ((CAMERA, 4), (TURNING, 4), (PSD, 3), (FOCUS, 3)):
+    for sensor, count in ((CAMERA, 5), (TURNING, 5), (PSD, 4), (FOCUS, 4)):
         found = scan_advice(status, sensor)
         assert len(found) == count
         assert "damaged" in found[0]

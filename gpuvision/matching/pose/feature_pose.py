@@ -343,9 +343,10 @@ class EstimateFeaturePose(OperationSequence[FeaturePose]):
         As in `SolveFeatures`.
     ruler_sigma_px, matched_sigma_px, drilled_sigma_px, size_tolerance : float
         As in `SolveFeatures`.
-    min_share, max_residual_px : float
-        As in `SolveFeatures`. Defaults 0.5, a majority (with fewer, another pose could gather as many), and 0.5 px
-        (chosen).
+    min_share : float
+        As in `SolveFeatures`, 0 to 1. Default 0.5, a majority: with fewer, another pose could gather as many.
+    max_residual_px : float
+        As in `SolveFeatures` [px], above 0. Default 0.5 (chosen).
 
     Raises
     ------

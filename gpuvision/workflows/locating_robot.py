@@ -187,7 +187,7 @@ def _search_map(field: Field, points: Float32, margin: float | None, device: Dev
     size = max(field.length, field.width)
     cost_scale = min(_MAX_COST_SCALE, _COST_SCALE * size)
     # The factor keeps the farthest point inside the map after rounding to single precision.
-    max_range = min(float(np.hypot(*points.T).max()) * 1.001 + cost_scale, _MAX_DIAGONAL * size)
+    max_range = min(float(np.hypot(*points.T.astype(np.float64)).max()) * 1.001 + cost_scale, _MAX_DIAGONAL * size)
     return DistanceMap(
         field=field,
         cell=_CELL * cost_scale,

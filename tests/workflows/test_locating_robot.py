@@ -514,6 +514,16 @@ def test_random_points_are_refused(rng: np.random.Generator) -> None:
                 assert located.report()["evidence"]["seen"] is None
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_point_whose_distance_overflows_changes_nothing(rng: np.random.Generator) -> None:
+    """There is no warning, and the range of the map is 1.5 lengths of the field in both searches."""
+    field = read_field("robocup_msl")
+    near = rng.uniform(-3.0, 3.0, (40, 2))
+    found, other = (locate_robot(np.vstack([near, [[far, -far]]]).astype(np.float32), field) for far in (3e38, 100.0))
+    assert found.reason == other.reason
+    assert found.evidence == other.evidence
+
+
 Command = Callable[..., tuple[int, str, str]]
 
 

@@ -67,7 +67,7 @@ class FeaturePose(NamedTuple):
         without double precision.
     status : uint16
         `Status` flags, as in `BoardPose`: NO_DATA, AMBIGUOUS, OUT_OF_RANGE, NOT_FINITE, NOT_CONVERGED (with a pose).
-        AMBIGUOUS also where too few features in the image agree, or too badly (`SolveFeatures`).
+        AMBIGUOUS also where too few features in the image agree, or their residuals are too large (`SolveFeatures`).
     residuals, weights : float32, (rows,)
         Residual along the normal in the artwork [m], and weight in the pose, 0 to 1: of each ruler, then of the two
         principal axes of each fiducial.
@@ -265,7 +265,8 @@ class SolveFeatures(VisionOperation[FeaturePose]):
     min_share : float
         Least share of the rows in the image that must be inliers: fewer are another board.
     max_residual_px : float
-        Largest accepted scale of the residuals [px]: more is another board or a wrong scale.
+        Largest accepted scale of the residuals [px], `FeaturePose.scale` times the median sigma of the rows: more is
+        another board or a wrong scale. If the solver has a given scale, only the sigmas are limited.
     """
 
     Result: ClassVar[type[Any]] = FeaturePose

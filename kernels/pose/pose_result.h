@@ -86,7 +86,8 @@ BETWEEN_BARRIERS void store_covariance(private const solved_pose *fit, pose_fram
 // Translation about the origin: T(p) = c + (I + D) (p - c) + t gives t - D c for the centre c of the rows. Deformation:
 // I + D = R(theta) ((1 + kx, shear), (0, 1 + ky)), kx and theta from its first column.
 static inline void store_pose(GROUP_SPACE const solved_pose *fit, pose_rows all, pose_frame frame, int all_finite,
-                              int is_wrong, long item, int count, pose_limits limits, real place_x, real place_y, pose_outputs to) {
+                              int is_wrong, long item, int count, pose_limits limits, real place_x, real place_y,
+                              pose_outputs to) {
     const int few = fit->present < POSE_PARAMETERS;
     // Below an inlier fraction of 0.75 two outliers may agree by chance. Half the leverage limit then requires that two
     // other rows check each row.

@@ -235,9 +235,9 @@ def merge_height_maps(
     for heights, own in (first, second):
         for values, empty in ((heights.z, math.nan), (heights.intensity, math.nan), (heights.status, Status.NO_DATA)):
             kind = np.dtype(np.uint8) if values is heights.status else dtype
-            frames.append(placed(to_numpy(values), own, grid, empty, kind))
+            frames.append(pad_to_grid(to_numpy(values), own, grid, empty, kind))
         if with_sigma and heights.sigma is not None:
-            sigmas.append(placed(to_numpy(heights.sigma), own, grid, math.nan, dtype))
+            sigmas.append(pad_to_grid(to_numpy(heights.sigma), own, grid, math.nan, dtype))
     return operation(*frames, *sigmas, device=device), grid
 
 
@@ -261,7 +261,7 @@ def common_differences(
     source = to_numpy(merged.source)
     common = (source & (FIRST | SECOND) == FIRST | SECOND) | (source & DISAGREES != 0)
     one, two = (
-        placed(to_numpy(heights.z), own, grid, math.nan, np.dtype(np.float64))[common]
+        pad_to_grid(to_numpy(heights.z), own, grid, math.nan, np.dtype(np.float64))[common]
         for heights, own in (first, second)
     )
     return np.asarray(two - one)
@@ -301,8 +301,20 @@ def _common_grid(first: Grid, second: Grid, max_cells: int) -> Grid:
     )
 
 
-def placed(values: Any, own: Grid, grid: Grid, empty: float, dtype: np.dtype[Any]) -> Any:
-    """Return an array over a larger grid on the same lattice, with ``empty`` in the other cells."""
+def pad_to_grid(values: Any, own: Grid, grid: Grid, empty: float, dtype: np.dtype[Any]) -> Any:
+    """Return an array over a larger grid on the same lattice, with ``empty`` in the other cells.
+
+    Parameters
+    ----------
+    values : array_like
+        (own.rows, own.columns).
+    own, grid : Grid
+        Grid of the values, and the larger one.
+    empty : float
+        Value of the other cells.
+    dtype : numpy.dtype
+        Type of the result, (grid.rows, grid.columns).
+    """
     made = np.full(grid.shape, empty, dtype)
     row, column = round((grid.top - own.top) / grid.cell_y), round((own.left - grid.left) / grid.cell_x)
     made[row : row + own.rows, column : column + own.columns] = values

@@ -32,7 +32,7 @@ from gpuvision.ranging.merge_heights import (
     MergedHeights,
     common_differences,
     merge_height_maps,
-    placed,
+    pad_to_grid,
 )
 from gpuvision.status import Status
 
@@ -341,9 +341,9 @@ def _merged_phase(
     variance = np.zeros(grid.shape)
     for bit, (heights, own), phase in zip((FIRST, SECOND), maps, phases, strict=True):
         if phase is not None:
-            sigma = placed(to_numpy(heights.sigma), own, grid, math.nan, np.dtype(np.float64))
+            sigma = pad_to_grid(to_numpy(heights.sigma), own, grid, math.nan, np.dtype(np.float64))
             sigma[sigma == 0.0] = math.nan  # a missing height
-            shared = placed(np.where(np.isfinite(phase), phase, 0.0), own, grid, 0.0, np.dtype(np.float64))
+            shared = pad_to_grid(np.where(np.isfinite(phase), phase, 0.0), own, grid, 0.0, np.dtype(np.float64))
             weight = np.where(source & (FIRST | SECOND) == bit, 1.0, (total / sigma) ** 2)
             variance += np.where(source & bit != 0, (weight * shared) ** 2, 0.0)
     return np.where(np.isfinite(total), np.sqrt(variance), math.nan).astype(total.dtype)

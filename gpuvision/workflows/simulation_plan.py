@@ -74,7 +74,8 @@ class SettingsTrial(NamedTuple):
         Error of the range [m] by ``change``, ``pairs`` and ``finest``: the sum of bounds, and the root of the sum of
         squares of estimates. The part of the rays in ``change`` and in ``finest`` adds up before it is squared.
     least : float
-        The same with the lower limit of the change [m]: more profiles may show that the error is as small as this.
+        The same with the lower limits of ``change`` and ``finest`` [m]: more profiles may show that the error is as
+        small as this.
     change : float
         Root mean square difference between the readings and those of the reference, with all pairs [m]. It is an upper
         limit: the mean square is raised by two standard errors. The reference has the finest options, with more rays

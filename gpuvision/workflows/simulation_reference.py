@@ -63,8 +63,8 @@ class SimulationReference:
 
     The error by the rays of diffuse light is half of the root mean square of both changes from the two finest options.
     Errors of spread rays are independent: then the reference, with four times the rays of the finest option and half of
-    its error (measured: a half to a quarter), has 0.45 of that change. The errors of both options may be equal by
-    chance, or one of them the error of the reference: so both count.
+    its error (measured: a half to a quarter), has 0.45 of the change from the finest option. The errors of both options
+    may be equal by chance, or one of them the error of the reference: so both count.
     """
 
     def __init__(self, options: LightOptions) -> None:

@@ -268,16 +268,16 @@ class SampleReader:
         error, same, counted = self._range_errors(found, reference)
         strength = np.where(same, reference.strength, 0.0)
         change = np.where(same, found.strength - reference.strength, 0.0)
-        total = float(np.sum(strength**2))
         if chances is None:
             chances = np.full(len(error), min(len(error) / self.profiles, 1.0))
+        squares, total = (float(np.sum(np.sum(each**2, axis=-1) / chances)) for each in (change, strength))
         least, most = self._root_mean_square(error, same, chances)
         changed, deviation = self._mean(counted & ~same, counted, chances)
         return Difference(
             error=most,
             least=least,
             worst=float(error.max(initial=0.0)),
-            signal=math.sqrt(float(np.sum(change**2)) / total) if total > 0.0 else 0.0,
+            signal=math.sqrt(squares / total) if total > 0.0 else 0.0,
             changed=changed,
             least_changed=max(changed - deviation, 0.0),
         )

@@ -23,8 +23,8 @@ def profile_shares(task: SimulationTask, count: int, device: Device) -> Float64:
     """Return the share of each profile in a sample, in which profiles with large errors are frequent.
 
     A light path left out, slabs and rays change few profiles by much: where the sheet passes a wall or grazes an edge,
-    and where a ray runs beside a lit line. The coarsest light of some profiles shows which ones. A third or more of the
-    shares is equal for all profiles, because finer light may change others.
+    and where a ray runs beside a lit line. The coarsest light of some profiles shows which ones. A quarter or more of
+    the shares is equal for all profiles, because finer light may change others.
 
     Parameters
     ----------

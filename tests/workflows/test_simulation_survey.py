@@ -16,7 +16,7 @@ from gpuvision.workflows.planning_simulation import plan_task
 from gpuvision.workflows.simulation_plan import SimulationPlanLimits
 from gpuvision.workflows.simulation_sample import ProfileSample, SampleReader
 from gpuvision.workflows.simulation_survey import profile_shares
-from workflows.test_planning_simulation import MM, heights_of, task_of
+from workflows.test_planning_simulation import MM, heights_of, reading_at, task_of
 
 COUNT = 100
 
@@ -87,6 +87,21 @@ def test_equal_shares_are_equal_chances() -> None:
     sample = sample_of(None, 10, 20)
     for groups, count in ((0, 6), (1, 16), (2, 36)):
         np.testing.assert_allclose(sample.chances(groups), count / COUNT)
+
+
+def test_profiles_count_by_their_chances_in_the_error_and_the_signal() -> None:
+    """One certain profile, and one that stands for four: means over five profiles."""
+    reader = SampleReader.of(task_of(), Device.best())
+    u = np.zeros((2, 16))
+    moved = u + np.array([[0.0], [1e-6]])
+    found, reference = reading_at(reader, moved, np.array([[1.0], [1.1]])), reading_at(reader, u)
+    chances = np.array([1.0, 0.25])
+    difference = reader.compare(found, reference, chances)
+    assert difference.signal == pytest.approx(0.1 * np.sqrt(4.0 / 5.0))
+    # The standard error is that of one profile with the chance 1/4: its residual is 4 times 1/5 of the square.
+    single = reader.mean_squares(found, reference)[1]
+    deviation = 2.0 * np.sqrt(0.75 * 2.0) * 4.0 / 5.0 / 5.0 * single
+    assert difference.error == pytest.approx(np.sqrt(0.8 * single + deviation))
 
 
 def test_the_mean_over_the_part_is_estimated_without_bias() -> None:

@@ -16,6 +16,7 @@ from gpuvision.cli.arguments import (
     claim_outputs,
     device_of,
     echo,
+    echo_warnings,
     length_of,
     named_path,
     pose_of,
@@ -166,6 +167,7 @@ def locate_robot(
             picture, described, camera, pixel, line_width, blind_radius, threshold=threshold, device=devices
         )
     located = locate(measured, described, initial_pose=pose, scale=pixel, device=devices)
+    echo_warnings(located.warnings, err=True)
     report_pose(located, lambda path: draw_located_robot(path, located, picture), out, as_json, outputs)
 
 

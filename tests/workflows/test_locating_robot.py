@@ -408,6 +408,7 @@ def test_a_search_and_its_evidence(is_scan: bool, known: bool, refused: bool, mo
     monkeypatch.setattr(locating_robot, "_search_map", lambda *_: field_map)
     monkeypatch.setattr(locating_robot, "find_pose_candidates", search)
     monkeypatch.setattr(locating_robot, "evidence", weigh)
+    monkeypatch.setattr(locating_robot, "point_scale", lambda *_, **__: None)
     sizes: list[Any] = []
 
     class Devices(StepDevices):
@@ -495,6 +496,50 @@ def test_one_line_tells_a_part(device: Device, rng: np.random.Generator) -> None
     assert Status.AMBIGUOUS in located.candidates[0].status
     assert np.isnan(located.candidates[0].covariance).all()
     assert "fix a part of it only" in located.summary()
+
+
+def seen_points(field: Field, pose: tuple[float, float, float], rng: np.random.Generator) -> np.ndarray:
+    """Return 128 points (128, 2) within 6 m, evenly along the straight lines, with 1 cm of noise."""
+    ends = np.array(field.lines).reshape(-1, 2, 2)
+    size = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
+    line = rng.choice(len(ends), 4000, p=size / size.sum())
+    away = ends[line, 0] + rng.uniform(size=(4000, 1)) * (ends[line, 1] - ends[line, 0]) - pose[:2]
+    near = away[np.hypot(*away.T) < 6.0][:128]
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return (near @ np.array([[c, -s], [s, c]]) + rng.normal(0.0, 0.01, near.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("error", [0.0, 0.01, -0.04])
+def test_a_wrong_scale_of_points_is_named(error: float, device: Device, rng: np.random.Generator) -> None:
+    """An error of 1 % is a warning, one of 4 % refuses the pose; both are measured right."""
+    field = read_field("robocup_msl")
+    for pose in ((-6.0, 2.0, 0.7), (3.0, -1.5, -2.0)):
+        points = ((1.0 + error) * seen_points(field, pose, rng)).astype(np.float32)
+        located = locate_robot(points, field, scale=SCALE, device=device)
+        assert located.point_scale is not None
+        assert located.point_scale.error == pytest.approx(error, abs=5.0 * located.point_scale.sigma)
+        assert located.point_scale.sigma < 2e-3
+        messages = (*located.warnings, *filter(None, [located.reason]))
+        assert len(messages) == (error != 0.0)
+        assert bool(located.reason) == (abs(error) > 0.02)
+        assert bool(located.candidates) != bool(located.doubtful)
+        for message in messages:
+            assert f"{'farther from' if error > 0 else 'nearer to'} the robot than the lines of the field" in message
+            assert f", not {1e3 * SCALE:.4g} mm?" in message
+
+
+def test_the_limit_of_the_scale_is_larger_for_scans(device: Device, rng: np.random.Generator) -> None:
+    field = read_field("robocup_msl")
+    points = (1.03 * seen_points(field, (-6.0, 2.0, 0.7), rng)).astype(np.float32)
+    scan = FloorScan(points, np.full(len(points), 0.01, np.float32), np.empty((0, 4), np.float32), WIDE)
+    found = locate_robot(scan, field, device=device)
+    assert (found.reason, len(found.warnings)) == ("", 1)
+    assert "height and tilt of the camera" in found.warnings[0]
+    assert found.warnings[0] == locate_robot(points, field, device=device).reason
+    # The significance is a limit, too.
+    limits = RobotLimits(scale_significance=1e6)
+    kept = locate_robot(points, field, device=device, limits=limits)
+    assert (kept.reason, kept.warnings) == ("", ())
 
 
 @pytest.mark.slow

@@ -402,8 +402,8 @@ def find_pose_candidates(
     """Return the poses that fit the points, best first; an empty tuple where no pose does.
 
     A robot that sees 6 m of a middle-size field is found with 70 % of its points in clutter (150 of 150 trials, up to
-    the field's symmetry). A robot that sees 3 m is often not found: another place fits equally well, and is among the
-    candidates.
+    the field's symmetry). A robot that sees 3 m is often not found: another place fits equally well. In 4 of 22 such
+    views the true pose was not among the candidates.
 
     Parameters
     ----------

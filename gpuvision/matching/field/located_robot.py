@@ -15,6 +15,7 @@ from gpuvision.host import Device
 from gpuvision.matching.field.distance_map import Field
 from gpuvision.matching.field.evidence import Evidence
 from gpuvision.matching.field.field_pose import PoseCandidate
+from gpuvision.matching.field.point_scale import PointScale
 from gpuvision.status import Status
 
 Float32 = npt.NDArray[np.float32]
@@ -40,6 +41,10 @@ class LocatedRobot:
         Size of a pixel of the top view [m]; None where points were given.
     reason
         Why the pose is refused; ``""`` where it is accepted.
+    point_scale
+        Error of the scale of the points, fitted about the best pose; None where it is not determined or not tested.
+    warnings
+        Messages that do not refuse the pose, such as a small but significant error of the scale.
     device
         Device of the search.
     seconds
@@ -59,6 +64,8 @@ class LocatedRobot:
     device: Device
     seconds: dict[str, float]
     steps: dict[str, Any] = dataclasses.field(default_factory=dict)
+    point_scale: PointScale | None = None
+    warnings: tuple[str, ...] = ()
 
     def summary(self) -> str:
         """Return one line for each candidate, or the reason of the refusal."""
@@ -96,6 +103,8 @@ class LocatedRobot:
             "candidates": [_candidate_report(each) for each in self.candidates],
             "evidence": _evidence_report(self.evidence),
             "scale": self.scale,
+            "point_scale": None if self.point_scale is None else self.point_scale._asdict(),
+            "warnings": list(self.warnings),
             "points": self.points.tolist(),
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
             "steps": self.steps,

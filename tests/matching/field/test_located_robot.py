@@ -14,6 +14,7 @@ from gpuvision.host import Device
 from gpuvision.matching.field.evidence import Evidence
 from gpuvision.matching.field.field_pose import PoseCandidate
 from gpuvision.matching.field.located_robot import LocatedRobot
+from gpuvision.matching.field.point_scale import PointScale
 from gpuvision.status import Status
 
 COVARIANCE = np.diag([4e-4, 9e-4, 1e-4])
@@ -36,6 +37,8 @@ def located(device: Device, **changes: Any) -> LocatedRobot:
         "device": device,
         "steps": {"search": {"device": device.label, "seconds": {}, "unusable": {}}},
         "seconds": {"lines": 0.5},
+        "point_scale": PointScale(0.01, 0.002),
+        "warnings": ("a warning",),
     }
     return LocatedRobot(**{**values, **changes})
 
@@ -63,6 +66,8 @@ def test_report(device: Device) -> None:
         "candidates": [known, partly],
         "evidence": {"log10_nfa": pytest.approx(-2.0), "on_lines": 0.6, "expected": 40, "seen": 0.8},
         "scale": 0.04,
+        "point_scale": {"error": 0.01, "sigma": 0.002},
+        "warnings": ["a warning"],
         "points": [[1.0, 2.0], [3.0, 4.0]],
         "device": {"label": device.label, "name": device.name, "driver": device.driver},
         "steps": {"search": {"device": device.label, "seconds": {}, "unusable": {}}},
@@ -70,6 +75,7 @@ def test_report(device: Device) -> None:
     }
     refused = located(device, candidates=(), evidence=None, reason="no lines").report()
     assert (refused["status"], refused["reason"], refused["evidence"]) == ("refused", "no lines", None)
+    assert located(device, point_scale=None, warnings=()).report()["point_scale"] is None
     unseen = located(device, evidence=EVIDENCE._replace(expected=0, seen=math.nan)).report()
     assert unseen["evidence"]["seen"] is None
 

@@ -37,11 +37,11 @@ from gpuvision.workflows.simulation_survey import profile_shares
 Progress = Callable[[int, int | None], object]
 
 # Profiles of a part up to which planning takes longer than it saves, with and without multi-bounce light. Measured on
-# PoCL beside other work: planning without it took the time of 484 to 1067 profiles of the sensor file's light (two
-# sensors, two tolerances). A plan of half of that light's time then saves time from 968 to 2134 profiles on. With it,
-# planning took the time of 115 profiles (one part). That was before settings, and the errors of the reference, were
-# tried on more profiles: it takes longer now. The limits were not measured again.
-_WORTH_BOUNCES, _WORTH = 120, 2000
+# PoCL beside other work: planning without it took the time of 1815 to 2741 profiles of the sensor file's light (a part
+# of 2500 profiles, two sensors, two tolerances). A plan of half of that light's time then saves time from 3630 to 5482
+# profiles on. With it, planning took the time of 115 profiles (one part). That was before settings, and the errors of
+# the reference, were tried on more profiles: it takes longer now. This limit was not measured again.
+_WORTH_BOUNCES, _WORTH = 120, 4000
 # A setting whose error is undecided is worth more profiles if the fastest certain setting takes this many times its
 # time or more. Chosen: the largest ratio to the best setting that a plan should have, 1.5, less the scatter of times.
 _GAIN = 1.25

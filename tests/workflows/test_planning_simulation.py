@@ -308,7 +308,7 @@ def test_the_plan_of_a_job_simulates(tmp_path: Any) -> None:
     assert done.attribution.error.shape == (6, 16)
 
 
-@pytest.mark.parametrize(("paths", "albedo", "most"), [(PATHS, 0.7, 120), (PATHS, 0.0, 2000), (INDIRECT, 0.7, 2000)])
+@pytest.mark.parametrize(("paths", "albedo", "most"), [(PATHS, 0.7, 120), (PATHS, 0.0, 4000), (INDIRECT, 0.7, 4000)])
 def test_small_parts_are_not_worth_planning(paths: tuple[str, ...], albedo: float, most: int) -> None:
     """Black surfaces have no multi-bounce light."""
     task = dataclasses.replace(task_of(paths=paths), materials=white(albedo))

@@ -60,7 +60,7 @@ _BOUNCES = 0.5  # share of the PSD's jobs with multi-bounce light, which takes m
 
 
 class TrueRays(NamedTuple):
-    """Rays of truth per bin along u and along v, as factors of those of the sensor file.
+    """Numbers of rays per bin of the true light, along u and along v, as multiples of those in the sensor file.
 
     Attributes
     ----------

@@ -43,7 +43,7 @@ class SimulationPlanLimits(AccuracyLimits):
     surveyed : int
         Number of profiles of a part with more than ``profiles`` and ``checked`` profiles whose coarsest light shows
         where errors are large, so that more of these profiles are tried, 0 or more; 0: evenly spaced ones are tried.
-        Default 200: a wall of 1/100 of the part is met.
+        Default 200 (chosen): places of 1/200 of the part or more are met.
     """
 
     max_moved: float = 0.005

@@ -76,6 +76,8 @@ def _changes(task: SimulationTask, places: Float64, device: Device) -> Iterator[
 
 
 def _light(paths: LightPaths, names: Sequence[str], places: Float64) -> dict[str, Exposure]:
-    """Return the light of some paths by name (profiles, samples, bins)."""
+    """Return the light of some paths by name (profiles, samples, bins); nothing is computed for no paths."""
+    if not names:
+        return {}
     light = stack_profiles([each.exposures for each in paths.profiles(places)])
     return {name: light[name] for name in names if name in light}

@@ -289,7 +289,7 @@ def test_more_profiles_are_compared_together_with_the_sample() -> None:
         expected = sample.reader.compare(one, finest)
         assert found.profiles == len(places)
         assert found.change == pytest.approx(expected.error, rel=1e-3)
-        # The errors of the reference are those of a sample of all these profiles.
+        # The error of the reference is the same as if all these profiles were the sample.
         alone = LightOptions(dataclasses.replace(sample, places=places, others=()), 1e-9, lambda done, of: None)
         errors = SimulationReference(alone).errors()
         assert found.finest == pytest.approx(total_error(errors.most.values()), rel=1e-3)

@@ -51,6 +51,15 @@ def test_profiles_whose_light_changes_have_large_shares() -> None:
     assert most in ProfileSample.of(task, 6, device, others=(12,), shares=shares).numbers[1]
 
 
+def test_direct_light_alone_has_the_shares_of_its_slabs() -> None:
+    """Against heights with one slab; without indirect light nothing else changes."""
+    task, device = long_task(paths=("direct",)), Device.best()
+    whole, one = (heights_of(task, device, task.transports, **slabs) for slabs in ({}, {"sub_sheets": 1}))
+    change = np.nanmean((one - whole) ** 2, axis=-1)
+    expected = 0.5 / COUNT + 0.5 * change / change.sum()
+    np.testing.assert_allclose(profile_shares(task, COUNT, device), expected, rtol=0.3)
+
+
 def test_parts_with_few_profiles_are_not_surveyed(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 

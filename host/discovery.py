@@ -52,6 +52,9 @@ _BUSY = re.compile(
     "exit (-9|137):|OUT_OF_RESOURCES|OUT_OF_HOST_MEMORY|MEM_OBJECT_ALLOCATION_FAILURE|DEVICE_NOT_AVAILABLE"
 )
 
+# Messages of drivers and compilers where the cache folder or the folder of temporary files is full: probed again, too.
+_DISK_FULL = re.compile("No space left on device|disk is full|Disk quota exceeded|File too large")
+
 
 @dataclass(frozen=True)
 class ListedDevice:
@@ -126,6 +129,11 @@ class ProbedDevice(ListedDevice):
             return (
                 "the driver hangs, or the machine is busy; the verdict is kept for an hour: "
                 "`gpuvision devices --probe` asks again"
+            )
+        if _DISK_FULL.search(self.reason):
+            return (
+                f"free some space in {cache_folder()}, or set XDG_CACHE_HOME to a folder with space, and start again: "
+                "the verdict is not kept"
             )
         if _BUSY.search(self.reason):
             return "the device or the machine is busy; start again when it is idle: the verdict is not kept"
@@ -309,8 +317,8 @@ def probed_devices(*, probe_again: bool = False) -> tuple[ProbedDevice, ...]:
     Notes
     -----
     Verdicts are cached in the user's cache folder for each driver version. The first call on a machine takes about a
-    second per device. The verdict of a busy device (no memory) is not cached, the verdict of a device that does
-    not answer within the time limit for an hour.
+    second per device. The verdict of a busy device (no memory) or of a full disk is not cached, the verdict of a device
+    that does not answer within the time limit for an hour.
     """
     check_process()
     if probe_again:
@@ -326,11 +334,16 @@ def _probed_devices(*, trust_bad: bool) -> tuple[ProbedDevice, ...]:
     for each in listed:
         if each.key not in known:
             fresh[each.key] = _ask_probe(each.platform_index, each.device_index)
-    lasting = {key: reason for key, reason in fresh.items() if not _BUSY.search(reason)}
+    lasting = {key: reason for key, reason in fresh.items() if not _is_passing(reason)}
     if lasting:
         _keep_verdicts(lasting)
     verdicts = known | fresh
     return tuple(_with_verdict(each, _one_line(verdicts[each.key])) for each in listed)
+
+
+def _is_passing(reason: str) -> bool:
+    """Return whether the device may work at the next start: the machine is busy, or a disk is full."""
+    return bool(_BUSY.search(reason) or _DISK_FULL.search(reason))
 
 
 def _one_line(reason: str) -> str:

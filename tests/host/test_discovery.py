@@ -160,6 +160,26 @@ def test_verdict_of_a_busy_device_is_not_kept(see: Any, reason: str) -> None:
     assert probed == [(0, 0)]
 
 
+@pytest.mark.parametrize(
+    "reason",
+    [
+        "the runtime ended the probe's process (exit 1: LLVM ERROR: No space left on device)",
+        "the runtime ended the probe's process (exit 1: sqlite3.OperationalError: database or disk is full)",
+        "clBuildProgram failed: IO failure on output stream: Disk quota exceeded",
+        "the runtime ended the probe's process (exit 1: LLVM ERROR: File too large)",
+    ],
+)
+def test_verdict_on_a_full_disk_is_not_kept(see: Any, reason: str) -> None:
+    """Messages of PoCL 3.1 and pyopencl in a full cache folder; the device works as soon as there is space."""
+    see(FakePlatform(), probe=lambda p, d: reason)
+    (full,) = discovery.probed_devices()
+    assert (full.healthy, full.reason) == (False, reason)
+    assert f"free some space in {discovery.cache_folder()}" in full.advice
+    probed = see(FakePlatform())
+    assert discovery.probed_devices()[0].healthy
+    assert probed == [(0, 0)]
+
+
 def test_verdict_of_a_driver_without_answer_is_kept_for_an_hour(see: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 1_000_000.0
     monkeypatch.setattr(discovery.time, "time", lambda: now)

@@ -99,6 +99,16 @@ def test_home_that_cannot_be_written(vendors: Path, monkeypatch: pytest.MonkeyPa
     assert _exposed().is_relative_to(folder)
 
 
+def test_home_without_space_for_kernels(small_disk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """PoCL cannot compile where its cache is full."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(small_disk))
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    cache.provide_cache()
+    assert Path(os.environ["XDG_CACHE_HOME"]).parent == tmp_path / "temporary"
+    assert [path for path in small_disk.rglob("*") if path.is_file()] == []
+
+
 def test_home_that_can_be_written_is_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "new"))
     cache.provide_cache()

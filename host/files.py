@@ -48,10 +48,16 @@ class _CountedFile(io.RawIOBase):
     """Binary file that continues to count its size when the disk is full, so that the error can name the required size.
 
     It has no file descriptor for its users, so that NumPy and Pillow write through `write`, too.
+
+    Parameters
+    ----------
+    path, target : pathlib.Path
+        File to write, and name of the file for errors.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, target: Path) -> None:
         self._file = path.open("wb")
+        self._target = target
         self._position = 0
         self.wanted = 0
         self.is_full = False
@@ -99,8 +105,16 @@ class _CountedFile(io.RawIOBase):
             call(*arguments)
         except OSError as error:
             if error.errno not in _DISK_FULL:
+                _set_name(error, self._target)
                 raise
             self.is_full = True
+
+
+def _set_name(error: OSError, path: Path) -> None:
+    """Set the file of an error of the system: an error of writing has no file name."""
+    error.filename = os.fspath(path)
+    if error.errno == errno.EFBIG:
+        error.strerror = "the file is larger than the file system or the limit of the process (ulimit -f) allows"
 
 
 @contextlib.contextmanager
@@ -133,7 +147,7 @@ def atomic_write(path: str | os.PathLike[str], *, overwrite: bool = False, mode:
     """
     path = Path(path)
     if is_device(path):
-        with path.open("wb") as device:
+        with _naming(path), path.open("wb") as device:
             yield device
         return
     path = path.resolve()
@@ -142,7 +156,7 @@ def atomic_write(path: str | os.PathLike[str], *, overwrite: bool = False, mode:
     if not overwrite:
         _check_free(path)
     with _temporary(path.parent, functools.partial(Path.touch, mode=mode)) as temporary:
-        with contextlib.closing(_CountedFile(temporary)) as file:
+        with contextlib.closing(_CountedFile(temporary, path)) as file:
             yield cast(BinaryIO, file)
             file.synchronise()
         if not file.is_full:
@@ -151,6 +165,16 @@ def atomic_write(path: str | os.PathLike[str], *, overwrite: bool = False, mode:
             os.replace(temporary, path)
     if file.is_full:
         raise DiskFullError(path, file.wanted)
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            _set_name(error, path)
+        raise
 
 
 def _check_free(path: Path) -> None:
@@ -255,6 +279,9 @@ def atomic_folder(folder: str | Path) -> Iterator[Path]:
                 _move(inside, folder, replaced)
             except OSError as error:
                 if error.errno not in _DISK_FULL:
+                    is_inside = error.filename is not None and Path(error.filename).is_relative_to(inside)
+                    if is_inside or (error.filename is None and error.errno == errno.EFBIG):
+                        _set_name(error, _target(error, inside, folder))
                     raise
                 full = _target(error, inside, folder), _size(inside) + getattr(error, "wanted", 0)
         if full is not None:

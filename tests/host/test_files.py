@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import os
+import resource
 import stat
 import subprocess
 import sys
@@ -198,18 +199,6 @@ def test_what_a_killed_process_left_goes_with_the_next_one(tmp_path: Path) -> No
     assert {each.name for each in tmp_path.iterdir()} == {"other", *(each.name for each in foreign)}
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """Yield the folder of a file system of 64 KiB."""
-    folder = tmp_path / "small"
-    folder.mkdir()
-    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", folder], capture_output=True, check=False)
-    if done.returncode:
-        pytest.skip("only root mounts a small file system")
-    yield folder
-    subprocess.run(["umount", folder], check=True)
-
-
 def test_a_full_disk_is_named_with_wanted_and_free_bytes(small_disk: Path) -> None:
     (small_disk / "old").write_bytes(bytes(8192))
 
@@ -261,6 +250,55 @@ def test_a_full_disk_of_every_kind_of_write(tmp_path: Path, monkeypatch: pytest.
     np.savez(plain, a=np.zeros(100_000), b=np.zeros(7))
     assert raised.value.wanted == len(plain.getvalue())
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def small_files() -> Iterator[None]:
+    """Let this process write files of at most 64 KiB, as a file system with a largest file does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (65536, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.usefixtures("small_files")
+@pytest.mark.parametrize("is_direct", [False, True])
+def test_a_file_that_is_too_large_is_named(tmp_path: Path, is_direct: bool) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "large").write_text("old")
+
+    def write() -> None:
+        with files.atomic_folder(out) as inside:
+            if is_direct:  # as Matplotlib and Pillow write
+                (inside / "large").write_bytes(bytes(70_000))
+            with files.atomic_write(inside / "large") as file:
+                file.write(bytes(70_000))
+
+    with pytest.raises(OSError, match="larger than the file system or the limit of the process") as raised:
+        write()
+    named = out if is_direct else out / "large"  # the system names no file
+    assert (raised.value.errno, raised.value.filename) == (errno.EFBIG, str(named))
+    assert [(each.name, each.read_text()) for each in out.iterdir()] == [("large", "old")]
+    with pytest.raises(OSError, match="larger than the file system") as raised, files.atomic_write(out / "new") as file:
+        file.write(bytes(70_000))
+    assert raised.value.filename == str(out / "new")
+
+
+def test_an_error_names_the_final_file_and_not_the_temporary_one(tmp_path: Path) -> None:
+    def write() -> None:
+        with files.atomic_folder(tmp_path / "out") as inside:
+            (inside / "missing" / "file").write_text("x")
+
+    with pytest.raises(FileNotFoundError) as raised:
+        write()
+    assert raised.value.filename == str(tmp_path / "out" / "missing" / "file")
+
+
+def test_a_full_device_is_named() -> None:
+    with pytest.raises(OSError, match="No space left") as raised, files.atomic_write("/dev/full") as file:
+        file.write(b"x")
+    assert raised.value.filename == "/dev/full"
 
 
 @pytest.mark.parametrize("links", [True, False])

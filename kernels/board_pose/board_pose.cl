@@ -68,8 +68,8 @@ kernel void board_lines(global const real *restrict places, global const real *r
 //          POSE_PARAMETERS); residuals [m] and weights (lines, rows of a line); scale, residual_scale, condition, rank,
 //          inliers, status, etch [m], inlier_fraction, leverage: one number each (pose/pose.cl); edges [px], edge_status,
 //          edge_weights (lines, each); of_lines (lines,): status, as in line_fit/line_fit.cl.
-// Options: the options of ruler/ruler.h, line_fit/line_fit.h and pose/pose.h; MAX_RULERS_PER_LINE: capacity
-//          for the rulers of a line; MAX_RULERS: capacity for all rulers.
+// Options: the options of ruler/ruler.h, line_fit/line_fit.h and pose/pose.h (ROWS_IN_PAIRS: lines have several rulers);
+//          MAX_RULERS_PER_LINE: capacity for the rulers of a line; MAX_RULERS: capacity for all rulers.
 // Work:    one work-item.
 #include "board_pose/board_edge.h"
 #include "board_pose/board_line.h"

@@ -19,7 +19,7 @@
 //          FREEDOMS: number of unknowns, POSE_PARAMETERS and the etch bias. WITH_ETCH_BIAS: solve for the etch bias.
 //          CAPACITY: size of the row arrays. START_STEPS: Gauss-Newton steps of a start candidate. GIVEN_SCALE: known
 //          scale of the residuals in sigmas; otherwise it is estimated from their median. EFFICIENCY: of the loss for
-//          normal residuals, for the covariance at a known scale.
+//          normal residuals, for the covariance at a known scale. ROWS_IN_PAIRS: rows 2 k and 2 k + 1 are of one line.
 #ifndef POSE_H
 #define POSE_H
 
@@ -185,25 +185,62 @@ static inline void pose_covariance(private solved_pose *fit, private const pose_
     }
 }
 
-// Return the largest leverage of an inlier: h^T A^-1 h / sigma^2, with the covariance variance * A^-1.
+#ifdef ROBUST
+// Compute the Jacobian rows of LANES rows from row `at` on, divided by their sigmas; 0 for outliers.
+INLINE void inlier_jacobian(GROUP_SPACE const solved_pose *fit, pose_rows all, int at, private reals *jacobian) {
+    const laned_row row = row_of(all, at);
+    const pose_equation equation = equation_of(fit->pose, row);
+    const masks is_in = mask_of(row.certainty * loss_weight(equation.residual * row.certainty / fit->scale) > (reals)0);
+    for (int i = 0; i < FREEDOMS; i++) jacobian[i] = kept_where(is_in, equation.row[i] * row.certainty);
+}
+
+// Return h^T A^-1 g, with the covariance variance * A^-1.
+INLINE reals hat_element(GROUP_SPACE const solved_pose *fit, private const reals *h, private const reals *g) {
+    reals sum = 0;
+    for (int i = 0; i < FREEDOMS; i++)
+        for (int k = 0; k < FREEDOMS; k++) sum += h[i] * g[k] * (reals)(fit->covariance[i][k] / fit->variance);
+    return sum;
+}
+
+#ifdef ROWS_IN_PAIRS
+// Return the leverage of the pairs (row 2 k, row 2 k + 1) in the lanes of their rows, from the scaled rows h of `at`.
+//
+// The pair's block of the hat matrix is ((a, c), (c, b)). Its larger eigenvalue is the share of a combination of the two
+// rows that the pair determines itself: 1 where the other rows do not check it.
+INLINE reals pair_leverage(GROUP_SPACE const solved_pose *fit, pose_rows all, int at, private const reals *h) {
+    reals other[FREEDOMS];
+#ifdef VECTOR_VARIANT
+    for (int i = 0; i < FREEDOMS; i++) other[i] = h[i].s1032547698badcfe;
+#else
+    inlier_jacobian(fit, all, at ^ 1, other);
+#endif
+    const reals a = hat_element(fit, h, h), b = hat_element(fit, other, other), c = hat_element(fit, h, other);
+    const reals half_difference = (reals)0.5f * (a - b);
+    return (reals)0.5f * (a + b) + sqrt(half_difference * half_difference + c * c);
+}
+#endif
+#endif
+
+// Return the largest leverage of an inlier: h^T A^-1 h / sigma^2.
+//
+// ROWS_IN_PAIRS: of a pair of rows where at most half of the rows are inliers. Both rows of a pair come from one line of
+// the artwork; an outlier displaces both, so that they do not check each other. Without a majority, another pose may have
+// as many inliers by chance.
 INLINE real pose_leverage(GROUP_SPACE const solved_pose *fit, pose_rows all, pose_room room) {
     real leverage = 0;
 #ifdef ROBUST
-    const laned_pose pose = fit->pose;
-    const real scale = fit->scale, variance = fit->variance;
     EACH_PART(part) {
         real largest = 0;
         for (int at = part * LANES; at < all.count; at += PARTS * LANES) {
-            const laned_row row = row_of(all, at);
-            const pose_equation equation = equation_of(pose, row);
-            const masks is_in =
-                mask_of(row.certainty * loss_weight(equation.residual * row.certainty / scale) > (reals)0);
-            reals sum = 0;
-            for (int i = 0; i < FREEDOMS; i++)
-                for (int k = 0; k < FREEDOMS; k++)
-                    sum += equation.row[i] * equation.row[k] * (reals)(fit->covariance[i][k] / variance);
-            sum = kept_where(is_in, sum * row.certainty * row.certainty);
-            for (int lane = 0; lane < LANES; lane++) largest = max(largest, LANE(sum, lane));
+            reals h[FREEDOMS];
+            inlier_jacobian(fit, all, at, h);
+#ifdef ROWS_IN_PAIRS
+            const int is_majority = 2 * fit->inliers > fit->present;
+            const reals of = is_majority ? hat_element(fit, h, h) : pair_leverage(fit, all, at, h);
+#else
+            const reals of = hat_element(fit, h, h);
+#endif
+            for (int lane = 0; lane < LANES; lane++) largest = max(largest, LANE(of, lane));
         }
         leverage = largest;
 #ifdef IN_GROUP

@@ -15,7 +15,7 @@ import pytest
 from canary import Guarded
 from gpuvision.host import Device, Trace
 from gpuvision.matching.features.ruler import RulerEdges
-from gpuvision.matching.pose.board_pose import BoardPoseEstimator, place_rulers
+from gpuvision.matching.pose.board_pose import BoardPoseEstimator, FitBoardLines, MeasureBoardEdges, place_rulers
 from gpuvision.matching.pose.pose import SolvePose, line_rows
 from gpuvision.reference import robust
 from gpuvision.status import Status
@@ -27,6 +27,7 @@ PLACE = (3e-3, -1e-3)
 # An oblique camera with y upwards in the image.
 MATRIX = np.array([[1.0 / PIXEL, 0.0, 240.0], [0.0, -1.0 / PIXEL, 180.0], [6.0, 3.0, 1.0]])
 POSE = np.array([3e-5, -2e-5, 0.006])
+ANGLES = np.arange(LINES) * np.pi / LINES + 0.1  # of the normals [rad]
 
 
 def on_board(points: np.ndarray) -> np.ndarray:
@@ -35,22 +36,28 @@ def on_board(points: np.ndarray) -> np.ndarray:
     return np.asarray(lifted[..., :2] / lifted[..., 2:])
 
 
-def artwork() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def artwork(angle: np.ndarray = ANGLES) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return normals and points of the lines, one in the middle of each patch, and the offsets of their rulers."""
-    angle = np.arange(LINES) * np.pi / LINES + 0.1
     middle = [((i % 4 + 0.5) * PATCH, (i // 4 + 0.5) * PATCH) for i in range(LINES)]
     along = np.tile(np.linspace(-20.0, 20.0, EACH) * PIXEL, (LINES, 1))
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1), on_board(np.array(middle)), along
 
 
-def picture(rng: np.random.Generator, pose: np.ndarray = POSE, shifted: tuple[int, ...] = ()) -> np.ndarray:
-    """Return an image of the artwork's edges at a pose, each in its patch; some are displaced by 10 px."""
-    normal, point, _ = artwork()
+def picture(
+    rng: np.random.Generator,
+    pose: np.ndarray = POSE,
+    shifted: tuple[int, ...] = (),
+    shifts_px: np.ndarray | None = None,
+    angle: np.ndarray = ANGLES,
+) -> np.ndarray:
+    """Return an image of the artwork's edges at a pose, each in its patch; some are displaced by 10 px, or as given."""
+    normal, point, _ = artwork(angle)
+    shift_px = 10.0 * np.isin(np.arange(LINES), shifted) if shifts_px is None else shifts_px
     row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
     matrix, shift = robust.transform_of(pose)
     back = (on_board(np.stack([column, row], axis=-1)) - shift) @ np.linalg.inv(matrix).T
     which = row // PATCH * 4 + column // PATCH
-    away = np.sum((back - point[which]) * normal[which], axis=-1) / PIXEL - 10.0 * np.isin(which, shifted)
+    away = np.sum((back - point[which]) * normal[which], axis=-1) / PIXEL - shift_px[which]
     image = 100.0 + 50.0 * np.tanh(away / 1.3) + rng.normal(0.0, NOISE, SHAPE)
     return np.rint(image).astype(np.uint8)
 
@@ -60,8 +67,8 @@ def operation(variant: Any = "auto", **more: Any) -> BoardPoseEstimator:
     return BoardPoseEstimator(ruler=ruler, lines=LINES, rulers_per_line=EACH, solver=SolvePose(placement=PLACE, **more))
 
 
-def board_rulers(sigma: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    normal, point, along = artwork()
+def board_rulers(sigma: float = 0.0, angle: np.ndarray = ANGLES) -> tuple[np.ndarray, np.ndarray]:
+    normal, point, along = artwork(angle)
     return place_rulers(normal, point, along, MATRIX, sigma)
 
 
@@ -218,6 +225,59 @@ def test_covariance_is_what_is_measured(device: Device, variant: Any, rng: np.ra
     assert (ratio > 0.7).all()
     squares = np.einsum("bi,bij,bj->b", np.array(found), np.linalg.inv(covariance), np.array(found))
     assert squares.max() < 49.0
+
+
+def largest_leverages(
+    fix: BoardPoseEstimator, image: np.ndarray, placed: tuple[np.ndarray, np.ndarray], weights: Any, device: Device
+) -> tuple[float, float]:
+    """Return the largest leverage of a row and of a line, from the hat matrix of the rows with a weight."""
+    measure = MeasureBoardEdges(
+        ruler=replace(fix.ruler, variant="work_item"), lines=fix.lines, rulers_per_line=fix.rulers_per_line
+    )
+    edges = measure(image, placed[0], device=device)
+    rows = FitBoardLines(solver=fix.solver)(edges.places, edges.sigmas, placed[1], device=device).rows.astype(float)
+    nx, ny, x, y, _, _, sigma = rows.T
+    x, y = 1e3 * (x - x.mean()), 1e3 * (y - y.mean())
+    jacobian = np.where(weights.reshape(-1, 1) > 0.0, np.column_stack([nx, ny, ny * x - nx * y]) / sigma[:, None], 0.0)
+    hat = jacobian @ np.linalg.pinv(jacobian)
+    of_lines = [np.linalg.eigvalsh(hat[i : i + 2, i : i + 2])[-1] for i in range(0, len(hat), 2)]
+    return float(np.diag(hat).max()), float(max(of_lines))
+
+
+@VARIANTS
+def test_two_rows_of_a_line_do_not_check_each_other(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    """Another board: only half of the lines agree, by chance, three in each direction."""
+    angle = np.where(np.arange(LINES) % 2, 0.02, 0.5 * np.pi - 0.03)
+    shifts_px = np.array([1.5, 1.5, 1.5, 1.5, 5.0, -3.0, -3.0, 5.0, -5.0, 3.0, 1.5, 1.5])
+    image, placed = picture(rng, shifts_px=shifts_px, angle=angle), board_rulers(angle=angle)
+    fix = operation(variant, max_trials=256)
+    refused = fix(image, *placed, device=device)
+    assert refused.status == Status.AMBIGUOUS
+    assert np.isnan(refused.pose).all()
+    # No other limit refuses the pose: each row has two other rows that check it, but one of them is of its own line.
+    lenient = operation(variant, max_trials=256, max_leverage=1.0)
+    found = lenient(image, *placed, device=device)
+    assert found.status == Status.OK
+    np.testing.assert_array_equal((found.weights > 0.0).all(axis=1), shifts_px == 1.5)
+    of_row, of_line = largest_leverages(lenient, image, placed, found.weights, device)
+    assert of_row < 0.95 / 2 < of_line
+    np.testing.assert_allclose([refused.leverage, found.leverage], of_line, rtol=0.01)
+
+
+@VARIANTS
+def test_a_majority_of_the_lines_gives_the_pose(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    """Four displaced lines of twelve: rows are checked one by one, although a line has a high leverage."""
+    shifts_px = np.zeros(LINES)
+    shifts_px[::3] = [-3.0, 2.0, 4.0, -5.0]
+    image, placed = picture(rng, shifts_px=shifts_px), board_rulers()
+    fix = operation(variant, max_trials=256)
+    result = fix(image, *placed, device=device)
+    assert result.status == Status.OK
+    np.testing.assert_array_equal((result.weights > 0.0).all(axis=1), shifts_px == 0.0)
+    of_row, of_line = largest_leverages(fix, image, placed, result.weights, device)
+    assert of_row < 0.95 / 2 < of_line
+    np.testing.assert_allclose(result.leverage, of_row, rtol=0.01)
+    assert (np.abs(error(result)) < 5.0 * np.sqrt(np.diag(result.covariance))).all()
 
 
 @VARIANTS

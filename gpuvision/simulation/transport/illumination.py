@@ -21,6 +21,14 @@ Integers = npt.NDArray[np.int64]
 # Least depth of a lit point below the source of a fan, as a fraction of the source's height. Derived: rays then meet
 # H = 0 within a thousand heights, so that x stays finite. Part of the definition of `LightSheet.source`.
 _MIN_DEPTH_FRACTION = 1e-3
+SHORTEST_LINE = 1e-9
+"""Length up to which lit lines are omitted, as a fraction of the largest coordinate: rounding decides the direction of
+a shorter line. Derived: coordinates are rounded to some 1e-15, and lines must lie in their surfaces to 1e-5
+(`SegmentLimits`); a factor of ten. The omitted light is of the same order."""
+# Width of a beam, in parts of the largest coordinate across the light, up to which the line that it lights is omitted.
+# Derived: a surface along the light catches beams of some 1e-15 by rounding, and its line moves infinitely fast as the
+# sheet moves; a factor of a thousand.
+_NARROWEST_BEAM = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,7 +184,8 @@ class LightSheet:
         """Return the segments that a thin sheet lights.
 
         Surfaces are lit on the side that the light comes from. Each ray stops at the first surface that it meets.
-        Error: a few roundings of the coordinates.
+        Error: a few roundings of the coordinates. Lines up to `SHORTEST_LINE`, and lines on surfaces along
+        the light, are omitted.
 
         Parameters
         ----------
@@ -215,7 +224,11 @@ class LightSheet:
         if self.transport.bend is not None:
             ends = _on_planes(ends, scene.corners[triangle])
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-        good = (length > 0.0) & (arriving > 0.0)
+        reach = max(
+            float(np.abs(each).max(initial=0.0)) for each in (ends, sheet_ends, self.transport.origin, transports)
+        )
+        is_wide = lit.right - lit.left > _NARROWEST_BEAM * max(reach, float(np.abs(x).max(initial=0.0)))
+        good = is_wide & (length > SHORTEST_LINE * reach) & (arriving > 0.0)
         sheet, triangle, ends = sheet[good], triangle[good], ends[good]
         line = LitLine(ends, self._normals(scene, triangle, ends), triangle, arriving[good] / length[good])
         return line, np.searchsorted(sheet, np.arange(len(transports) + 1))

@@ -87,7 +87,9 @@ def slanted_limits(
     high = np.where(np.isfinite(upper), upper, slab_high[level][:, None])
     low = np.where(np.isfinite(lower), lower, slab_low[level][:, None])
     start, end = pieces.x[piece].T
-    share = (ends - start[:, None]) / (end - start)[:, None]
+    # A piece whose ends round to one x is not split.
+    extent = (end - start)[:, None]
+    share = np.where(extent > 0.0, (ends - start[:, None]) / np.where(extent > 0.0, extent, 1.0), (0.0, 1.0))
     return SlantedLimits(piece, share[:, 0], share[:, 1], low, np.maximum(low, high))
 
 

@@ -14,7 +14,7 @@ from gpuvision.simulation.scene.rays import ClosestHit
 from gpuvision.simulation.scene.row_padding import run_with_row_padding
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.envelope import upper_envelope
-from gpuvision.simulation.transport.illumination import LightSheet, LitLine
+from gpuvision.simulation.transport.illumination import SHORTEST_LINE, LightSheet, LitLine
 from gpuvision.simulation.transport.mirror_points import TriangleBlocks
 from gpuvision.simulation.transport.sheet_cut import concatenated_ranges
 
@@ -174,7 +174,7 @@ class SpecularInterreflection:
         arriving = (
             beam.line.power[line] * self.reflectance[beam.line.triangle[line]] * (right - left) * fans.length[fan]
         )
-        good = length > 0.0
+        good = length > SHORTEST_LINE * self._reach
         light = fans.light[fan][good]
         triangle = cuts.triangle[member][good]
         return _Beam(_lit_lines(self._planes, ends[good], triangle, (arriving[good] / length[good]), light), light)
@@ -247,7 +247,7 @@ class SpecularInterreflection:
         length = np.linalg.norm(spots[:, 1] - spots[:, 0], axis=1)
         arriving = beam.line.power * beam.line.lengths * self.reflectance[beam.line.triangle]
         arriving = arriving[row] * (share[:, 1] - share[:, 0])
-        good = length > 0.0
+        good = length > SHORTEST_LINE * self._reach
         # The piece is short: its light counts as parallel.
         light = np.column_stack([-towards.mean(axis=1), np.zeros(len(row))])[good]
         power = arriving[good] / length[good]

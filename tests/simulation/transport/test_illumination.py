@@ -18,6 +18,7 @@ from gpuvision.reference.sheet import first_hits
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.envelope import upper_envelope
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
+from gpuvision.simulation.transport.line_irradiance import LitSegments
 from gpuvision.simulation.transport.lit_sheets import SheetLighting
 from gpuvision.simulation.transport.sheet_cut import SheetIndex
 
@@ -390,3 +391,33 @@ def test_a_million_triangles() -> None:
         assert lit.total() == pytest.approx(0.1, rel=1e-12)
         assert len(lit.power) >= 1414
     assert len(scene.corners) > 999_000
+
+
+@pytest.mark.parametrize("turns", [(1, 1, 0), (1, 2, 2), (2, 1, 0), (2, 2, 1)])
+@pytest.mark.parametrize("name", ["parallel", "fan"])
+def test_rounding_lights_no_line_on_corners_and_walls(turns: tuple[int, int, int], name: str) -> None:
+    """Cubes turned by multiples of 45 degrees: by rounding, corners reach through a sheet, and walls into its light.
+
+    Such a line has no direction, or lies along the light. The light on the cube stays that of its width.
+    """
+    cube = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+    for count, axis in zip(turns, np.eye(3), strict=True):
+        cube.apply_transform(trimesh.transformations.rotation_matrix(count * math.pi / 4.0, axis))
+    sheet, scene = SHEETS[name], Scene.of(cube)
+    for L in np.unique(np.round(cube.vertices[:, 1], 9)):
+        lit = sheet.illuminate(scene, float(L))
+        LitSegments(lit.ends, lit.normals, lit.power)  # refuses lines outside of their surfaces
+        middle = lit.ends.mean(axis=1)
+        assert np.all(np.sum(lit.normals * sheet.direction_to_light(middle), axis=1) > 1e-9)
+    width = np.ptp(rays_of(sheet, plane_cut(cube, 0.3), 0.3))
+    lit = sheet.illuminate(scene, 0.3)
+    assert float(lit.power @ lit.lengths) == pytest.approx(sheet.power * width, rel=1e-9)
+
+
+def plane_cut(mesh: Any, y: float) -> np.ndarray:
+    """Return the points in which the plane at y cuts the edges of a mesh."""
+    a, b = np.moveaxis(mesh.vertices[mesh.edges_unique], 1, 0)
+    a, b = a[crossing := (a[:, 1] < y) != (b[:, 1] < y)], b[crossing]
+    points: np.ndarray = a + ((y - a[:, 1]) / (b[:, 1] - a[:, 1]))[:, None] * (b - a)
+    points[:, 1] = y
+    return points

@@ -84,13 +84,19 @@ def limit_at(runs: Runs, run: int, x: float, middle: float, slab: float, *, abov
     return (min if above else max)(limits, default=slab)
 
 
+def slabs() -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and the upper limits of the slabs of the levels."""
+    between = 0.5 * (PLACE[1:] + PLACE[:-1])
+    low, high = np.append(-math.inf, between), np.append(between, math.inf)
+    low[FIRST], high[LAST] = -math.inf, math.inf
+    return low, high
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_limits_are_lines_between_the_ends_of_runs(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pieces, runs = random_runs(rng)
-    between = 0.5 * (PLACE[1:] + PLACE[:-1])
-    low, high = np.append(-math.inf, between), np.append(between, math.inf)
-    low[FIRST], high[LAST] = -math.inf, math.inf
+    low, high = slabs()
     found = slanted_limits(pieces, runs, PLACE, low, high, WIDTH)
     assert len(found.piece)
     for piece, run in enumerate(runs.piece_run):
@@ -113,3 +119,15 @@ def test_limits_are_lines_between_the_ends_of_runs(seed: int) -> None:
                 upper = limit_at(runs, run, x, middle, high[level], above=True)
                 assert found.low[row, number] == pytest.approx(lower, abs=1e-9)
                 assert found.high[row, number] == pytest.approx(max(upper, lower), abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_piece_without_width_is_whole(seed: int) -> None:
+    """Of a wall along the light, both ends of a piece can round to one x."""
+    pieces, runs = random_runs(np.random.default_rng(seed))
+    run = int(runs.piece_run[slanted_limits(pieces, runs, PLACE, *slabs(), WIDTH).piece[0]])
+    pieces = Pieces(*(np.append(each, each[:1], axis=0) for each in pieces))
+    pieces.level[-1], pieces.x[-1] = runs.level[run], runs.x[run].mean()
+    found = slanted_limits(pieces, runs._replace(piece_run=np.append(runs.piece_run, run)), PLACE, *slabs(), WIDTH)
+    mine = found.piece == len(pieces.x) - 1
+    assert (found.start[mine].tolist(), found.end[mine].tolist()) == ([0.0], [1.0])

@@ -145,9 +145,12 @@ static inline uchar put_fiducial(pose_rows rows, int row, FeatureFiducial from, 
 }
 
 // Return whether the features show another board, or none: fewer than a share of the rows in the image are inliers, or
-// the scale of the residuals, times the median sigma of the rows, is above a limit [m].
+// their residuals are larger than their sigmas explain by more than a limit [m].
 //
-// Features outside the image do not count. `size` is the unit of the rows [m]; `distances` is overwritten.
+// The residuals of the inliers have the variance r^2 sigma^2, with the residual scale r and the median sigma of the rows.
+// Their errors explain sigma^2 (1 + 3 sqrt(2 / f)): three standard deviations of a reduced chi-square with f degrees of
+// freedom. The rest is compared with the square of the limit. Without degrees of freedom r is NaN, and only the share is
+// checked. Features outside the image do not count. `size` is the unit of the rows [m]; `distances` is overwritten.
 static inline int is_another_board(private const solved_pose *fit, pose_rows rows, real size, int ruler_count,
                                    int fiducial_count, global const uchar *status, pose_room room, real min_share,
                                    real max_residual) {
@@ -160,7 +163,9 @@ static inline int is_another_board(private const solved_pose *fit, pose_rows row
         *(private reals_at *)(sigmas + i) = certainty > (reals)0 ? (reals)1 / certainty : (reals)INFINITY;
     }
     const real sigma = group_ranked(sigmas, rows.count, fit->present / 2 + 1, BITS_TO_ONE_PERCENT, room.sums);
-    return fit->inliers < min_share * in_image || fit->scale * sigma * size > max_residual;
+    const real explained = 1 + 3 * sqrt(2 / max((real)(fit->inliers - FREEDOMS), (real)1));
+    const real rest = max(fit->residual_scale * fit->residual_scale - explained, (real)0);
+    return fit->inliers < min_share * in_image || sqrt(rest) * sigma * size > max_residual;
 }
 
 // Change a motion of the board and its covariance into the pose of the camera and its covariance, in place.

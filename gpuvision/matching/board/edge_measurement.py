@@ -232,7 +232,7 @@ class BoardMeasurer:
             reason="",
             warnings=(_NOT_CONVERGED,) if status else (),
         )
-        return self._check(solution, float(to_numpy(fit.scale)), scale)
+        return self._check(solution, scale)
 
     def _has_etch_bias(self, rulers: RulerMeasurements) -> bool:
         return bool(((self.features.spacing == 0) & rulers.found).any()) and self.etch_bias_sigma > 0
@@ -303,7 +303,7 @@ class BoardMeasurer:
         x, y = self.features.placement
         return np.array([pose[0] + c * x - s * y - x, pose[1] + s * x + c * y - y, pose[2]])
 
-    def _check(self, solution: PoseSolution, residual_scale: float, scale: float) -> PoseSolution:
+    def _check(self, solution: PoseSolution, scale: float) -> PoseSolution:
         """Refuse a pose with which too few rulers and fiducials agree, or agree too badly."""
         rulers, fiducials, limits = solution.rulers, solution.fiducials, self.limits
         used, in_image = count_true(rulers.used, fiducials.used), count_true(rulers.in_image, fiducials.in_image)
@@ -313,12 +313,17 @@ class BoardMeasurer:
                 reason=f"{used} of {in_image} {features} agree, expected {limits.min_share:.0%} or more"
             )
         sigma = float(np.nanmedian(np.concatenate([rulers.sigma, *fiducials.axes[0].T])))
-        residual_px = residual_scale * sigma / scale
-        if residual_px > limits.max_residual_px:
-            return solution._replace(
-                reason=f"the edges differ from the best pose by {residual_px:.1f} px, expected "
-                f"{limits.max_residual_px} px or less"
+        # Errors explain a reduced chi-square of up to 1 and three of its standard deviations.
+        unknowns = 3 + math.isfinite(solution.etch_bias)
+        degrees = max(count_true(rulers.used, fiducials.used, fiducials.used) - unknowns, 1)
+        explained = 1.0 + 3.0 * math.sqrt(2.0 / degrees)
+        unexplained_px = math.sqrt(max(solution.residual_scale**2 - explained, 0.0)) * sigma / scale
+        if unexplained_px > limits.max_residual_px:
+            reason = (
+                f"the edges differ from the best pose by {unexplained_px:.1f} px more than their errors explain; "
+                f"expected {limits.max_residual_px} px or less"
             )
+            return solution._replace(reason=reason)
         return solution
 
 

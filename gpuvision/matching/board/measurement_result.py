@@ -35,7 +35,8 @@ class MeasurementLimits:
     min_count
         Least number of rulers and fiducials that must agree: as many as unknowns of a rigid pose. Default 3.
     max_residual_px
-        Largest accepted scale of the residuals [px]: more is another board or a wrong scale (chosen). Default 0.5.
+        Largest accepted standard deviation of the residuals beyond the errors of the features [px]: more is another
+        board or a wrong scale (chosen). Default 0.5.
     fiducial_slack_px
         Largest accepted distance of a fiducial beyond its expected search range, besides the etch bias [px] (chosen).
         Default 1.0.

@@ -214,8 +214,8 @@ class FeatureSet:
             Least share of the features in the image, a fiducial counted twice, that must agree with the pose, 0 to 1:
             with fewer another pose could gather as many, and the status is AMBIGUOUS. Default 0.5.
         max_residual_px : float
-            Largest accepted scale of the residuals [px], above 0: more is another board or a wrong scale, and the
-            status is AMBIGUOUS. Default 0.5 (chosen).
+            Largest accepted standard deviation of the residuals beyond the errors of the features [px], above 0: more
+            is another board or a wrong scale, and the status is AMBIGUOUS. Default 0.5 (chosen).
         queue : pyopencl.CommandQueue, optional
             Queue to run in; see `BoundFeatures`.
 

@@ -265,8 +265,9 @@ class SolveFeatures(VisionOperation[FeaturePose]):
     min_share : float
         Least share of the rows in the image that must be inliers: fewer are another board.
     max_residual_px : float
-        Largest accepted scale of the residuals [px], `FeaturePose.scale` times the median sigma of the rows: more is
-        another board or a wrong scale. If the solver has a given scale, only the sigmas are limited.
+        Largest accepted standard deviation of the residuals beyond the predicted errors [px]: sqrt(r^2 - 1 -
+        3 sqrt(2 / f)) times the median sigma of the rows, with `FeaturePose.residual_scale` r and f degrees of freedom
+        (inliers less unknowns); 0 where the root is of a negative number. More is another board or a wrong scale.
     """
 
     Result: ClassVar[type[Any]] = FeaturePose

@@ -203,16 +203,28 @@ def test_a_pose_needs_three_features_and_a_share_that_agree(
     rulers: list[int], in_image: int, fiducials: list[int], reason: str
 ) -> None:
     found = solved(rulers_of([1e-6] * len(rulers), rulers, in_image), fiducials_of([1e-6] * len(fiducials), fiducials))
-    assert measurer_of()._check(found, 1.0, 20e-6).reason == reason
+    assert measurer_of()._check(found, 20e-6).reason == reason
 
 
 def test_residuals_above_half_a_pixel_are_refused() -> None:
-    """The median sigma of rulers and of the axes of fiducials is 4 um, 0.2 px."""
+    """The median sigma is 4 um, 0.2 px; of 2 degrees of freedom, errors explain a chi-square of 4: 0.49 and 0.51 px."""
     found = solved(rulers_of([1e-6, 2e-6, 4e-6], [1, 1, 1]), fiducials_of([9e-6], [1]))
     measurer = measurer_of()
-    assert measurer._check(found, 2.5, 20e-6).reason == ""
-    reason = measurer._check(found, 3.0, 20e-6).reason
-    assert reason == "the edges differ from the best pose by 0.6 px, expected 0.5 px or less"
+    assert measurer._check(found._replace(residual_scale=math.sqrt(4.0 + 2.45**2)), 20e-6).reason == ""
+    reason = measurer._check(found._replace(residual_scale=math.sqrt(4.0 + 2.55**2)), 20e-6).reason
+    assert reason == (
+        "the edges differ from the best pose by 0.5 px more than their errors explain; expected 0.5 px or less"
+    )
+    # One more unknown: 1 degree of freedom.
+    with_etch_bias = found._replace(etch_bias=0.0, residual_scale=math.sqrt(1.0 + 3.0 * math.sqrt(2.0) + 2.45**2))
+    assert measurer._check(with_etch_bias, 20e-6).reason == ""
+
+
+@pytest.mark.parametrize("residual_scale", [0.2, 1.0, 1.9])
+def test_residuals_as_large_as_the_errors_are_accepted(residual_scale: float) -> None:
+    """Errors of 1 px explain residuals of 1.9 px with 3 degrees of freedom, a chi-square of 3.6, up to 0.4 px."""
+    found = solved(rulers_of([20e-6] * 4, [1] * 4), fiducials_of([20e-6], [1]), residual_scale=residual_scale)
+    assert measurer_of()._check(found, 20e-6).reason == ""
 
 
 def fit_of(*, status: int = 0, residual_scale: float = 2.0, sigma: float = 1e-4, error: float = 0.0) -> Any:

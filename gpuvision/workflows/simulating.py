@@ -250,7 +250,10 @@ def _transports_over(part: Scene, transport: StraightTransport, profiles: int | 
         first = (first + last + 1 - profiles) // 2
         last = first + profiles - 1
     if last < first:
-        raise ValueError("no profile meets the part: it is shorter than a step of the transport")
+        raise ValueError(
+            "no profile meets the part: it is shorter than a step of the transport; give a smaller [transport] step, "
+            "or the right unit of the mesh"
+        )
     return transport.start + transport.step * np.arange(first, last + 1, dtype=np.float64)
 
 
@@ -259,7 +262,6 @@ def _corner_transports(part: Scene, transport: StraightTransport) -> Array:
     if transport.bend is not None:
         return SheetIndex.of(part, transport).corners[..., 2].ravel()
     corners = part.corners.reshape(-1, 3)
-    corners = corners[np.isfinite(corners).all(axis=1)]
     axes = np.array([transport.g_axis, transport.h_axis, transport.direction])
     return np.asarray((corners - transport.origin) @ np.linalg.inv(axes)[:, 2])
 
@@ -348,7 +350,7 @@ def _concatenate(parts: Sequence[ErrorAttribution]) -> ErrorAttribution:
 def _describe_position(part: Scene) -> str:
     """Return a text with the extent of a part."""
     corners = part.corners.reshape(-1, 3)
-    low, high = (1e3 * bound(corners[np.isfinite(corners).all(axis=1)], axis=0) for bound in (np.min, np.max))
+    low, high = (1e3 * bound(corners, axis=0) for bound in (np.min, np.max))
     return "the part lies at " + ", ".join(
         f"{name} {a:.4g} to {b:.4g} mm" for name, a, b in zip("xyz", low, high, strict=True)
     )

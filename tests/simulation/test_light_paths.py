@@ -13,6 +13,7 @@ from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert, Phong
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.readings import BEYOND_ENDS
+from gpuvision.simulation.sensors.readings import PATHS as READ_PATHS
 from gpuvision.simulation.transport.direct import DirectLimits
 from gpuvision.simulation.transport.illumination import LightSheet
 from sensor_views import sensor_view
@@ -71,6 +72,19 @@ def test_limits_reach_the_direct_light_and_the_mirrors(device):
     assert powers[0].any()
     assert not np.array_equal(*powers)
     assert paths(corner(), device, mirror_steps=5.0)._mirrors.steps_per_sample == 5.0
+
+
+def test_damaged_and_repeated_triangles_change_no_light(device):
+    """Triangles with NaN and infinity, and triangles that a mesh holds twice, leave all light and the patches' size."""
+    clean = Scene(corner().corners.astype(np.float32).astype(np.float64))
+    more = clean.corners.copy()
+    more[0, 1, 2], more[1, 0], more[2, 2, 0] = np.nan, np.inf, -np.inf
+    damaged = Scene(np.concatenate([clean.corners, more[:3], clean.corners]))
+    given = {"materials": [Material(diffuse=Lambert(albedo=0.5), mirror=0.3)], "paths": READ_PATHS}
+    good, bad = (paths(scene, device, **given).profile(0.0).exposures for scene in (clean, damaged))
+    assert good.keys() == bad.keys()
+    for name in READ_PATHS:
+        np.testing.assert_allclose(bad[name].power, good[name].power, rtol=1e-5, atol=1e-9 * good[name].power.max())
 
 
 def test_a_wall_glows_as_the_line_before_it_says(device):

@@ -31,9 +31,14 @@ class Defects:
     Attributes
     ----------
     not_finite
-        Triangles with a corner that is NaN or infinite. They are not in the BVH.
+        Triangles with a corner that is NaN or infinite. They are not in the BVH, and `Scene.corners` holds a corner of
+        another triangle three times.
     degenerate
         Triangles without area: two corners coincide, or all three are collinear. They are not in the BVH.
+    duplicate
+        Triangles with the corners and the winding of an earlier triangle, on an edge of three or more triangles: parts
+        of a mesh that were stored twice. They are not in the BVH, and `Scene.corners` holds their first corner three
+        times.
     non_manifold
         Triangles on an edge of three or more triangles, or on a surface that cannot be oriented (a Moebius strip). They
         are kept unchanged.
@@ -44,6 +49,7 @@ class Defects:
 
     not_finite: tuple[int, ...]
     degenerate: tuple[int, ...]
+    duplicate: tuple[int, ...]
     non_manifold: tuple[int, ...]
     inverted: tuple[int, ...]
 
@@ -55,6 +61,11 @@ class Defects:
                 some = ", ".join(map(str, numbers[:10])) + (", ..." if len(numbers) > 10 else "")
                 lines.append(f"{name.replace('_', ' ')}: {len(numbers)} triangles ({some})")
         return "\n".join(lines) or "no defects"
+
+    @property
+    def without_area(self) -> list[int]:
+        """Triangles of a scene that have no area: not finite, degenerate and duplicate ones."""
+        return [*self.not_finite, *self.degenerate, *self.duplicate]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +106,10 @@ class Scene:
                 "Scene.material has a negative index; expected 0 for the first material, 1 for the second, ..."
             )
         defects = _defects(corners)
+        # Without area, so that no other code meets NaN or two surfaces in one place.
+        duplicate, not_finite = list(defects.duplicate), list(defects.not_finite)
+        corners[duplicate] = corners[duplicate][:, :1]
+        corners[not_finite] = next((each for each in corners[:, 0] if np.isfinite(each).all()), 0.0)
         inverted = list(defects.inverted)
         corners[inverted] = corners[inverted][:, ::-1]
         corners.flags.writeable = False
@@ -104,7 +119,7 @@ class Scene:
 
     @functools.cached_property
     def bvh(self) -> Bvh:
-        """BVH over the triangles that are finite and not degenerate, built at the first use."""
+        """BVH over the triangles with an area, built at the first use."""
         return self._tree(WIDTH)
 
     @functools.cached_property
@@ -123,7 +138,7 @@ class Scene:
     @property
     def _is_in_tree(self) -> npt.NDArray[np.bool_]:
         good = np.ones(len(self.corners), bool)
-        good[[*self.defects.not_finite, *self.defects.degenerate]] = False
+        good[self.defects.without_area] = False
         return good
 
     def _tree(self, width: int) -> Bvh:
@@ -188,9 +203,12 @@ class Scene:
         with reading(path, "mesh", hint="is it damaged, truncated or of another format?"):
             check_mesh(path)
             # Materials of the file are not used, and may refer to files of any size.
-            scene = cls.of(trimesh.load(path, process=False, skip_materials=True), metres=metres)
+            loaded = trimesh.load(path, process=False, skip_materials=True)
+            scene = (
+                cls(np.zeros((0, 3, 3))) if isinstance(loaded, trimesh.PointCloud) else cls.of(loaded, metres=metres)
+            )
         if not len(scene.corners):
-            raise ReadError(f"{path}: contains no triangles")
+            raise ReadError(f"{path}: contains no triangles, expected a mesh of the part")
         return scene
 
 
@@ -217,14 +235,24 @@ def _defects(corners: npt.NDArray[np.float64]) -> Defects:
     finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(corners).all(axis=(1, 2)))
     safe = np.where(finite[:, None, None], corners, 0.0)
     flat = finite & _is_degenerate(safe)
-    good = np.flatnonzero(finite & ~flat)
-    if not len(good):
-        return Defects(_numbers(np.flatnonzero(~finite)), _numbers(np.flatnonzero(flat)), (), ())
-    points = _vertex_numbers(safe[good].reshape(-1, 3)).reshape(-1, 3)
-    non_manifold, inverted = _winding(points)
+    good, duplicate = np.flatnonzero(finite & ~flat), np.zeros(0, np.int64)
+    non_manifold, inverted = duplicate, duplicate
+    if len(good):
+        points = _vertex_numbers(safe[good].reshape(-1, 3)).reshape(-1, 3)
+        non_manifold, inverted = _winding(points)
+        # A duplicate of a triangle with neighbours is on an edge of three or more triangles.
+        rows = points[non_manifold]
+        rows = np.take_along_axis(rows, (rows.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+        first = np.unique(rows, axis=0, return_index=True)[1]
+        if len(first) < len(non_manifold):
+            is_kept = np.ones(len(good), bool)
+            is_kept[np.delete(non_manifold, first)] = False
+            duplicate, good = good[~is_kept], good[is_kept]
+            non_manifold, inverted = _winding(points[is_kept])
     return Defects(
         _numbers(np.flatnonzero(~finite)),
         _numbers(np.flatnonzero(flat)),
+        _numbers(duplicate),
         _numbers(good[non_manifold]),
         _numbers(good[inverted]),
     )

@@ -121,7 +121,7 @@ class SheetIndex:
     @classmethod
     def _build(cls, scene: Scene, transport: StraightTransport) -> SheetIndex:
         good = np.ones(len(scene.corners), bool)
-        good[[*scene.defects.not_finite, *scene.defects.degenerate]] = False
+        good[scene.defects.without_area] = False
         triangle, corners = np.arange(len(good)), np.where(good[:, None, None], scene.corners, 0.0)
         if transport.bend is not None:
             longest_edge = math.sqrt(BEND_ERROR / (_DEVIATION * max(_curvature(transport.bend), 1e-300)))

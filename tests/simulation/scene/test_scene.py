@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from gpuvision.host import Device
+from gpuvision.host.errors import ReadError
 from gpuvision.simulation.scene.rays import ClosestHit
 from gpuvision.simulation.scene.scene import Scene, _vertex_numbers
 
@@ -62,6 +63,13 @@ def test_a_damaged_file_is_named(tmp_path: Path, ending: str, harm: str) -> None
         Scene.load(path)
 
 
+def test_a_file_of_points_is_no_mesh(tmp_path: Path) -> None:
+    """A point cloud, such as the range image of a scan, has no triangles."""
+    trimesh.PointCloud(np.eye(3)).export(tmp_path / "points.ply")
+    with pytest.raises(ReadError, match=r"points\.ply: contains no triangles, expected a mesh of the part"):
+        Scene.load(tmp_path / "points.ply")
+
+
 def test_a_folder_is_no_mesh(tmp_path: Path) -> None:
     (tmp_path / "part.stl").mkdir()
     with pytest.raises(IsADirectoryError, match=r"part\.stl: a folder, expected a file"):
@@ -84,6 +92,39 @@ def test_not_finite(box: np.ndarray) -> None:
     assert scene.defects.not_finite == (3, 7)
     assert scene.defects.degenerate == ()
     assert len(scene.bvh.numbers) == 10
+    assert np.ptp(scene.corners[[3, 7]], axis=1).max() == 0.0
+    assert np.isfinite(scene.corners).all()
+    np.testing.assert_array_equal([scene.corners.min(axis=(0, 1)), scene.corners.max(axis=(0, 1))], box_bounds(box))
+
+
+def box_bounds(box: np.ndarray) -> np.ndarray:
+    """Return the bounds of the finite triangles of a box."""
+    finite = box[[0, 1, 2, 4, 5, 6, 8, 9, 10, 11]].reshape(-1, 3)
+    return np.array([finite.min(axis=0), finite.max(axis=0)])
+
+
+def test_nothing_finite() -> None:
+    scene = Scene(np.full((2, 3, 3), np.nan))
+    assert scene.defects.not_finite == (0, 1)
+    assert not len(scene.bvh.numbers)
+
+
+def test_duplicates(box: np.ndarray) -> None:
+    """Triangles that a file holds twice leave the box as it is, also where their corners are rotated."""
+    scene = Scene(np.concatenate([box, np.roll(box[:5], 1, axis=1), box[[11, 11]]]))
+    assert scene.defects.duplicate == tuple(range(12, 19))
+    assert (scene.defects.non_manifold, scene.defects.inverted) == ((), ())
+    np.testing.assert_array_equal(np.sort(scene.bvh.numbers), range(12))
+    assert "duplicate: 7 triangles (12, 13, " in str(scene.defects)
+
+
+def test_touching_solids_have_no_duplicates(box: np.ndarray) -> None:
+    """The common face of two boxes has both windings: each box stays closed."""
+    across = np.ptp(box[..., 2])
+    other = box * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * box[..., 2].max()]
+    scene = Scene(np.concatenate([box, other[:, ::-1]]))
+    assert np.ptp(scene.corners[..., 2]) == pytest.approx(2.0 * across)
+    assert scene.defects.duplicate == ()
 
 
 def test_inverted_are_turned(box: np.ndarray) -> None:

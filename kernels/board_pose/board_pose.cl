@@ -139,6 +139,6 @@ kernel void board_pose(global const CODE *restrict image, global const BoardRule
                                   scale,  residual_scale,      condition, rank,       inliers,   status,     etch,
                                   inlier_fraction, leverage};
     const pose_limits limits = {min_inlier_fraction, max_leverage, max_shift, max_turn};
-    store_pose(&fit, all, frame, 1, 0, 0, count, limits, place_x, place_y, outputs);
+    store_pose(&fit, all, frame, STATUS_OK, 0, count, limits, place_x, place_y, outputs);
 }
 #endif

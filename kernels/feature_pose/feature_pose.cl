@@ -138,7 +138,8 @@ kernel void feature_pose(global const WIDE *restrict expected, global const real
 #endif
     const int is_other = is_another_board(&fit, rows, centred.size, ruler_count, matched_count + drilled_count,
                                           feature_status, room, min_share, max_residual);
-    store_pose(&fit, rows, centred, is_pose_finite, is_other, 0, count, limits, at_x, at_y, outputs);
+    const ushort verdict = !is_pose_finite ? STATUS_NOT_FINITE : is_other ? STATUS_AMBIGUOUS : STATUS_OK;
+    store_pose(&fit, rows, centred, verdict, 0, count, limits, at_x, at_y, outputs);
 #ifdef GIVEN_SCALE
     const real smallest = 1;
 #else

@@ -51,11 +51,11 @@ kernel void pose_sets(global const PoseRow *restrict rows,
         put_row(all, i, read_row(rows + item * count + min(i, count - 1), i < count));
     const pose_frame frame = centre_rows(&all);
 #endif
-    int all_finite = 1;
+    ushort verdict = STATUS_OK;
     laned_pose about = {0, 0, 0, 0, 0, 0, 0};
 #ifdef WITH_INITIAL_POSE
     const real x = start[3 * item], y = start[3 * item + 1], turn = start[3 * item + 2];
-    all_finite = !(not_finite(x) | not_finite(y) | not_finite(turn));
+    verdict = not_finite(x) | not_finite(y) | not_finite(turn) ? STATUS_NOT_FINITE : STATUS_OK;
     about = pose_in_frame(x, y, turn, frame);
 #endif
     GROUP_SPACE solved_pose fit;
@@ -67,5 +67,5 @@ kernel void pose_sets(global const PoseRow *restrict rows,
                                   scale,  residual_scale,      condition, rank,       inliers,   status,     etch,
                                   inlier_fraction, leverage};
     const pose_limits limits = {min_inlier_fraction, max_leverage, max_shift, max_turn};
-    store_pose(&fit, all, frame, all_finite, 0, item, count, limits, place_x, place_y, outputs);
+    store_pose(&fit, all, frame, verdict, item, count, limits, place_x, place_y, outputs);
 }

@@ -81,20 +81,23 @@ BETWEEN_BARRIERS void store_covariance(private const solved_pose *fit, pose_fram
         }
 }
 
-// Check a pose against the limits and store it; a refused pose is stored as NaN. `is_wrong`: the caller refuses it.
+// Check a pose against the limits and store it; a refused pose is stored as NaN.
+//
+// `verdict` of the caller: STATUS_OK, or the flag with which it refuses the pose: STATUS_AMBIGUOUS, or STATUS_NOT_FINITE of
+// the initial or expected pose.
 //
 // Translation about the origin: T(p) = c + (I + D) (p - c) + t gives t - D c for the centre c of the rows. Deformation:
 // I + D = R(theta) ((1 + kx, shear), (0, 1 + ky)), kx and theta from its first column.
-static inline void store_pose(GROUP_SPACE const solved_pose *fit, pose_rows all, pose_frame frame, int all_finite,
-                              int is_wrong, long item, int count, pose_limits limits, real place_x, real place_y,
-                              pose_outputs to) {
-    const int few = fit->present < POSE_PARAMETERS;
+static inline void store_pose(GROUP_SPACE const solved_pose *fit, pose_rows all, pose_frame frame, ushort verdict,
+                              long item, int count, pose_limits limits, real place_x, real place_y, pose_outputs to) {
+    const int all_finite = verdict != STATUS_NOT_FINITE, few = fit->present < POSE_PARAMETERS;
     // Below an inlier fraction of 0.75 two outliers may agree by chance. Half the leverage limit then requires that two
     // other rows check each row.
     const real leverage = fit->inlier_fraction > 0.75f ? limits.leverage : limits.leverage / 2;
     // Where the normal equations of the last step were singular, the steps ended before the pose of least loss: the
     // weights of Huber's loss can be so unequal although all rows count as inliers.
-    const int refused = is_wrong || fit->is_singular || fit->rank < POSE_PARAMETERS || fit->inliers < POSE_PARAMETERS ||
+    const int refused = verdict == STATUS_AMBIGUOUS || fit->is_singular || fit->rank < POSE_PARAMETERS ||
+                        fit->inliers < POSE_PARAMETERS ||
                         !(fit->inlier_fraction >= limits.inlier_fraction) || !(fit->leverage < leverage) ||
                         !(fit->covariance_factor < (real)INFINITY);
     const real axx = 1 + FIRST(fit->pose.dxx), axy = FIRST(fit->pose.dxy), ayx = FIRST(fit->pose.dyx),

@@ -330,9 +330,17 @@ def _check_places(
     if values[needed - 1] <= rank_tolerance * values[0]:
         # C3 reads H only.
         count = len(np.unique(points[:, 1:] if model == "C3" else points, axis=0))
+        what = "heights H" if model == "C3" else "places on the sheet"
         least = -(-needed // len(rows))
-        reason = f"which needs {least} or more" if count < least else "as too many of them lie on one line"
-        raise DegenerateError(f"{count} places on the sheet do not fix the model {model}, {reason}")
+        if count < least:
+            reason = f"which needs {least} or more"
+        elif model == "C3":
+            reason = "as they are too close to each other"
+        elif model == "C4":
+            reason = "which needs places off the line G = 0 at two heights H, or three heights and one such place"
+        else:
+            reason = "as too many of them lie on one line"
+        raise DegenerateError(f"{count} {what} do not fix the model {model}, {reason}")
 
 
 def _direct_linear(

@@ -27,7 +27,7 @@ BLURRED = (*DIRECT, "diffuse-specular")
 _FIRST_ORDER, _SECOND_ORDER = 2.0, 4.0 / 3.0
 # Error by the rays per bin over its change by twice the rays along both axes, which are spread: at other places their
 # error is independent. Measured on nine random parts with 1 x 1 and 2 x 2 rays: 0.3 to 1.3 (without spread rays: 3.3).
-_BY_RAYS = 4.0 / 3.0
+_ERROR_PER_FINER_CHANGE = 4.0 / 3.0
 
 
 class ErrorPart(NamedTuple):
@@ -145,7 +145,7 @@ def estimate_errors(task: SimulationTask, *, profiles: int = 6, device: Device |
         finer = None if bounces is None else (2 * bounces[0], 2 * bounces[1])
         found["nodes"] = estimate.refined(
             indirect,
-            factor=_BY_RAYS,
+            factor=_ERROR_PER_FINER_CHANGE,
             limits={"spreads_rays": True},
             nodes=(2 * u, 2 * v),
             bounce_nodes=finer,

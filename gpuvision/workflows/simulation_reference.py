@@ -26,7 +26,8 @@ _PARTS = (
     ("bounce_nodes", "nodes of multi-bounce light", 0.5),
     ("patch_size", "patches", 1.0),
 )
-_BY_RAYS = 0.5  # see `SimulationReference`
+# Error of the reference over its change by coarser rays; see `SimulationReference`.
+_ERROR_PER_COARSER_CHANGE = 0.5
 
 
 class ReferenceErrors(NamedTuple):
@@ -134,7 +135,7 @@ def _coarser_options(axes: Sequence[Sequence[Option]]) -> list[tuple[str, float,
         (part, factor, option) for name, part, factor in _PARTS for axis in axes for option in _last_coarser(axis, name)
     ]
     rays = [each for axis in axes for each in axis if "nodes" in each.changes and not each.pairs]
-    return found + [(_RAYS, _BY_RAYS, each) for each in rays[-2:]]
+    return found + [(_RAYS, _ERROR_PER_COARSER_CHANGE, each) for each in rays[-2:]]
 
 
 def _last_coarser(axis: Sequence[Option], name: str) -> list[Option]:

@@ -394,10 +394,10 @@ class ProfileSample:
         """
         every = np.arange(len(task.transports))
         shares = np.full(len(every), 1.0 / len(every)) if shares is None else shares
-        chosen = [spaced(every, profiles)]
+        chosen = [evenly_spaced(len(every), profiles)]
         for count in others:
             rest = np.setdiff1d(every, np.concatenate(chosen))
-            chosen.append(rest[_drawn(shares[rest], count)])
+            chosen.append(rest[_systematic(shares[rest], count)])
         kept = [each for number, each in enumerate(chosen) if len(each) or not number]
         places = [task.transports[each] for each in kept]
         return cls(
@@ -435,15 +435,15 @@ class ProfileSample:
         return sample_light(settings.applied(self.task), where, self.device, **{"solvers": self.solvers, **changes})
 
 
-def spaced(numbers: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
-    """Return evenly spaced elements, each in the middle of its part; all if there are fewer."""
-    count = min(count, len(numbers))
-    places: npt.NDArray[np.int64] = ((np.arange(count) + 0.5) * len(numbers) / max(count, 1)).astype(np.int64)
-    return np.take(numbers, places)
+def evenly_spaced(size: int, count: int) -> npt.NDArray[np.int64]:
+    """Return ``count`` of the numbers below ``size``, each in the middle of its part; all if there are fewer."""
+    count = min(count, size)
+    numbers: npt.NDArray[np.int64] = ((np.arange(count) + 0.5) * size / max(count, 1)).astype(np.int64)
+    return numbers
 
 
-def _drawn(shares: Float64, count: int) -> npt.NDArray[np.int64]:
-    """Return the numbers of about ``count`` elements: a systematic sample with chances in proportion to the shares."""
+def _systematic(shares: Float64, count: int) -> npt.NDArray[np.int64]:
+    """Return about ``count`` of the numbers of shares: a systematic sample with chances in proportion to them."""
     if not (count := min(count, len(shares))):
         return np.zeros(0, np.int64)
     picks = np.searchsorted(np.cumsum(_chances(shares, count)), np.arange(count) + 0.5, side="right")

@@ -14,7 +14,7 @@ from gpuvision.simulation.sensors.readings import stack_profiles
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.workflows.light_cache import PROFILES_PER_BLOCK, SimulationTask, make_light_paths
 from gpuvision.workflows.simulation_errors import DIRECT, scene_paths
-from gpuvision.workflows.simulation_sample import SampleReader, SimulationSettings, spaced
+from gpuvision.workflows.simulation_sample import SampleReader, SimulationSettings, evenly_spaced
 
 Float64 = npt.NDArray[np.float64]
 
@@ -41,7 +41,7 @@ def profile_shares(task: SimulationTask, count: int, device: Device) -> Float64:
         (profiles,): shares, with the sum 1.
     """
     every = np.arange(len(task.transports))
-    chosen = spaced(every, count)
+    chosen = evenly_spaced(len(every), count)
     changes = np.concatenate(list(_changes(task, task.transports[chosen], device)))
     shares = [np.ones(len(every)), *(np.interp(every, chosen, each) for each in changes.T)]
     return np.asarray(np.mean([each / each.sum() for each in shares if each.any()], axis=0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import tomllib
 from typing import Any
@@ -321,7 +322,7 @@ def test_points_that_do_not_fix_a_model(points: np.ndarray, options: dict[str, A
         ([0, 8, -9], "H8", "3 places on the sheet do not fix the model H8, which needs 4 or more"),
         ([0, 1, 2, -9], "H8", "4 places on the sheet do not fix the model H8, as too many of them lie on one line"),
         ([0, 8], "D6", "2 places on the sheet do not fix the model D6, which needs 3 or more"),
-        ([0, 8], "C3", r"[12] places on the sheet do not fix the model C3, which needs 3 or more"),
+        ([0, 8], "C3", r"[12] heights H do not fix the model C3, which needs 3 or more"),
     ],
 )
 def test_repeated_readings_do_not_replace_places(
@@ -334,6 +335,34 @@ def test_repeated_readings_do_not_replace_places(
         with pytest.raises(ValueError, match=f"^{message}$"):
             Triangulation.fit(seen, points, model=model)
         assert model != "H8" or Triangulation.fit(seen, points).model != "H8"
+
+
+@pytest.mark.parametrize(
+    ("places", "is_fixed"),
+    [
+        ([(0, 0), (0, 1), (0, 2), (0, 3)], False),
+        ([(1, 0), (2, 0), (-1, 0)], False),
+        ([(0, 0), (1, 1), (-1, 1), (2, 1)], False),
+        ([(1, 0), (2, 1)], True),
+        ([(1, 0), (0, 1), (0, 2)], True),
+        ([(1, 0), (1, 1), (1, 2)], True),
+    ],
+)
+def test_places_that_fix_the_symmetric_model(places: list[tuple[int, int]], is_fixed: bool) -> None:
+    """u fixes a, b and c from three heights, or c comes from v = d G / (c H + 1) at two; G = 0 tells nothing of d."""
+    points = np.repeat(np.array(places) * [2e-3, 1e-3] + [0.0, 1e-3], 3, axis=0)
+    missing = "which needs places off the line G = 0 at two heights H, or three heights and one such place"
+    message = rf"^{len(places)} places on the sheet do not fix the model C4, {missing}$"
+    with contextlib.nullcontext() if is_fixed else pytest.raises(ValueError, match=message):
+        fitted = Triangulation.fit(psd().to_sensor(points), points, model="C4")
+        np.testing.assert_allclose(fitted.to_sensor(points), psd().to_sensor(points), rtol=1e-6, atol=1e-15)
+
+
+def test_heights_that_are_almost_equal_do_not_fix_a_beam() -> None:
+    points = np.array([[0.0, 1e-3], [0.0, 1e-3 + 1e-18], [0.0, 1e-3 + 2e-18], [0.0, 3e-3]])
+    message = "^4 heights H do not fix the model C3, as they are too close to each other$"
+    with pytest.raises(ValueError, match=message):
+        Triangulation.fit(psd().to_sensor(points), points, model="C3")
 
 
 @pytest.mark.parametrize(("count", "model"), [(2, "C4"), (3, "D6"), (4, "H8")])

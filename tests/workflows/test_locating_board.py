@@ -378,7 +378,8 @@ def locate_with(
     devices: Any = SimpleNamespace(choose=lambda step, run, *size: sizes.append((step, size[2:])) or "cpu")
     done: Any = job(devices=devices)
     view: Any = FirstView("first view")
-    found: Any = done.locate(_ExpectedPose(view, (1e-3, 0.1), found="registration", **changes), features, copper)  # type: ignore[arg-type]
+    at: Any = _ExpectedPose(view, (1e-3, 0.1), found="registration", **changes)  # type: ignore[arg-type]
+    found: Any = done.locate(at, features, copper)
     measurement, chosen, given, registration, reason = found
     assert (chosen, given, registration) == (kind, features, "registration")
     assert measurement.view == f"{kind} first view"

@@ -16,7 +16,7 @@ from gpuvision.workflows.planning_simulation import plan_task
 from gpuvision.workflows.simulation_plan import SimulationPlanLimits
 from gpuvision.workflows.simulation_sample import ProfileSample, SampleReader
 from gpuvision.workflows.simulation_survey import profile_shares
-from workflows.test_planning_simulation import MM, heights_of, reading_at, task_of
+from groove_simulations import MM, heights_of, reading_at, task_of
 
 COUNT = 100
 

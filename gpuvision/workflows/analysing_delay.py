@@ -48,6 +48,8 @@ _PREDICTOR_GAINS, _NOISE_RATIO = (0.2, 0.5, 0.8), 1.0
 _SETTLED, _FRAMES = 0.01, 40
 # Longest delay [frames] (chosen): the roots of its picture take 8 s, and their time grows with the third power.
 _MAX_FRAMES = 100.0
+# Largest jitter [frames] (chosen): four of its standard deviations are the longest delay, and the limit takes seconds.
+_MAX_JITTER = 25.0
 # Largest difference of the measured scale from 1, and of the frame times relative to each other, without a warning
 # (chosen): a wrong unit differs by a factor of 10 and more, a calibration and a clock by a few percent.
 _SCALE_ERROR, _PERIOD_ERROR = 0.2, 0.1
@@ -97,6 +99,11 @@ class DelayAnalysis:
     def warnings(self) -> tuple[str, ...]:
         """Signs of wrong units or missing parts; one line each."""
         found = []
+        if self.budget.exposure > self.budget.period * (1.0 + 1e-9):
+            found.append(
+                f"the exposure of {1e3 * self.budget.exposure:.4g} ms is longer than a frame of "
+                f"{1e3 * self.budget.period:.4g} ms; check exposure and frame rate"
+            )
         if self.measured is None:
             if self.delay == 0.0:
                 found.append("the delay is 0: no part of it is given; the gains hold for a loop without delay")
@@ -266,8 +273,8 @@ def analyse_delay(
     Raises
     ------
     ValueError
-        Neither a budget nor a recording is given, the recording shows no delay (see `measure_delay`), or the delay is
-        longer than 100 frames.
+        Neither a budget nor a recording is given, the recording shows no delay (see `measure_delay`), the delay is
+        longer than 100 frames, or the jitter is larger than 25 frames.
     """
     if budget is None and recording is None:
         raise ValueError("give the parts of the delay, or a recording")
@@ -287,5 +294,10 @@ def analyse_delay(
         raise ValueError(
             f"the delay is {done.delay:.4g} s = {done.frames:.4g} frames of {1e3 * budget.period:.4g} ms, expected at "
             f"most {_MAX_FRAMES:g} frames; check the units of {advice}"
+        )
+    if done.jitter > _MAX_JITTER * budget.period:
+        raise ValueError(
+            f"the jitter is {done.jitter:.4g} s = {done.jitter / budget.period:.4g} frames of "
+            f"{1e3 * budget.period:.4g} ms, expected at most {_MAX_JITTER:g} frames; check its unit"
         )
     return done

@@ -91,6 +91,10 @@ def test_sensor_gives_the_readout(tmp_path: Path, quick_picture: None) -> None:
             ("--rate", "1000", "--exposure", "400"),
             "200 s = 2e.05 frames of 1 ms, expected at most 100 frames; check the",
         ),
+        (
+            ("--rate", "100", "--transfer", "1ms", "--jitter", "1"),
+            "the jitter is 1 s = 100 frames of 10 ms, expected at most 25 frames; check its unit",
+        ),
         (("--rate", "1000", "--stage", "edges"), "--stage is 'edges'"),
         (("--rate", "1000", "--exposure", "1mm"), "--exposure is '1mm', expected 1 number: s"),
         (("--rate", "1000", "--roi", "8x8"), "--roi has no effect without --sensor"),

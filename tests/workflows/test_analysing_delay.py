@@ -151,3 +151,6 @@ def test_warnings() -> None:
     assert text.startswith("the fit of the delay stopped before it converged")
     (text,) = analysis(budget=DelayBudget(period=PERIOD)).warnings
     assert text.startswith("the delay is 0")
+    assert analysis(budget=DelayBudget(period=PERIOD, exposure=PERIOD)).warnings == ()
+    (text,) = analysis(budget=DelayBudget(period=PERIOD, exposure=0.02)).warnings
+    assert text == "the exposure of 20 ms is longer than a frame of 10 ms; check exposure and frame rate"

@@ -62,10 +62,14 @@ class HomographyLimits:
     residual_rounding : float
         Residuals below this fraction of the largest coordinate are rounding errors, which an F test must not compare.
         Chosen: 64 roundings of float64.
+    max_rms : float
+        Largest root mean square residual in given standard deviations that `Triangulation.fit` accepts. Chosen: a wrong
+        pair gives a hundred and more, a standard deviation that is stated too small seldom ten. Default 10.
     """
 
     rank_tolerance: float = 1e-10
     residual_rounding: float = 64.0 * float(np.finfo(np.float64).eps)
+    max_rms: float = 10.0
 
 
 DEFAULT_LIMITS = HomographyLimits()

@@ -177,13 +177,18 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
         along, lens, camera : {"columns", "rows"}, Lens or None, Camera or None
             As in the class.
         limits : HomographyLimits, optional
-            Limits of rank and rounding.
+            Limits of rank, rounding and, with ``sigma``, of the residuals.
 
         Raises
         ------
         ValueError
             Shapes differ, a point is not finite or lies beyond the fold of the lens, the points do not determine the
-            model, or both a lens and a camera are given.
+            model, the residuals are far larger than ``sigma``, or both a lens and a camera are given.
+
+        Notes
+        -----
+        Sheet points that are all mirrored, or all have G and H swapped, fit as well as the right ones: the map to
+        mirrored axes is a homography, too. Check the sign of H on a part of known height.
         """
         sensor = np.asarray(sensor_points, dtype=np.float64)
         fits = fit_models(
@@ -197,6 +202,11 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
             limits=limits,
         )
         chosen = next(each for each in fits if each.p_value >= significance or each is fits[-1])
+        if sigma is not None and chosen.rms > limits.max_rms:
+            raise ValueError(
+                f"Triangulation.fit: the root mean square residual is {chosen.rms:.3g} times sigma, expected at most "
+                f"{limits.max_rms:g}; check the order of the points in both lists, the lens, and sigma"
+            )
         known = np.ravel([] if sigma is None else sigma)
         return cls(
             homography=numbers(chosen.homography, (3, 3), "Triangulation.homography"),

@@ -253,6 +253,24 @@ def test_residuals_are_told_in_sigmas(rng: np.random.Generator) -> None:
     assert full.rms == pytest.approx(math.sqrt(118 / 126), rel=0.26)
 
 
+def test_a_wrong_pair_is_refused_where_sigma_is_known(rng: np.random.Generator) -> None:
+    """One pair with G and H exchanged is hundreds of sigmas off; all pairs with mirrored axes fit."""
+    seen = psd().to_sensor(SHEET) + rng.normal(0.0, SIGMA, SHEET.shape)
+    wrong = SHEET.copy()
+    wrong[5] = wrong[5, ::-1]
+    with pytest.raises(ValueError, match=r"residual is \d\S+ times sigma, expected at most 10; check the order"):
+        Triangulation.fit(seen, wrong, sigma=SIGMA)
+    assert Triangulation.fit(seen, wrong).model  # without sigma there is nothing to compare with
+    limits = homography.HomographyLimits(max_rms=math.inf)
+    assert Triangulation.fit(seen, wrong, sigma=SIGMA, limits=limits).model
+    for mirror in (np.array([-1.0, 1.0]), np.array([1.0, -1.0])):
+        fitted = Triangulation.fit(seen, SHEET * mirror, sigma=SIGMA)
+        np.testing.assert_allclose(fitted.to_sensor(SHEET * mirror), seen, rtol=0, atol=6.0 * SIGMA)
+    Triangulation.fit(seen, SHEET, sigma=SIGMA / 8.0)
+    with pytest.raises(ValueError, match="times sigma, expected at most 10"):
+        Triangulation.fit(seen, SHEET, sigma=SIGMA / 12.0)
+
+
 def test_single_beam_is_a_moebius_map(rng: np.random.Generator) -> None:
     heights = np.linspace(-0.01, 0.01, 21)
     sheet = np.stack([np.full(21, 0.003), heights], -1)

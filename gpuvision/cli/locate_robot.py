@@ -206,6 +206,7 @@ def _track(
         with outputs.folder(files.out) as inside:
             track.write(inside)
         shown = f"look at {files.out / 'track.png'} and {files.out / 'track.csv'}"
+    echo_warnings(track.warnings(), err=True)
     problem = track.problem()
     if problem is not None:
         raise RecordingError("; ".join(each for each in (problem, shown) if each))

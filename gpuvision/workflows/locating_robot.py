@@ -82,6 +82,11 @@ class RobotLimits:
     scale_significance
         Error of the scale of the points that is significant [standard deviations] (chosen: one right view in 16 000).
         Default 4.0.
+    min_scale_gain
+        A significant error counts as not determined where it brings fewer points to lines than this multiple of the
+        square root of their number: clutter then determines the scale (measured on 4000 simulated views with up to half
+        of their points in clutter: of 87 wrong errors of a right scale 5 remain, of 661 right errors of 3 to 5 % 567).
+        Default 0.5.
     max_scale_error, max_scan_scale_error
         Largest accepted error of the scale of points, and of the points of a scan, where it is significant. A larger
         limit for scans (chosen: a camera whose tilt is wrong by a quarter of a degree changes the distances by up to
@@ -96,6 +101,7 @@ class RobotLimits:
     min_least_seen: float = 0.25
     min_refined: int = 24
     scale_significance: float = 4.0
+    min_scale_gain: float = 0.5
     max_scale_error: float = 0.02
     max_scan_scale_error: float = 0.05
 
@@ -153,8 +159,9 @@ def locate_robot(
     accepted where no whole line is missing (`RobotLimits.min_least_seen`).
 
     The scale of the points is fitted about the best pose, as one more unknown. Where its error is significant, the pose
-    is refused if the error is above `RobotLimits.max_scale_error`; otherwise `LocatedRobot.warnings` names it. The
-    covariances do not contain this error. Mirrored points are accepted: most fields equal their mirror image.
+    is refused if the error is above `RobotLimits.max_scale_error`; otherwise `LocatedRobot.warnings` names it, and the
+    covariance of each candidate contains the square of the motion of its pose by the scale. Mirrored points are
+    accepted: most fields equal their mirror image.
     """
     devices = _step_devices(device)
     start = time.perf_counter()
@@ -186,11 +193,13 @@ def locate_robot(
     weights = [evidence(used, paths, field, each.pose, half_line_width=0.5 * wide, **how) for each in found]
     ordered, weights = _order(found, weights, max_candidates)
     reason = _doubt(weights[0] if weights else None, len(used), limits)
-    fitted = None if reason else point_scale(used, field, ordered[0].pose, scale=field_map.scale)
+    fitted = None if reason else _fit_scale(used, field, ordered[0], field_map.scale, limits)
     largest = limits.max_scale_error if scan is None else limits.max_scan_scale_error
-    wrong = _scale_message(fitted, scale, limits.scale_significance)
+    wrong = _scale_message(fitted, scale) if fitted is not None and _is_significant(fitted, limits) else ""
     if fitted is not None and wrong and abs(fitted.error) > largest:
         reason, wrong = wrong, ""
+    if wrong:
+        ordered = tuple(_add_scale_error(each, used, field, field_map.scale, limits) for each in ordered)
     return LocatedRobot(
         candidates=() if reason else ordered,
         doubtful=ordered[:1] if reason else (),
@@ -261,10 +270,33 @@ def _doubt(best: Evidence | None, count: int, limits: RobotLimits) -> str:
     return ""
 
 
-def _scale_message(fitted: PointScale | None, scale: float | None, significance: float) -> str:
-    """Return the error of the scale of the points in words; empty where it is not significant."""
-    if fitted is None or not abs(fitted.error) > significance * fitted.sigma:
-        return ""
+def _is_significant(fitted: PointScale, limits: RobotLimits) -> bool:
+    return abs(fitted.error) > limits.scale_significance * fitted.sigma
+
+
+def _fit_scale(
+    points: Float32, field: Field, candidate: PoseCandidate, cost_scale: float, limits: RobotLimits
+) -> PointScale | None:
+    """Return the scale of the points about a candidate; None where they do not determine it."""
+    fitted = point_scale(points, field, candidate.pose, scale=cost_scale)
+    needed = limits.min_scale_gain * math.sqrt(len(points))
+    return None if fitted is not None and _is_significant(fitted, limits) and fitted.gained < needed else fitted
+
+
+def _add_scale_error(
+    candidate: PoseCandidate, points: Float32, field: Field, cost_scale: float, limits: RobotLimits
+) -> PoseCandidate:
+    """Return a candidate whose covariance contains the motion of the pose by a significant error of the scale."""
+    fitted = _fit_scale(points, field, candidate, cost_scale, limits)
+    if fitted is None or not _is_significant(fitted, limits):
+        return candidate
+    x, y, turn = fitted.pose - candidate.pose
+    moved = np.array([x, y, math.remainder(turn, 2.0 * math.pi)])
+    return candidate._replace(covariance=candidate.covariance + np.outer(moved, moved))
+
+
+def _scale_message(fitted: PointScale, scale: float | None) -> str:
+    """Return the error of the scale of the points in words."""
     question = "are their scale, or height and tilt of the camera, right?"
     if scale is not None:
         question = f"is the scale {1e3 * scale / (1.0 + fitted.error):.4g} mm, not {1e3 * scale:.4g} mm?"

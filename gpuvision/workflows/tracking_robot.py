@@ -80,6 +80,8 @@ class RobotTrack:
         State after each frame.
     refused
         Reason of each frame whose view was refused, by its number.
+    warned
+        Warnings of each frame that has some, by its number, such as an error of the scale.
     field
         The field.
     device
@@ -88,6 +90,7 @@ class RobotTrack:
 
     states: tuple[RobotState, ...]
     refused: dict[int, str]
+    warned: dict[int, tuple[str, ...]]
     field: Field
     device: Device
 
@@ -111,6 +114,14 @@ class RobotTrack:
         reasons = Counter(self.refused.values()).most_common(1)
         return f"no pose in {len(self.states)} frames" + (f": {reasons[0][0]}" if reasons else "")
 
+    def warnings(self) -> tuple[str, ...]:
+        """Return the first warning, and in how many frames there are warnings; nothing without warnings."""
+        if not self.warned:
+            return ()
+        first = min(self.warned)
+        count = f"{len(self.warned)} of {len(self.states)} frames have warnings"
+        return (f"{count}; frame {first}: {self.warned[first][0]}",)
+
     def rows(self) -> list[dict[str, Any]]:
         """Return a row for each frame: metres, radians, seconds; None where a value is not known."""
         rows = []
@@ -131,6 +142,7 @@ class RobotTrack:
                     {"pose": each.estimate.pose.tolist(), "probability": each.probability} for each in state.hypotheses
                 ],
                 "refused": self.refused.get(number),
+                "warnings": list(self.warned.get(number, ())),
             }
             for number, (row, state) in enumerate(zip(self.rows(), self.states, strict=True))
         ]
@@ -201,7 +213,8 @@ def track_robot(
     if initial_pose is not None:
         sigmas = np.array([uncertainty.initial, uncertainty.initial, uncertainty.initial_turn])
         initial = PoseEstimate(np.array(initial_pose, np.float64), np.diag(sigmas**2))
-    robot, states, refused = RobotFilter(field, initial, limits=limits), list[RobotState](), dict[int, str]()
+    robot, states = RobotFilter(field, initial, limits=limits), list[RobotState]()
+    refused, warned = dict[int, str](), dict[int, tuple[str, ...]]()
     if motions is not None and source.length is not None and len(motions) != source.length - 1:
         source.close()
         raise _wrong_number(len(motions), source.length)
@@ -216,6 +229,8 @@ def track_robot(
             located = locate_robot(scan_floor(frame[0], device=device, **scan), field, device=device)
             if located.reason:
                 refused[number] = located.reason
+            if located.warnings:
+                warned[number] = located.warnings
             robot.see(number / rate, located.candidates)
             states.append(robot.state())
     finally:
@@ -224,7 +239,7 @@ def track_robot(
         raise RecordingError("the recording has no frame")
     if motions is not None and len(motions) != len(states) - 1:
         raise _wrong_number(len(motions), len(states))
-    return RobotTrack(states=tuple(states), refused=refused, field=field, device=device)
+    return RobotTrack(states=tuple(states), refused=refused, warned=warned, field=field, device=device)
 
 
 def _wrong_number(motions: int, frames: int) -> ValueError:

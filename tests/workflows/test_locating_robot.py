@@ -528,6 +528,51 @@ def test_a_wrong_scale_of_points_is_named(error: float, device: Device, rng: np.
             assert f", not {1e3 * SCALE:.4g} mm?" in message
 
 
+def poses_on(field: Field, count: int, rng: np.random.Generator) -> list[tuple[float, float, float]]:
+    half = 0.4 * np.array([field.length, field.width])
+    return [(*rng.uniform(-half, half).tolist(), float(rng.uniform(-3.0, 3.0))) for _ in range(count)]
+
+
+def test_clutter_feigns_no_error_of_the_scale(device: Device) -> None:
+    """A third of the points anywhere within 6 m: without a limit of the gain, views at the right scale are refused."""
+    field, rng, refused = read_field("robocup_msl"), np.random.default_rng(7), {0.5: 0, -1e3: 0}
+    for pose in poses_on(field, 30, rng):
+        points = seen_points(field, pose, rng)
+        hit = rng.uniform(size=len(points)) < 0.3
+        far, turn = 6.0 * np.sqrt(rng.uniform(size=hit.sum())), rng.uniform(0.0, 2.0 * math.pi, hit.sum())
+        points[hit] = np.stack([far * np.cos(turn), far * np.sin(turn)], axis=-1)
+        for gain in refused:
+            located = locate_robot(points, field, device=device, limits=RobotLimits(min_scale_gain=gain))
+            refused[gain] += "than the lines of the field" in located.reason
+    assert refused[-1e3] >= 2
+    assert refused[0.5] == 0
+
+
+def test_the_covariance_contains_a_significant_error_of_the_scale(device: Device) -> None:
+    """At points 1 % too far; without the error, the poses are 20 standard deviations off."""
+    field, rng, warned = read_field("robocup_msl"), np.random.default_rng(7), 0
+    for pose in poses_on(field, 12, rng):
+        points = (1.01 * seen_points(field, pose, rng)).astype(np.float32)
+        located = locate_robot(points, field, device=device)
+        ignored = locate_robot(points, field, device=device, limits=RobotLimits(scale_significance=1e6))
+        assert (located.reason, ignored.reason, ignored.warnings) == ("", "", ())
+        if not located.warnings:
+            continue
+        warned += 1
+        off = [_squared_error(each.candidates, pose) for each in (located, ignored)]
+        assert off[0] < 16.27  # exceeded with a probability of 0.001
+        assert off[1] > 10.0 * off[0]
+    assert warned >= 6
+
+
+def _squared_error(candidates: Any, pose: tuple[float, float, float]) -> float:
+    """Return the squared Mahalanobis distance of the candidate that is nearest to the pose."""
+    best = min(candidates, key=lambda each: float(np.hypot(*(each.pose - pose)[:2])))
+    error = best.pose - pose
+    error[2] = math.remainder(error[2], 2.0 * math.pi)
+    return float(error @ np.linalg.solve(best.covariance, error))
+
+
 def test_the_limit_of_the_scale_is_larger_for_scans(device: Device, rng: np.random.Generator) -> None:
     field = read_field("robocup_msl")
     points = (1.03 * seen_points(field, (-6.0, 2.0, 0.7), rng)).astype(np.float32)

@@ -107,6 +107,26 @@ def test_the_command_writes_the_track(
     assert (tmp_path / "out" / "track.png").stat().st_size > 1000
 
 
+def test_a_small_error_of_the_scale_is_in_the_report_and_on_standard_error(
+    drive: tuple[np.ndarray, np.ndarray],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Views of 4 cm per pixel, read with 4.06 cm."""
+    views, _ = drive
+    np.save(tmp_path / "views.npy", views[:2])
+    where = ["--field", "robocup_msl", "--scale", "4.06cm", "--rate", "10", "--json", str(tmp_path / "track.json")]
+    monkeypatch.setattr("sys.argv", ["gpuvision", "locate-robot", str(tmp_path / "views.npy"), *where])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert not end.value.code
+    assert "warning: 2 of 2 frames have warnings; frame 0: the points are 1." in capsys.readouterr().err
+    for frame in json.loads((tmp_path / "track.json").read_text())["frames"]:
+        (warning,) = frame["warnings"]
+        assert "farther from the robot than the lines of the field" in warning
+
+
 def test_wrong_odometry_is_refused(drive: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
     views, _ = drive
     source, field = ArraySource(views[:1]), read_field("robocup_msl")
@@ -204,7 +224,9 @@ def test_report_and_summary_of_a_track(device: Device) -> None:
     lost = RobotState(0.5, np.full(3, np.nan), np.full((3, 3), np.nan), 0.0, Status.NO_DATA, ())
     found = RobotState(1.5, np.array([1.0, 2.0, 0.5]), covariance, 0.75, Status.OK, (hypothesis,))
     field = read_field("robocup_msl")
-    track = RobotTrack(states=(lost, found), refused={0: "too dark"}, field=field, device=device)
+    track = RobotTrack(
+        states=(lost, found), refused={0: "too dark"}, warned={1: ("a scale", "more")}, field=field, device=device
+    )
     unknown = dict.fromkeys(("x", "y", "theta", "sigma_x", "sigma_y", "sigma_theta"))
     known = {"x": 1.0, "y": 2.0, "theta": 0.5, "sigma_x": 0.02, "sigma_y": pytest.approx(0.03), "sigma_theta": 0.01}
     rows = [
@@ -217,12 +239,13 @@ def test_report_and_summary_of_a_track(device: Device) -> None:
         "field": field.name,
         "symmetric": True,
         "frames": [
-            {**rows[0], "covariance": None, "hypotheses": [], "refused": "too dark"},
+            {**rows[0], "covariance": None, "hypotheses": [], "refused": "too dark", "warnings": []},
             {
                 **rows[1],
                 "covariance": covariance.tolist(),
                 "hypotheses": [{"pose": [1.0, 2.0, 0.5], "probability": 0.75}],
                 "refused": None,
+                "warnings": ["a scale", "more"],
             },
         ],
         "device": {"label": device.label, "name": device.name, "driver": device.driver},
@@ -232,10 +255,16 @@ def test_report_and_summary_of_a_track(device: Device) -> None:
         "sigmas 20 mm, 30 mm, 0.57 degrees"
     )
     assert track.problem() is None
-    none = RobotTrack(states=(lost, lost), refused={0: "too dark", 1: "too dark"}, field=field, device=device)
+    assert track.warnings() == ("1 of 2 frames have warnings; frame 1: a scale",)
+    none = RobotTrack(
+        states=(lost, lost), refused={0: "too dark", 1: "too dark"}, warned={}, field=field, device=device
+    )
     assert none.summary() == "2 frames, 2 of them refused; last state NO_DATA\nno pose at the last frame"
     assert none.problem() == "no pose in 2 frames: too dark"
-    assert RobotTrack(states=(lost,), refused={}, field=field, device=device).problem() == "no pose in 1 frames"
+    assert none.warnings() == ()
+    assert (
+        RobotTrack(states=(lost,), refused={}, warned={}, field=field, device=device).problem() == "no pose in 1 frames"
+    )
 
 
 class Followed:
@@ -268,7 +297,11 @@ def test_each_frame_moves_the_robot_and_shows_its_place(
     monkeypatch.setattr(
         tracking_robot,
         "locate_robot",
-        lambda scan, field, device: SimpleNamespace(reason="dark" if scan[0] == 1 else "", candidates=(scan, device)),
+        lambda scan, field, device: SimpleNamespace(
+            reason="dark" if scan[0] == 1 else "",
+            candidates=(scan, device),
+            warnings=("small",) if scan[0] == 2 else (),
+        ),
     )
     views = np.arange(3, dtype=np.uint8)[:, None, None] * np.ones((3, 2, 2), np.uint8)
     motions = np.array([[0.3, 0.4, -0.5], [0.6, 0.0, 0.0]]) if with_odometry else None
@@ -293,7 +326,7 @@ def test_each_frame_moves_the_robot_and_shows_its_place(
     for call, time, (motion, sigmas) in zip((calls[1], calls[3]), (0.25, 0.5), moves, strict=True):
         assert call == ("move", time, motion, pytest.approx(sigmas))
     assert track.states == (1, 3, 5)
-    assert (track.refused, track.field, track.device) == ({1: "dark"}, field, device)
+    assert (track.refused, track.warned, track.field, track.device) == ({1: "dark"}, {2: ("small",)}, field, device)
 
 
 class Views(Source):

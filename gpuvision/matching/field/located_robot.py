@@ -103,13 +103,17 @@ class LocatedRobot:
             "candidates": [_candidate_report(each) for each in self.candidates],
             "evidence": _evidence_report(self.evidence),
             "scale": self.scale,
-            "point_scale": None if self.point_scale is None else self.point_scale._asdict(),
+            "point_scale": _scale_report(self.point_scale),
             "warnings": list(self.warnings),
             "points": self.points.tolist(),
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
             "steps": self.steps,
             "seconds": self.seconds,
         }
+
+
+def _scale_report(scale: PointScale | None) -> dict[str, float] | None:
+    return None if scale is None else {"error": scale.error, "sigma": scale.sigma}
 
 
 def _evidence_report(evidence: Evidence | None) -> dict[str, Any] | None:

@@ -25,6 +25,8 @@ Float64 = npt.NDArray[np.float64]
 _MAX_ITERATIONS, _MIN_STEP = 30, 1e-5
 # Least ratio of eigenvalues of the information at which the points determine the scale (chosen: single precision).
 _MIN_EIGENVALUE_RATIO = 1e-7
+# A point is on a line within this many standard deviations of the points near lines (chosen: 99 % of normal errors).
+_ON_LINE = 2.5
 
 
 class PointScale(NamedTuple):
@@ -34,10 +36,16 @@ class PointScale(NamedTuple):
     ----------
     error, sigma : float
         Error and its standard deviation, relative.
+    gained : int
+        Number of points on lines, more than without an error of the scale.
+    pose : (3,)
+        Pose that is fitted with the scale: x, y [m] and heading [rad].
     """
 
     error: float
     sigma: float
+    gained: int
+    pose: Float64
 
 
 def point_scale(points: npt.ArrayLike, field: Field, pose: npt.ArrayLike, *, scale: float) -> PointScale | None:
@@ -55,20 +63,26 @@ def point_scale(points: npt.ArrayLike, field: Field, pose: npt.ArrayLike, *, sca
     Returns
     -------
     PointScale, optional
-        None where the points do not determine the scale, for example points on two lines that meet.
+        None where the points do not determine the scale, for example points on two lines that meet, or where the fit
+        does not converge.
 
     Notes
     -----
     Gauss-Newton steps with the weights c^4 / (c^2 + r^2)^2 of the Geman-McClure loss, the loss of the pose. The
     covariance is the covariance of an M-estimator: H^-1 (sum psi^2 j j^T) H^-1 n / (n - 4), H the curvature of the
     cost, with psi the derivative of a point's cost and n the sum of the weights.
+
+    Points in clutter are beside other lines at other scales. Where the points on lines hardly determine the scale, such
+    a scale is found with a small standard deviation, but it gains few points.
     """
     found = np.asarray(points, np.float64)
     x, y, heading = np.asarray(pose, np.float64)
     unknowns = np.array([x, y, heading, 0.0])
     size = np.array([1.0, 1.0, *[1.0 / max(float(np.median(np.hypot(*found.T))), 1e-12)] * 2])  # similar units
+    start: Float64 | None = None
     for _ in range(_MAX_ITERATIONS):
         rows, left = _linearised(found, field, unknowns)
+        start = left if start is None else start
         weights = (scale**2 / (scale**2 + left**2)) ** 2
         rows = rows * size
         information = rows.T @ (weights[:, None] * rows)
@@ -78,6 +92,8 @@ def point_scale(points: npt.ArrayLike, field: Field, pose: npt.ArrayLike, *, sca
         unknowns += step
         if abs(step[3]) < _MIN_STEP:
             break
+    else:
+        return None
     slopes = weights * (scale**2 - 3.0 * left**2) / (scale**2 + left**2)
     curvature = rows.T @ (slopes[:, None] * rows)
     count = float(weights.sum())
@@ -87,7 +103,17 @@ def point_scale(points: npt.ArrayLike, field: Field, pose: npt.ArrayLike, *, sca
     covariance = inverse @ (rows.T @ (((weights * left) ** 2)[:, None] * rows)) @ inverse * count / (count - 4.0)
     # The model scales the points by exp(unknown): points that are too far need a factor below 1.
     error = math.exp(-unknowns[3]) - 1.0
-    return PointScale(error, (1.0 + error) * float(size[3]) * math.sqrt(covariance[3, 3]))
+    sigma = (1.0 + error) * float(size[3]) * math.sqrt(covariance[3, 3])
+    assert start is not None
+    return PointScale(error, sigma, _gained(start, left, scale), unknowns[:3])
+
+
+def _gained(before: Float64, after: Float64, scale: float) -> int:
+    """Return how many more points lie on lines, from the distances before and after a fit."""
+    near = [each[each < scale] for each in (np.abs(before), np.abs(after))]
+    sigma = min((1.4826 * float(np.median(each)) for each in near if len(each)), default=0.0)
+    first, last = (int(np.count_nonzero(each < _ON_LINE * sigma)) for each in near)
+    return last - first
 
 
 def _is_determined(information: Float64) -> bool:

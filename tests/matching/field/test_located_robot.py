@@ -37,7 +37,7 @@ def located(device: Device, **changes: Any) -> LocatedRobot:
         "device": device,
         "steps": {"search": {"device": device.label, "seconds": {}, "unusable": {}}},
         "seconds": {"lines": 0.5},
-        "point_scale": PointScale(0.01, 0.002),
+        "point_scale": PointScale(0.01, 0.002, 9, np.zeros(3)),
         "warnings": ("a warning",),
     }
     return LocatedRobot(**{**values, **changes})

@@ -113,6 +113,7 @@ def select(
     """
     from gpuvision.formats.features_file import write_features
     from gpuvision.matching.artwork.artwork import read_artwork
+    from gpuvision.matching.board.measurement_result import MeasurementLimits
     from gpuvision.matching.features.feature_set import choose_features, edge_clearance
     from gpuvision.plots.board import draw_features
 
@@ -135,6 +136,12 @@ def select(
         missing=missing,
         device=device_of(device),
     )
+    count, least = len(features.length) + len(features.fiducials.radius), MeasurementLimits().min_count
+    if count < least:
+        raise ValueError(
+            f"the region and the budget give {count} rulers and fiducials, gpuvision locate needs {least} or more; "
+            "give a larger --region or --budget"
+        )
     with outputs.folder(out) as inside:
         write_features(features, inside / "features.toml")
         draw_features(inside / "features.png", artwork, features, box)

@@ -161,8 +161,8 @@ Select = Callable[..., tuple[int, str, str]]
 def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], folder: Path) -> Select:
     options = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]
 
-    def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["gpuvision", "select", str(folder), *options, *map(str, arguments)])
+    def call(*arguments: object, board: Path = folder) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["gpuvision", "select", str(board), *options, *map(str, arguments)])
         code = 0
         try:
             cli.main()
@@ -189,6 +189,28 @@ def test_the_command_writes_features_and_a_picture(tmp_path: Path, run: Select) 
     np.testing.assert_allclose(chosen.placement, (9e-3, 8e-3))
     assert len(chosen.length) == 25
     assert cv2.imread(str(tmp_path / "chosen" / "features.png")).shape[1] > 1000
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_board_of_round_fiducials_needs_three(tmp_path: Path, run: Select, folder: Path, count: int) -> None:
+    """The command `locate` refuses poses from two."""
+    places = [(3, 3), (17, 13), (3, 13)][:count]
+    for name, diameter in (("copper.gbr", 1.0), ("mask.gbr", 2.0)):
+        flashes = "".join(f"X{x}000000Y{y}000000D03*\n" for x, y in places)
+        (tmp_path / name).write_text(f"%FSLAX46Y46*%\n%MOMM*%\n%ADD10C,{diameter}*%\nD10*\n{flashes}M02*\n")
+    (tmp_path / "outline.gbr").write_bytes((folder / "outline.gbr").read_bytes())
+    words = ("--region", "1mm,1mm,19mm,15mm", "--scale", "25um", "--out", tmp_path / "out")
+    code, out, err = run(*words, board=tmp_path)
+    if count == 3:
+        assert (code, err) == (0, "")
+        assert out.startswith("0 rulers (0 across traces) and 3 fiducials")
+        return
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert not (tmp_path / "out").exists()
+    if count == 1:
+        assert "0 edges of the region have room for a ruler, expected 3 or more, and 1 round pads can serve" in err
+    else:
+        assert "the region and the budget give 2 rulers and fiducials, gpuvision locate needs 3 or more" in err
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -61,7 +62,9 @@ def test_imaging_of_the_options() -> None:
 def test_features_are_chosen_written_and_drawn(full: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A device is for budgets in microseconds alone; the next command has the layers of this one."""
     asked: list[Any] = []
-    made = SimpleNamespace(summary=lambda: "30 rulers")
+    made = SimpleNamespace(
+        summary=lambda: "30 rulers", length=np.zeros(30), fiducials=SimpleNamespace(radius=np.zeros(0))
+    )
     side = SimpleNamespace(warnings=("an odd layer",))
     monkeypatch.setattr(Device, "named", staticmethod(lambda label: f"device {label}"))
     monkeypatch.setattr(artwork, "read_artwork", lambda *given, **how: asked.append((given, how)) or side)

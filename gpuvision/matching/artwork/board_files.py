@@ -121,7 +121,9 @@ def open_layers(place: Path, path: Path, layers: Mapping[str, str] | None) -> La
     ReadError
         The layers cannot be determined; the message proposes ``--layers``.
     """
-    how = {"overrides": dict(layers) if layers else None, "autoguess": not layers}
+    # gerbonara derives the name of the board from the names of the files, and fails at names of one letter.
+    how: dict[str, Any] = {"board_name": path.name}
+    how |= {"overrides": dict(layers) if layers else None, "autoguess": not layers}
     with warnings.catch_warnings(), reading(path, "board", hint="name its files with layers"):
         warnings.simplefilter("ignore")  # of old spellings, and of layers determined by contents
         _restore_layer_rules()

@@ -419,8 +419,9 @@ def choose_features(
     )
     if len(rulers.sigma) + 2 * len(fiducials.sigma) < 3:
         raise ValueError(
-            f"{len(rulers.sigma)} edges of the region have room for a ruler, expected 3 or more; give a larger "
-            "region, a smaller pixel or blur, or less shift"
+            f"{len(rulers.sigma)} edges of the region have room for a ruler, expected 3 or more, and "
+            f"{len(fiducials.sigma)} round pads can serve as fiducials; give a larger region, a smaller pixel or blur, "
+            "or less shift"
         )
     return select_feature_set(
         rulers, imaging, artwork.side, fiducials=fiducials, budget=budget, unit=unit, missing=missing, device=device

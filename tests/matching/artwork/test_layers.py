@@ -66,6 +66,12 @@ def test_layers_named_by_the_user_leave_other_files_out(tmp_path: Path) -> None:
     assert read_artwork(tmp_path, layers=named).warnings == ()
 
 
+def test_files_with_names_of_one_letter(tmp_path: Path) -> None:
+    written(tmp_path, "b.gtl", "b.gts")
+    named = {r"b\.gtl": "top copper", r"b\.gts": "top mask"}
+    assert len(read_artwork(tmp_path, layers=named).copper) == 2
+
+
 def proposed(error: pytest.ExceptionInfo[ReadError]) -> dict[str, str]:
     """Return the layers that the options in a message name, as the command takes them."""
     words = shlex.split(str(error.value).partition(": --layers ")[2].partition(" (layers unknown")[0])

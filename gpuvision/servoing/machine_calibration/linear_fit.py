@@ -52,12 +52,14 @@ def whiten(rows: Float64, covariance: npt.ArrayLike) -> Float64:
     Raises
     ------
     ValueError
-        A covariance is not positive definite.
+        A covariance is not finite or not positive definite.
     """
     given = np.asarray(covariance, np.float64)
     size = rows.shape[1]
     if given.shape not in ((size, size), (len(rows), size, size)):
         raise ValueError(f"covariance has shape {given.shape}, expected ({size}, {size}) or (n, {size}, {size})")
+    if not np.isfinite(given).all():
+        raise ValueError("covariance is not finite; drop refused measurements first")
     try:
         factor = np.linalg.cholesky(given)
     except np.linalg.LinAlgError:

@@ -34,6 +34,8 @@ _NAMES = (*_AXES, "board x", "board y", "camera angle", "camera offset x", "came
 _OFFSET = slice(7, 9)
 # Moves across their common direction below this fraction of their length count as 0: the same as in `linear_fit`.
 _FLAT = 1e-9
+# Significance of the determinant of the axes [standard deviations]: one false alarm in 30 000 for normal errors.
+_AXES_SIGNIFICANCE = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,9 +115,10 @@ def fit_motion_frame(commands: npt.ArrayLike, seen: npt.ArrayLike, covariance: n
     Raises
     ------
     DegenerateError
-        The moves do not determine scales, skew and angles; the message names the missing parameters.
+        The moves do not determine scales, skew and angles; the message names the missing parameters. Or the seen
+        positions do not follow the commands in two directions.
     ValueError
-        A shape is wrong or a number is not finite.
+        A shape is wrong, a number is not finite, or the seen axes are mirrored.
 
     Notes
     -----
@@ -135,6 +138,7 @@ def fit_motion_frame(commands: npt.ArrayLike, seen: npt.ArrayLike, covariance: n
     observed[:, 2] = _wrap(poses[:, 2] - given[:, 2], poses[0, 2] - given[0, 2])
     advice = "move the head in x and y, and turn it at different places"
     fit = fit_linear(design[:, :, : len(names)], observed, covariance, names, advice)
+    _check_axes(fit.values[:4], fit.covariance[:4, :4])
     rows = _parameter_rows(fit.values)
     parameters = _parameters(fit.values)
     spread = rows @ fit.covariance @ rows.T
@@ -188,6 +192,8 @@ def next_move(
 
 def _check_moves(commands: Float64) -> None:
     """Refuse commands along one line, with the names of the parameters that stay unknown."""
+    if not len(commands):
+        raise DegenerateError("there is no command; move the head in x and y, and turn it at different places")
     moves = commands[:, :2] - commands[:, :2].mean(axis=0)
     _, lengths, directions = np.linalg.svd(np.vstack([moves, np.zeros((2, 2))]), full_matrices=False)
     if lengths[0] == 0.0:
@@ -201,6 +207,22 @@ def _check_moves(commands: Float64) -> None:
     elif x <= _FLAT:
         along, missing = "along y", "skew and x scale"
     raise DegenerateError(f"all moves are {along}: {missing} cannot be found; move across that line, too")
+
+
+def _check_axes(axes: Float64, covariance: Float64) -> None:
+    """Refuse axes (ax, ay, bx, by) that are mirrored, or whose determinant does not differ from 0."""
+    ax, ay, bx, by = axes
+    slope = np.array([by, -bx, -ay, ax])
+    area, sigma = ax * by - ay * bx, math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+    if area < -_AXES_SIGNIFICANCE * sigma:
+        raise ValueError(
+            "the seen axes are mirrored: y is clockwise from x; check the signs of the commands and of the seen poses"
+        )
+    if area <= _AXES_SIGNIFICANCE * sigma:
+        raise DegenerateError(
+            "the seen positions do not follow the commands in two directions; check that the head moves and that both "
+            "are in metres"
+        )
 
 
 def _design(commands: Float64) -> Float64:

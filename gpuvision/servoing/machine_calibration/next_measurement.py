@@ -49,10 +49,12 @@ def most_informative(candidates: Float64, information: Float64) -> NextMeasureme
     Raises
     ------
     ValueError
-        There is no candidate.
+        There is no candidate, or one is not finite.
     """
     if not len(candidates):
         raise ValueError("there is no candidate for the next measurement, expected one at least")
+    if not np.isfinite(candidates).all():
+        raise ValueError("a candidate for the next measurement is not finite, expected finite numbers")
     # Unit diagonal before the inversion: parameters in metres and without unit have very different sizes.
     unit = 1.0 / np.sqrt(np.diag(information))
     covariance = np.linalg.inv(information * unit * unit[:, None]) * unit * unit[:, None]

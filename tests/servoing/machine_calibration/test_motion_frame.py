@@ -174,6 +174,32 @@ def test_first_moves_are_proposed_without_a_fit() -> None:
     assert frame.unobservable == ()
 
 
+def test_mirrored_and_still_axes_are_refused() -> None:
+    """Commands with the wrong sign of y, with x and y exchanged; positions that do not move, or along a line."""
+    for change in (np.diag([1.0, -1.0, 1.0]), np.eye(3)[[1, 0, 2]]):
+        with pytest.raises(ValueError, match="the seen axes are mirrored: y is clockwise from x; check the signs"):
+            fit_motion_frame(COMMANDS @ change, _seen(COMMANDS), COVARIANCE)
+    both = np.diag([-1.0, -1.0, 1.0])  # a turn by half
+    assert fit_motion_frame(COMMANDS @ both, _seen(COMMANDS), COVARIANCE).parameters[0] == pytest.approx(X_SCALE)
+    for still in (np.diag([0.0, 0.0, 1.0]), np.diag([1.0, 0.0, 1.0])):
+        seen = _seen(COMMANDS @ still)
+        for noise in (0.0, _draws(COMMANDS, 1, 4)[0] - _seen(COMMANDS)):
+            with pytest.raises(DegenerateError, match="do not follow the commands in two directions"):
+                fit_motion_frame(COMMANDS, seen + noise, COVARIANCE)
+
+
+def test_missing_and_infinite_values_are_refused() -> None:
+    with pytest.raises(DegenerateError, match="there is no command"):
+        fit_motion_frame(np.zeros((0, 3)), np.zeros((0, 3)), COVARIANCE)
+    for value in (math.nan, math.inf):
+        candidates = COMMANDS.copy()
+        candidates[2, 1] = value
+        with pytest.raises(ValueError, match="covariance is not finite"):
+            fit_motion_frame(COMMANDS, _seen(COMMANDS), np.diag([1.0, 1.0, value]))
+        with pytest.raises(ValueError, match="a candidate for the next measurement is not finite"):
+            next_move(COMMANDS[:1], candidates, COVARIANCE)
+
+
 def test_wrong_input_is_refused() -> None:
     with pytest.raises(ValueError, match="seen have shape"):
         fit_motion_frame(COMMANDS, _seen(COMMANDS)[:-1], COVARIANCE)

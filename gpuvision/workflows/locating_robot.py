@@ -184,21 +184,15 @@ def locate_robot(
     kept["device"] = devices.choose("search", search, *size)
     chosen = time.perf_counter()
     found = search(kept["device"])
-    paths, wide = (None, default_line_width(field)) if scan is None else (scan.paths, scan.line_width)
-    how: dict[str, Any] = {
-        "scale": field_map.scale,
-        "max_range": field_map.max_range,
-        "margin": field_map.margin if initial_pose is None else None,
-    }
-    weights = [evidence(used, paths, field, each.pose, half_line_width=0.5 * wide, **how) for each in found]
+    weights = _weigh(found, used, scan, field_map, is_anywhere=initial_pose is None)
     ordered, weights = _order(found, weights, max_candidates)
-    reason = _doubt(weights[0] if weights else None, len(used), limits)
-    fitted = None if reason else _fit_scale(used, field, ordered[0], field_map.scale, limits)
-    largest = limits.max_scale_error if scan is None else limits.max_scan_scale_error
-    wrong = _scale_message(fitted, scale) if fitted is not None and _is_significant(fitted, limits) else ""
-    if fitted is not None and wrong and abs(fitted.error) > largest:
-        reason, wrong = wrong, ""
-    if wrong:
+    reason, warning, fitted = _doubt(weights[0] if weights else None, len(used), limits), "", None
+    if not reason:
+        fitted = _fit_scale(used, field, ordered[0], field_map.scale, limits)
+    if fitted is not None and _is_significant(fitted, limits):
+        largest = limits.max_scale_error if scan is None else limits.max_scan_scale_error
+        message = _scale_message(fitted, scale)
+        reason, warning = (message, "") if abs(fitted.error) > largest else ("", message)
         ordered = tuple(_add_scale_error(each, used, field, field_map.scale, limits) for each in ordered)
     return LocatedRobot(
         candidates=() if reason else ordered,
@@ -206,7 +200,7 @@ def locate_robot(
         evidence=weights[0] if weights else None,
         reason=reason,
         point_scale=fitted,
-        warnings=(wrong,) if wrong else (),
+        warnings=(warning,) if warning else (),
         steps=devices.report(),
         seconds={"map": mapped - start, "choose device": chosen - mapped, "search": time.perf_counter() - chosen},
         **kept,
@@ -233,6 +227,26 @@ def _usable(points: Float32) -> Float32:
     """Return the finite points; where they are too many, every n-th of them."""
     finite = points[np.isfinite(points).all(axis=1)]
     return np.ascontiguousarray(finite[:: -(-max(len(finite), 1) // _MAX_POINTS)], np.float32)
+
+
+def _weigh(
+    found: tuple[PoseCandidate, ...],
+    points: Float32,
+    scan: FloorScan | None,
+    field_map: DistanceMap,
+    *,
+    is_anywhere: bool,
+) -> list[Evidence]:
+    """Return the evidence for each candidate; of points without a scan no expected lines are counted."""
+    field = field_map.field
+    paths, width = (None, default_line_width(field)) if scan is None else (scan.paths, scan.line_width)
+    how: dict[str, Any] = {
+        "half_line_width": 0.5 * width,
+        "scale": field_map.scale,
+        "max_range": field_map.max_range,
+        "margin": field_map.margin if is_anywhere else None,
+    }
+    return [evidence(points, paths, field, each.pose, **how) for each in found]
 
 
 def _order(

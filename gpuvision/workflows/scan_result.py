@@ -360,29 +360,29 @@ def scan_advice(status: npt.NDArray[np.uint8], sensor: Sensor) -> tuple[str, ...
         )
     if Status.NOT_FINITE in frequent:
         sentences.append(
-            "most samples have light that is not finite (infinity or NaN): check the program that wrote the recording"
+            "many samples have light that is not finite (infinity or NaN): check the program that wrote the recording"
         )
     if Status.LOW_SIGNAL in frequent and isinstance(sensor.readout, LineReadout):
         threshold = "a lower [line] threshold" if sensor.auto_threshold else '[line] threshold = "auto"'
         sentences.append(
-            f"most samples are dark at a threshold of {sensor.readout.threshold:g} grey levels: try {threshold}, "
+            f"many samples are dark at a threshold of {sensor.readout.threshold:g} grey levels: try {threshold}, "
             "[recording] background in ambient light, another [recording] channel, or a longer exposure"
         )
     elif Status.LOW_SIGNAL in frequent and sensor.kind == "focus":
-        sentences.append("most pixels have no texture: try a lower [focus] threshold, or project a pattern")
+        sentences.append("many pixels have no texture: try a lower [focus] threshold, or project a pattern")
     elif Status.LOW_SIGNAL in frequent:
-        sentences.append("most samples are dark: try a lower [psd] minimum_total, or more light")
+        sentences.append("many samples are dark: try a lower [psd] minimum_total, or more light")
     if Status.AMBIGUOUS in frequent and camera:
         sentences.append(
-            "most samples have several candidates for the line: try [recording] background, which removes ambient "
+            "many samples have several candidates for the line: try [recording] background, which removes ambient "
             "light, or a higher [line] threshold"
         )
     if frequent & {Status.HORIZON, Status.OUT_OF_RANGE}:
         if sensor.kind == "focus":
             return (
                 *sentences,
-                "most pixels are sharpest outside the stack: check its range, and the limits of [output]",
+                "many pixels are sharpest outside the stack: check its range, and the limits of [output]",
             )
         step = "the sign of [transport] angle_step and axis_direction" if turning else "the sign of [axes] and baseline"
-        sentences.append(f"most samples miss the scene: check {step}, and the limits x, y, z of [output]")
+        sentences.append(f"many samples miss the scene: check {step}, and the limits x, y, z of [output]")
     return tuple(sentences)

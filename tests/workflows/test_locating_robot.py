@@ -390,7 +390,7 @@ def test_a_search_and_its_evidence(is_scan: bool, known: bool, refused: bool, mo
     given: Any = FloorScan(points, np.zeros(4, np.float32), np.ones((2, 4), np.float32), 0.05) if is_scan else points
     field: Any = SimpleNamespace(length=3.0, width=2.0)
     level = SimpleNamespace(shape=(7, 9))
-    field_map = SimpleNamespace(cells=SimpleNamespace(level=level), scale=0.06, max_range=4.0, margin=0.15)
+    field_map = SimpleNamespace(cells=SimpleNamespace(level=level), field=field, scale=0.06, max_range=4.0, margin=0.15)
     pose = (0.1, 0.2, 0.3) if known else None
     asked: list[Any] = []
 

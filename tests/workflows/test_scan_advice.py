@@ -27,15 +27,15 @@ FOCUS = Sensor.from_section(
 FLAGS = ("NO_DATA", "NOT_FINITE", "LOW_SIGNAL", "AMBIGUOUS", "HORIZON", "OUT_OF_RANGE")
 WORDS = {
     "NO_DATA": "many frames are damaged",
-    "NOT_FINITE": "most samples have light that is not finite (infinity or NaN)",
-    "camera, LOW_SIGNAL": "most samples are dark at a threshold of",
-    "focus, LOW_SIGNAL": "most pixels have no texture",
+    "NOT_FINITE": "many samples have light that is not finite (infinity or NaN)",
+    "camera, LOW_SIGNAL": "many samples are dark at a threshold of",
+    "focus, LOW_SIGNAL": "many pixels have no texture",
     "psd, LOW_SIGNAL": "try a lower [psd] minimum_total",
-    "camera, AMBIGUOUS": "most samples have several candidates for the line",
-    "focus, HORIZON": "most pixels are sharpest outside the stack",
-    "focus, OUT_OF_RANGE": "most pixels are sharpest outside the stack",
-    "HORIZON": "most samples miss the scene",
-    "OUT_OF_RANGE": "most samples miss the scene",
+    "camera, AMBIGUOUS": "many samples have several candidates for the line",
+    "focus, HORIZON": "many pixels are sharpest outside the stack",
+    "focus, OUT_OF_RANGE": "many pixels are sharpest outside the stack",
+    "HORIZON": "many samples miss the scene",
+    "OUT_OF_RANGE": "many samples miss the scene",
     "psd, AMBIGUOUS": None,
     "focus, AMBIGUOUS": None,
 }

@@ -131,7 +131,7 @@ def test_what_to_try(device: Device) -> None:
     frames, _ = slope_frames(dark=20)
     assert "no texture" in " ".join(scan(frames, sensor(threshold=100.0), device=device).advice())
     assert "sharpest outside the stack" in " ".join(scan(frames[5:, 20:], sensor(), device=device).advice())
-    with pytest.raises(ValueError, match=r"no valid sample in .*most pixels have no texture"):
+    with pytest.raises(ValueError, match=r"no valid sample in .*many pixels have no texture"):
         scan(np.zeros((5, 8, 8), np.uint8), sensor(), device=device)
 
 

@@ -360,7 +360,7 @@ def test_a_source_of_unknown_length_is_compared_with_the_odometry(
     frames: int, motions: int | None, error: type[Exception], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tracking_robot, "scan_floor", lambda frame, **_: None)
-    located = SimpleNamespace(reason="no line", candidates=())
+    located = SimpleNamespace(reason="no line", candidates=(), warnings=())
     monkeypatch.setattr(tracking_robot, "locate_robot", lambda *_, **__: located)
     source = Views(frames)
     odometry = None if motions is None else np.tile(MOTION, (motions, 1))

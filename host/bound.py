@@ -6,7 +6,7 @@ import collections
 import functools
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, NoReturn, TypeVar
 
 import numpy as np
@@ -24,6 +24,7 @@ from gpuvision.host.launch import Launch, Launchable, Spec, describe_launch
 from gpuvision.host.limits import fit_work
 from gpuvision.host.process import after_fork, check_process
 from gpuvision.host.program import build
+from gpuvision.host.team import BRIEF_PAUSE_NS, PAUSE_NS, Team, core_query, new_counters
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -99,6 +100,7 @@ class Bound(Generic[R]):
         # total.
         self._wait: Callable[[Any], object] = device.wait if device.kind == "pocl" else cl.Event.wait
         self._empty = not all(launch.global_size)
+        self._shift = device.shift
         self.inputs = tuple(inputs) or self._new_inputs(launch.inputs)
         self.outputs = self.allocate()
         self._in_flight: collections.deque[tuple[Any, Any]] = collections.deque()
@@ -111,6 +113,8 @@ class Bound(Generic[R]):
         self._copied_bytes = 0 if inputs else sys.maxsize if device.kind == "intel" else _COPIED_BYTES
         self._array_specs = (*launch.inputs, *self._computed_specs.values())
         self._inline_site: _Site | None = None
+        self._team: Team | None = None  # of launches that the caller waits for
+        self._called_team: Team | None = None  # of others
         self._calls_inline = False  # whether a call that does not wait uses the inline site
         try:
             self._connect(launch)
@@ -160,6 +164,17 @@ class Bound(Generic[R]):
                 cl.enqueue_nd_range_kernel(*self._queue_site.arguments).wait()
             except cl.Error as error:
                 self._raise(error)
+
+    def prepare_team(self) -> None:
+        """Build the kernel for launches that the calling thread and waiting workers share (`Launch.by_team`)."""
+        launch, device = self._launch, self.device
+        if not launch.by_team or launch.groups == 1 or self._queue_is_inline or not device.has_teams:
+            return
+        try:
+            self._team = self._new_team()
+            self._called_team = self._team if device.call_gains_by_team else None
+        except cl.Error as error:
+            self._raise(error)
 
     def _new_inputs(self, specs: Sequence[Spec]) -> tuple[DeviceArray, ...]:
         """Return new input arrays, filled with zeros."""
@@ -221,6 +236,8 @@ class Bound(Generic[R]):
         """
         given = self._own if not frames and out is None else self._given(frames, out)
         try:
+            if self._called_team is not None and not wait_for:
+                return self._call_team(given, self._called_team)
             return self._enqueue(given, wait_for)
         except cl.Error as error:
             self._raise(error)
@@ -229,12 +246,47 @@ class Bound(Generic[R]):
         """Launch, wait with the least delay, and return the written arrays: `out` or `outputs`."""
         given = self._own if not frames and out is None else self._given(frames, out)
         try:
-            event = self._enqueue(given, waits=True)
-            if self._empty or not self._run_site.inline:
-                self._wait(event)
+            if self._team is None:
+                self._run_alone(given)
+            else:
+                self._run_team(given, self._team)
         except cl.Error as error:
             self._raise(error)
         return self.outputs if out is None else out
+
+    def _run_alone(self, given: tuple[Any, ...]) -> None:
+        """Launch and wait."""
+        event = self._enqueue(given, waits=True)
+        if self._empty or not self._run_site.inline:
+            self._wait(event)
+
+    def _run_team(self, given: tuple[Any, ...], team: Team) -> None:
+        """Launch and wait, with the waiting workers if there are any; else they begin to wait if this gains."""
+        if team.has(given):
+            self._finish_queue()
+            team.lead()
+            return
+        gains = team.gains(PAUSE_NS)
+        self._run_alone(given)
+        team.rest()
+        if gains:
+            self._start_team(given, team)
+
+    def _call_team(self, given: tuple[Any, ...], team: Team) -> Any:
+        """Launch with the waiting workers if the caller does nothing else between launches; return the event."""
+        gains = team.gains(BRIEF_PAUSE_NS)
+        if gains and team.has(given):
+            self._finish_queue()
+            return team.lead()
+        event = self._enqueue(given)
+        if gains:
+            self._start_team(given, team)
+        return event
+
+    def _start_team(self, given: tuple[Any, ...], team: Team) -> None:
+        self._set_arrays(self._leader, given)
+        self._set_arrays(self._member, given)
+        team.start(given)
 
     def _raise(self, error: cl.Error) -> NoReturn:
         """Raise the exception of gpuvision for an error of the runtime."""
@@ -257,6 +309,8 @@ class Bound(Generic[R]):
             self._finish_queue()
         if given is not site.given:
             self._set_arrays(site, given)
+        if self._shift.team is not None and not site.inline:
+            self._shift.end()
         event = cl.enqueue_nd_range_kernel(*site.arguments)
         if given is not self._own and not site.inline:
             self._hold(event, given)
@@ -420,15 +474,34 @@ class Bound(Generic[R]):
                 defect = "is missing" if array is None else "is not computed; expected None"
                 raise ValueError(f"out.{name} {defect}")
 
+    def _new_team(self) -> Team:
+        launch, device = self._launch, self.device
+        counters = new_counters(device, launch.global_size)
+        core = core_query() if device.pins_workers else None
+        leading = replace(
+            launch,
+            global_size=(1,),
+            local_size=(1,),
+            defines={**launch.defines, "TEAM": None},
+            arguments=(*launch.arguments, memory_of(counters), np.uint32(0)),
+        )
+        waiting = replace(leading, global_size=(device.compute_units - (core is None),))
+        self._leader = self._site_on(device.inline_queue(self.queue), leading)
+        self._member = self._site_on(device.new_queue(), waiting)
+        for site in (self._leader, self._member):
+            self._set_arrays(site, self._own)
+        patience = len(launch.inputs) + len(launch.outputs) + len(launch.arguments) + 1
+        return Team(self._shift, counters, self._leader.arguments, self._member.arguments, patience, core)
+
     def _clear(self, array: DeviceArray) -> None:
         if self.device.shares_memory:
             host_view(array).fill(0)
         elif array.nbytes:
             cl.enqueue_fill_buffer(self.queue, memory_of(array), np.zeros(1, np.uint8), 0, array.nbytes)
 
-    def _site_on(self, queue: Any) -> _Site:
+    def _site_on(self, queue: Any, launch: Launch | None = None) -> _Site:
         """Build the kernel for the device of a queue and set the arguments that calls do not change."""
-        launch, operation = self._launch, self.operation
+        launch, operation = launch or self._launch, self.operation
         if operation.kernel_folder is None:
             raise ValueError(f"{type(operation).__name__} has no kernel_folder; set it to the folder of its .cl files")
         with building(launch.source):

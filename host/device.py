@@ -24,6 +24,7 @@ from gpuvision.host.failure import launch_failure
 from gpuvision.host.huge_pages import advise_huge_pages
 from gpuvision.host.kept import clear_with
 from gpuvision.host.process import check_process
+from gpuvision.host.team import Shift
 from gpuvision.host.text import printable, size_in_words
 from gpuvision.host.trace import active_trace
 
@@ -47,6 +48,7 @@ class _Connection:
 
     def __init__(self, context: Any, queue: Any, *, may_reopen: bool) -> None:
         self.context, self.queue = context, queue
+        self.shift = Shift()
         self.may_reopen = may_reopen
 
 
@@ -282,6 +284,26 @@ class Device:
                 "the device Device.of(queue)"
             )
         _check_order(queue)
+
+    @property
+    def shift(self) -> Shift:
+        """The team of workers that wait for a launch; see `gpuvision.host.team`."""
+        return self._connection.shift
+
+    @property
+    def has_teams(self) -> bool:
+        """Whether the calling thread and waiting workers can share a launch: cores, shared memory, an inline queue."""
+        return self.compute_units > 1 and self.shares_memory and self.has_inline_queues
+
+    @property
+    def call_gains_by_team(self) -> bool:
+        """Whether a launch by a team takes less time than one of some launches in the queue: on PoCL."""
+        return self.has_teams and self.inline_device is not None
+
+    @property
+    def pins_workers(self) -> bool:
+        """Whether each worker thread stays on its core (``POCL_AFFINITY``, set by `gpuvision.host.runtime`)."""
+        return self.kind == "pocl" and os.environ.get("POCL_AFFINITY") == "1"
 
     def without_vectors(self) -> Device:
         """Return this device, with its context and queue, for kernels in one work-item per element."""

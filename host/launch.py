@@ -59,6 +59,9 @@ class Launch:
     inline : bool or None
         Whether a launch that `passes_once` and is small runs in the calling thread. ``None``: where the runtime is
         known to gain. Default None.
+    by_team : bool
+        Whether the kernel takes its work-items as ``kernels/common/team.h`` says, so that the calling thread and
+        waiting workers can share a launch. Default False.
     """
 
     source: str
@@ -73,6 +76,7 @@ class Launch:
     streams: bool = False
     problem_per_group: bool = False
     inline: bool | None = None
+    by_team: bool = False
 
     @property
     def groups(self) -> int:

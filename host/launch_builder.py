@@ -45,6 +45,8 @@ _GROUPINGS = {
     "per_element": group_per_element,
 }
 
+# Fewest bytes of a stream whose launches waiting workers share: one core moves them in 10 us, a launch takes 2 us.
+_TEAM_BYTES = 256 << 10
 # Least rows and columns of an image whose last axis of 3 or 4 is taken for colours. Chosen: smaller images are rare,
 # and so are larger batches of frames of 3 or 4 columns.
 _FEWEST_PIXELS = 16
@@ -239,6 +241,7 @@ class LaunchBuilder:
         passes_once: bool = False,
         problem_per_group: bool = False,
         streams: bool = False,
+        by_team: bool = False,
     ) -> Launch:
         """Return the launch; add the macros of the real type and of the kernel variant.
 
@@ -254,6 +257,8 @@ class LaunchBuilder:
         streams : bool
             As in `Launch`. The vector variant of such a kernel writes past the caches of a CPU (macro ``PAST_CACHES``)
             when the launch moves more bytes than the last cache holds. Default False.
+        by_team : bool
+            Whether the vector variant of the kernel can be launched as in `Launch`. Default False.
 
         Raises
         ------
@@ -277,6 +282,7 @@ class LaunchBuilder:
             streams=streams,
             problem_per_group=problem_per_group,
             inline=self._settings.inline,
+            by_team=by_team and work.vectors and not past_caches and not (streams and moved < _TEAM_BYTES),
         )
 
 

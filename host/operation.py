@@ -142,6 +142,8 @@ class Operation(Generic[R]):
         """
         bound = self._bind(device, shape, dtype, queue, inputs)
         bound.prepare_queue()
+        if queue is None:  # not the stages of a sequence or a stream
+            bound.prepare_team()
         return bound
 
     def _bind(

@@ -150,6 +150,9 @@ class BoundSequence(Bound[R]):
     def prepare_queue(self) -> None:
         """Do nothing: `Operation.bind` has prepared the stages."""
 
+    def prepare_team(self) -> None:
+        """Do nothing: stages follow each other too quickly for workers to wait for one of them."""
+
     @property
     def inline(self) -> bool:
         """Whether all stages run in the calling thread."""

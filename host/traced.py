@@ -33,6 +33,9 @@ class TracedBound(Bound[R]):
         self._record("launch", "compute", [event], before)
         return event
 
+    def prepare_team(self) -> None:
+        """Do nothing: launches that are recorded have an event in the queue."""
+
     def run(self, *frames: Any, out: R | None = None) -> R:
         """Launch, wait and return the written arrays, as `Bound.run`."""
         with stage("launch and wait", _name(self)):

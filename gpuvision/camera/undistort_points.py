@@ -121,6 +121,7 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
                 **flags(INVERSE=self.inverse),
             },
             arguments=[self._packed(build.real), np.uint64(count), np.uint64(work.each)],
+            by_team=True,
         )
 
     def _model_defines(self, real: np.dtype[Any]) -> dict[str, Define]:

@@ -64,6 +64,7 @@ class LineLaunch:
                 None if profiles is None else profiles.blocks(build.real),
             ],
             passes_once=work.vectors and self._passes_once,
+            by_team=True,
         )
 
     @property

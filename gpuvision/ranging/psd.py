@@ -372,6 +372,7 @@ class PsdReadout(VisionOperation[PsdReading]):
             ],
             passes_once=work.vectors,
             streams=True,
+            by_team=True,
         )
 
     def _defines(self, dtype: np.dtype[Any], real: np.dtype[Any]) -> dict[str, Define]:

@@ -134,6 +134,7 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
             ],
             passes_once=work.vectors,
             streams=True,
+            by_team=True,
         )
 
     # ---- construction --------------------------------------------------------------------------------------

@@ -32,6 +32,7 @@
 //          (line_group.h); under CANDIDATES one work-item per profile, padded to whole work-groups.
 #include "line/line_profiles.h"
 #include "common/sheet.h"
+#include "common/team.h"
 
 // Parameters, in the order of LineTable in gpuvision/ranging/line_launch.py.
 typedef struct {
@@ -238,14 +239,14 @@ static inline Profiles profiles_from(const Profiles *frame, int sample) {
 #include "line/line_group.h"
 #endif
 
-// read_frame: read the part of a frame that this work-item processes. `first` is the element of the frame's first
-// profile in the outputs.
+// read_frame: read the part of a frame that a work-item processes, one of `items` of the frame. `first` is the element of
+// the frame's first profile in the outputs.
 #if defined(CANDIDATES)
 // LANES profiles, by a walk along them. Work-items beyond the last profile only fill up a work-group.
-static inline void read_frame(const Profiles *frame, int samples, constant LineTable *table, const Outputs *to,
-                              ulong first, global const real *previous) {
-    const int sample = min((int)get_global_id(0) * LANES, samples - LANES);
-    if ((int)get_global_id(0) * LANES >= samples) return;
+static inline void read_frame(const Profiles *frame, int item, int items, int samples, constant LineTable *table,
+                              const Outputs *to, ulong first, global const real *previous) {
+    const int sample = min(item * LANES, samples - LANES);
+    if (item * LANES >= samples) return;
     const Profiles profiles = profiles_from(frame, sample);
     ints nearest = -1;
 #ifdef SELECT_NEAREST
@@ -264,11 +265,10 @@ static inline void read_frame(const Profiles *frame, int samples, constant LineT
 #elif !defined(ALONG_ROWS)
 // A strip of columns, in parts of at most MAX_STRIP columns. Memory is read nearly in sequence, while the sums of a
 // group of columns stay in registers.
-static inline void read_frame(const Profiles *frame, int samples, constant LineTable *table, const Outputs *to,
-                              ulong first, global const real *previous) {
-    const int strips = get_global_size(0);
-    const int strip = ((samples + strips - 1) / strips + WIDE - 1) / WIDE * WIDE;
-    const int begin = (int)get_global_id(0) * strip, end = min(begin + strip, samples);
+static inline void read_frame(const Profiles *frame, int item, int items, int samples, constant LineTable *table,
+                              const Outputs *to, ulong first, global const real *previous) {
+    const int strip = ((samples + items - 1) / items + WIDE - 1) / WIDE * WIDE;
+    const int begin = item * strip, end = min(begin + strip, samples);
     for (int part = begin; part < end; part += MAX_STRIP) {
         read_strip(frame, part, min(part + MAX_STRIP, end), table, to, first);
     }
@@ -276,9 +276,9 @@ static inline void read_frame(const Profiles *frame, int samples, constant LineT
 
 #else
 // 16 rows; the last work-item moves back to end with the last row.
-static inline void read_frame(const Profiles *frame, int samples, constant LineTable *table, const Outputs *to,
-                              ulong first, global const real *previous) {
-    const int sample = min((int)get_global_id(0) * LANES, samples - LANES);
+static inline void read_frame(const Profiles *frame, int item, int items, int samples, constant LineTable *table,
+                              const Outputs *to, ulong first, global const real *previous) {
+    const int sample = min(item * LANES, samples - LANES);
     const Profiles profiles = profiles_from(frame, sample);
     read_rows(&profiles, table, to, first + sample, sample);
 }
@@ -294,7 +294,7 @@ kernel void line_readout(global const CODE *restrict frames,
                          global real *restrict sigma_h, global real *restrict systematic_g,
                          global real *restrict systematic_h, const int rows, const int columns, const CODE threshold,
                          const CODE saturation, const CODE minimum, const int radius, constant LineTable *table,
-                         constant SheetTable *sheet, global const real *restrict correction) {
+                         constant SheetTable *sheet, global const real *restrict correction TEAM_ARGUMENTS) {
 #ifndef SELECT_NEAREST
     global const real *previous = 0;
 #endif
@@ -303,16 +303,20 @@ kernel void line_readout(global const CODE *restrict frames,
 #else
     const int samples = columns, length = rows, stride = columns, lane_stride = 1;
 #endif
-    const ulong number = get_global_id(1);
-    const Profiles frame = {frames + number * rows * columns, stride,  lane_stride, length, threshold,
-                            saturation,                       minimum, radius};
-    const Outputs to = {position, peak,    width,   total,        status,       g,     h,
-                        sigma,    sigma_g, sigma_h, systematic_g, systematic_h, sheet, table,
-                        correction, samples};
 #ifdef TOGETHER
     local Shared shared;
-    read_group(&frame, samples, table, &to, number * samples, &shared);
-#else
-    read_frame(&frame, samples, table, &to, number * samples, previous);
 #endif
+    FOR_EACH_ITEM(item) {
+        const ulong number = item.y, first = number * samples;
+        const Profiles frame = {frames + number * rows * columns, stride,  lane_stride, length, threshold,
+                                saturation,                       minimum, radius};
+        const Outputs to = {position, peak,    width,   total,        status,       g,     h,
+                            sigma,    sigma_g, sigma_h, systematic_g, systematic_h, sheet, table,
+                            correction, samples};
+#ifdef TOGETHER
+        read_group(&frame, samples, table, &to, first, &shared);
+#else
+        read_frame(&frame, item.x, ITEM_COLUMNS, samples, table, &to, first, previous);
+#endif
+    }
 }

@@ -23,6 +23,7 @@
 #include "common/load.h"
 #include "common/sheet.h"
 #include "common/status.h"
+#include "common/team.h"
 
 // Parameters in units of the input if no other unit is given, in the order of PsdTable in gpuvision/ranging/psd.py.
 typedef struct {
@@ -296,14 +297,16 @@ kernel void psd_readout(global const INPUT *currents, global real *position, glo
                         global real *sigma, global real *g, global real *h, global real *sigma_g,
                         global real *sigma_h, global real *systematic_g, global real *systematic_h,
                         constant PsdTable *table, int samples, int each, global const real *linearity, int strips,
-                        int knots, constant SheetTable *sheet) {
+                        int knots, constant SheetTable *sheet TEAM_ARGUMENTS) {
     const Readout io = {currents, position,     total,        status, sigma,   g,      h,     sigma_g,   sigma_h,
                         systematic_g, systematic_h, table,  samples, strips, knots, linearity, sheet};
 #ifdef VECTOR_VARIANT
     // The last work-item also processes the remainder, and its last vector overlaps the previous vector: every sample
     // is covered, and no other work-item writes there.
-    const int begin = get_global_id(0) * each;
-    read_range(begin, get_global_id(0) + 1 == get_global_size(0) ? samples : begin + each, &io);
+    FOR_EACH_ITEM(item) {
+        const int begin = item.x * each;
+        read_range(begin, item.x + 1 == ITEM_COLUMNS ? samples : begin + each, &io);
+    }
 #else
     Verdict unused = clean_verdict();
     real4 left, right;

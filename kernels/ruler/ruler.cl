@@ -7,6 +7,7 @@
 // Variants: vector: a work-item processes `each` rulers, with vectors of 16 samples; work-item: a group of RULER_GROUP
 //           items takes RULERS_PER_GROUP rulers: samples, gradients and the search for edges over all items, then an
 //           item per ruler, or per edge with CHOOSE_ALL, for the sub-pixel edge (ruler_group.h).
+#include "common/team.h"
 #include "ruler/ruler.h"
 
 // Store lane `lane` of an edge as result i.
@@ -49,17 +50,19 @@ kernel void ruler_edges(global const CODE *restrict image, global const real *re
                         global real *restrict position, global real *restrict amplitude, global real *restrict width,
                         global real *restrict sigma, global real *restrict spacing, global uchar *restrict status,
                         constant real *table, constant real *model, const int rows, const int columns,
-                        const uint count, const uint each) {
+                        const uint count, const uint each TEAM_ARGUMENTS) {
 #ifdef VECTOR_VARIANT
     ruler_edge edges[MAX_EDGES];
-    const uint first = get_global_id(0) * each, end = min(first + each, count);
-    for (uint ruler = first; ruler < end; ruler += LANES) {
-        ruler_measure(image, rows, columns, rulers + RULER_INPUTS * (ulong)ruler, RULER_INPUTS, count - ruler, table,
-                      model, edges);
-        for (int k = 0; k < MAX_EDGES; k++)
-            for (uint lane = 0; lane < LANES && ruler + lane < count; lane++)
-                store_edge(edges + k, lane, ((ulong)ruler + lane) * MAX_EDGES + k, position, amplitude, width, sigma,
-                           spacing, status);
+    FOR_EACH_ITEM(item) {
+        const uint first = item.x * each, end = min(first + each, count);
+        for (uint ruler = first; ruler < end; ruler += LANES) {
+            ruler_measure(image, rows, columns, rulers + RULER_INPUTS * (ulong)ruler, RULER_INPUTS, count - ruler, table,
+                          model, edges);
+            for (int k = 0; k < MAX_EDGES; k++)
+                for (uint lane = 0; lane < LANES && ruler + lane < count; lane++)
+                    store_edge(edges + k, lane, ((ulong)ruler + lane) * MAX_EDGES + k, position, amplitude, width, sigma,
+                               spacing, status);
+        }
     }
 #else
     local ruler_memory shared;

@@ -14,6 +14,7 @@
 #include "common/item_samples.h"
 #include "common/load.h"
 #include "common/sheet.h"
+#include "common/team.h"
 
 typedef struct {
     global const INPUT *u, *v;
@@ -100,11 +101,13 @@ static inline void triangulate_range(ulong begin, ulong end, const Points *io) {
 kernel void triangulate(global const INPUT *restrict u, global const INPUT *restrict v, global real *restrict g,
                         global real *restrict h, global uchar *restrict status, global real *restrict sigma_g,
                         global real *restrict sigma_h, const ulong points, const ulong each, constant SheetTable *sheet,
-                        const real sigma_u, const real sigma_v) {
+                        const real sigma_u, const real sigma_v TEAM_ARGUMENTS) {
     const Points io = {u, v, g, h, status, sigma_g, sigma_h, points, sheet, sigma_u, sigma_v};
 #ifdef VECTOR_VARIANT
-    const ulong first = get_global_id(0) * each;
-    triangulate_range(first, min(first + each, points), &io);
+    FOR_EACH_ITEM(item) {
+        const ulong first = item.x * each;
+        triangulate_range(first, min(first + each, points), &io);
+    }
 #else
     real4 position = load_item_samples(u, points), sample = load_item_samples(v, points);
     // Each step moves the next point to the first lane: an index that changes would put the lanes into memory.

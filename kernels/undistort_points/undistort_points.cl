@@ -14,6 +14,7 @@
 #include "common/load.h"
 #include "common/plane.h"
 #include "common/status.h"
+#include "common/team.h"
 
 #ifdef VECTOR_VARIANT
 // Load LANES points from point i on, and separate x and y.
@@ -83,16 +84,18 @@ static inline __attribute__((always_inline)) void move_points(ulong i, reals x, 
 // than the registers, and PoCL's compiler spills them to a stack that is not aligned to vectors, so that each use crosses a
 // cache line. Numbers that the instructions of each vector read from the table take 25 % less time.
 kernel void undistort_points(global const INPUT *points, global real *moved_points, global uchar *status,
-                             constant real *model, const ulong count, const ulong each) {
+                             constant real *model, const ulong count, const ulong each TEAM_ARGUMENTS) {
 #ifdef VECTOR_VARIANT
     // The last vector moves back to end with the last point, and computes some points twice. This is cheaper than a test
     // for the end in every vector.
-    const ulong first = get_global_id(0) * each, end = min(first + each, count);
-    for (ulong next = first; next < end; next += LANES) {
-        const ulong i = min(next, count - LANES);
-        reals x, y;
-        load_points(points, i, &x, &y);
-        move_points(i, x, y, moved_points, status, model);
+    FOR_EACH_ITEM(item) {
+        const ulong first = item.x * each, end = min(first + each, count);
+        for (ulong next = first; next < end; next += LANES) {
+            const ulong i = min(next, count - LANES);
+            reals x, y;
+            load_points(points, i, &x, &y);
+            move_points(i, x, y, moved_points, status, model);
+        }
     }
 #else
     real4 x, y;

@@ -290,6 +290,7 @@ class FindBlobs(VisionOperation[Blobs]):
                 np.int32(self.passes),
             ],
             passes_once=work.vectors and self.count <= _INLINE,
+            by_team=True,
         )
 
     def _table(self, edges: Launch) -> npt.NDArray[Any]:

@@ -393,6 +393,7 @@ class RulerEdges(VisionOperation[Edges]):
                 np.uint32(each),
             ],
             passes_once=work.vectors and self.count <= _INLINE,
+            by_team=True,
         )
 
     def _defines(self, dtype: np.dtype[Any]) -> dict[str, Define]:

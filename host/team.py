@@ -1,0 +1,183 @@
+"""Teams: the calling thread and waiting worker threads of a CPU share the work-items of a launch.
+
+Waking a worker thread takes 5 to 25 us, as long as a short launch. Runtimes for parallel loops, such as OpenMP,
+therefore let their threads wait in a loop for some time after each use. A `Team` does so for a kernel that is launched
+again and again: workers wait in the kernel for the next launch, see ``kernels/common/team.h``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import math
+import os
+import platform
+import time
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from gpuvision.host.arrays import DeviceArray, HostArray, host_view
+
+# Places of the counters, in the order of Team in kernels/common/team.h.
+_ITEMS, _COLUMNS, _CORE, _MEMBERS, _TAKEN, _ENDED, _DISMISSED, _BEGUN = 0, 1, 2, 3, 16, 48, 49, 50
+_SIZE = 64
+_NO_CORE = 0xFFFFFFFF
+# Time for which workers wait for the next launch. Chosen: some times the time that waking a thread takes.
+_PATIENCE_NS = 150_000
+# Workers begin to wait after two launches with a shorter pause between them: they would wait in vain otherwise.
+PAUSE_NS = 75_000
+# The same for launches that the caller does not wait for: in a longer pause he does other work, beside which the workers
+# of the device should run. Chosen: the time that waking them takes.
+BRIEF_PAUSE_NS = 20_000
+# The time of a look at the counters is measured in a trial of at least this duration: a launch takes 1 to 5 us.
+_TRIAL_NS, _MOST_LOOKS = 40_000, 1 << 22
+
+
+def new_counters(device: Any, size: tuple[int, ...]) -> DeviceArray:
+    """Return the counters of a team for a launch of a global size in one or two dimensions."""
+    counters: DeviceArray = device.empty((_SIZE,), np.uint32)
+    values = host_view(counters)
+    values[:] = 0
+    values[_ITEMS] = values[_TAKEN] = math.prod(size)
+    values[_COLUMNS] = size[0]
+    return counters
+
+
+@functools.cache
+def core_query() -> Callable[[], int] | None:
+    """Return the function of the C library for the core of the calling thread, where kernels know theirs too."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        return None
+    try:
+        query: Callable[[], int] = ctypes.CDLL(None).sched_getcpu
+    except (AttributeError, OSError, TypeError):  # no such function, or no C library of that kind
+        return None
+    return query
+
+
+@dataclass(slots=True)
+class Shift:
+    """The team of a device whose workers wait, or begin to wait if its launch comes again soon.
+
+    A device has one, because waiting workers do nothing else: a launch of another kind dismisses them.
+    """
+
+    team: weakref.ref[Team] | None = None
+
+    def end(self) -> None:
+        """Dismiss the waiting workers, so that they run other launches."""
+        team = None if self.team is None else self.team()
+        self.team = None
+        if team is not None:
+            team.dismiss()
+
+
+class Team:
+    """Calling thread and waiting workers of one bound launch.
+
+    Parameters
+    ----------
+    shift : Shift
+        Of the device.
+    counters : pyopencl.array.Array
+        As `new_counters` makes them.
+    leader, member : tuple
+        Arguments of `pyopencl.enqueue_nd_range_kernel` in the calling thread, and for the workers. The last argument of
+        the kernels is the patience.
+    patience : int
+        Index of this argument.
+    core : callable, optional
+        Function that returns the core of the calling thread, where the workers stay on their cores: the worker on the
+        core of the caller ends at once. ``None``: the operating system finds free cores for all workers.
+    """
+
+    def __init__(
+        self,
+        shift: Shift,
+        counters: DeviceArray,
+        leader: tuple[Any, ...],
+        member: tuple[Any, ...],
+        patience: int,
+        core: Callable[[], int] | None,
+    ) -> None:
+        self._shift, self._leader, self._member, self._core = shift, leader, member, core
+        self._counters = host_view(counters)
+        self._reference = weakref.ref(self)
+        self._is_started = False
+        self._idle_since = 0
+        self._events: list[Any] = []
+        self._given: tuple[Any, ...] | None = None
+        self._size = self._counters[_MEMBERS] = member[2][0]
+        self._counters[_CORE] = _NO_CORE
+        member[1].set_arg(patience, np.uint32(self._looks(patience)))
+        leader[1].set_arg(patience, np.uint32(0))
+        weakref.finalize(self, _dismiss, counters, self._events, os.getpid())
+
+    def _looks(self, patience: int) -> int:
+        """Return the looks at the counters that take `_PATIENCE_NS`, from trials in the calling thread."""
+        looks, taken, is_first = 1, 0, True
+        while is_first or (taken < _TRIAL_NS and looks < _MOST_LOOKS):
+            is_first = looks == 1  # a first launch takes longer
+            looks *= 4
+            self._leader[1].set_arg(patience, np.uint32(looks))
+            start = time.perf_counter_ns()
+            cl.enqueue_nd_range_kernel(*self._leader).wait()
+            taken = time.perf_counter_ns() - start
+        return looks * _PATIENCE_NS // taken
+
+    @property
+    def _waits(self) -> bool:
+        """Whether workers wait for the next launch, or will soon."""
+        return self._is_started and bool(self._counters[_ENDED] < self._size)
+
+    def has(self, given: tuple[Any, ...]) -> bool:
+        """Return whether workers wait for a launch with these arrays."""
+        return given is self._given and self._waits
+
+    def lead(self) -> Any:
+        """Launch, together with the waiting workers; return the event of the launch, which is complete."""
+        event = cl.enqueue_nd_range_kernel(*self._leader)
+        self._idle_since = time.perf_counter_ns()
+        return event
+
+    def gains(self, pause: int) -> bool:
+        """Return whether the last launch of the device was of this team, and ended less than `pause` ago [ns]."""
+        return self._shift.team is self._reference and time.perf_counter_ns() - self._idle_since < pause
+
+    def rest(self) -> None:
+        """Note that a launch without the workers has ended."""
+        self._shift.team = self._reference
+        self._idle_since = time.perf_counter_ns()
+
+    def start(self, given: tuple[Any, ...]) -> None:
+        """Let workers wait for the next launch with the arrays that the kernels were given.
+
+        Does nothing while workers that were dismissed have not ended yet.
+        """
+        if self._waits:
+            return
+        self._given, self._shift.team = given, self._reference
+        self._counters[_CORE] = _NO_CORE if self._core is None else self._core()
+        self._counters[_ENDED] = self._counters[_DISMISSED] = self._counters[_BEGUN] = 0
+        self._events[:] = [cl.enqueue_nd_range_kernel(*self._member)]
+        self._member[0].flush()
+        self._is_started = True
+        self._idle_since = time.perf_counter_ns()
+
+    def dismiss(self) -> None:
+        """Make waiting workers end."""
+        self._counters[_DISMISSED] = 1
+
+
+def _dismiss(counters: DeviceArray, events: list[Any], process: int) -> None:
+    """Dismiss the members and wait for their end: they look at the counters, which must stay as long."""
+    if os.getpid() == process:  # a forked process has no workers
+        values: HostArray = host_view(counters)
+        values[_DISMISSED] = 1
+        for event in events:
+            event.wait()

@@ -31,8 +31,8 @@ _NO_CORE = 0xFFFFFFFF
 _PATIENCE_NS = 150_000
 # Workers begin to wait after two launches with a shorter pause between them: they would wait in vain otherwise.
 PAUSE_NS = 75_000
-# The same for launches that the caller does not wait for: in a longer pause he does other work, beside which the workers
-# of the device should run. Chosen: the time that waking them takes.
+# The same for launches that the caller does not wait for. In longer pauses the caller does other work, beside which the
+# workers should run. Chosen: the time that waking them takes.
 BRIEF_PAUSE_NS = 20_000
 # The time of a look at the counters is measured in a trial of at least this duration: a launch takes 1 to 5 us.
 _TRIAL_NS, _MOST_LOOKS = 40_000, 1 << 22

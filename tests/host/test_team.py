@@ -1,0 +1,306 @@
+"""Teams: the calling thread and waiting workers share a launch, and workers stop waiting when they should."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from gpuvision.camera.lens import Lens
+from gpuvision.camera.undistort_points import UndistortPoints
+from gpuvision.host import Device, Launch, Operation, host_view
+from gpuvision.host.bound import Bound
+from gpuvision.host.team import Team
+from gpuvision.host.trace import Trace
+from gpuvision.matching.features.blob import FindBlobs
+from gpuvision.matching.features.ruler import RulerEdges
+from gpuvision.operation import KERNEL_FOLDER
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.psd import PsdReadout
+from gpuvision.ranging.triangulation import Triangulation
+
+READOUT = PsdReadout(strip_length=2.0)
+_TRIES = 2000  # pairs of launches, one after the other: another process may take the core between two of them
+_CANARY = 0xA5
+COMPLETE, COMMAND_QUEUE = cl.command_execution_status.COMPLETE, cl.event_info.COMMAND_QUEUE
+
+
+@pytest.fixture
+def cpu(device: Device) -> Device:
+    """A device with teams, without workers that wait for a launch of another test."""
+    if not device.has_teams:
+        pytest.skip(f"{device.label} has no inline queues, or one core")
+    device.shift.end()
+    return device
+
+
+def team_of(bound: Bound[Any]) -> Team:
+    assert bound._team is not None
+    return bound._team
+
+
+def has_led(bound: Bound[Any]) -> bool:
+    """Launch until a launch was shared with waiting workers; return whether one was."""
+    team = team_of(bound)
+    for _ in range(_TRIES):
+        if team.has(bound._own):
+            bound.run()
+            return True
+        bound.run()
+    return False
+
+
+def until(condition: Any, seconds: float = 10.0) -> bool:
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.001)
+    return bool(condition())
+
+
+class Counts(NamedTuple):
+    count: Any
+    column: Any
+    row: Any
+
+
+@dataclass(frozen=True)
+class CountItems(Operation[Counts]):
+    """Adds 1 to a cell of its input for each work-item, and notes the places of the items."""
+
+    Result: ClassVar[type[Any]] = Counts
+    kernel_folder: ClassVar[Path | None] = None
+    include_folders: ClassVar[tuple[Path, ...]] = (KERNEL_FOLDER,)
+    columns: int = 37
+
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        size = (self.columns, shape[0] // self.columns)
+        word = (shape, np.dtype(np.int32))
+        outputs = {"count": word, "column": word, "row": word}
+        return Launch(
+            "count.cl", "count_items", [(shape, dtype)], outputs, size, (1, 1), passes_once=False, by_team=True
+        )
+
+
+SOURCE = """
+#include "common/team.h"
+kernel void count_items(global int *seen, global int *count, global int *column, global int *row TEAM_ARGUMENTS) {
+    FOR_EACH_ITEM(item) {
+        const uint at = item.y * ITEM_COLUMNS + item.x;
+        count[at] = seen[at] += 1;
+        column[at] = item.x;
+        row[at] = item.y;
+    }
+}
+"""
+
+
+@pytest.fixture
+def counting(tmp_path: Path) -> type[CountItems]:
+    (tmp_path / "count.cl").write_text(SOURCE)
+    return type("CountItemsHere", (CountItems,), {"kernel_folder": tmp_path})
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(37, 1), (2, 1), (37, 11), (1, 5), (300, 7)])
+def test_each_item_runs_once_in_each_launch(cpu: Device, counting: type[CountItems], columns: int, rows: int) -> None:
+    bound = counting(columns=columns).bind(cpu, (columns * rows,), np.int32)
+    at_start = host_view(bound.outputs.count).copy()
+    led = 0
+    for launch in range(1, 2001):
+        led += team_of(bound).has(bound._own)
+        bound.run()
+        assert np.array_equal(host_view(bound.outputs.count), at_start + launch)
+    assert led
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    np.testing.assert_array_equal(host_view(bound.outputs.column), column)
+    np.testing.assert_array_equal(host_view(bound.outputs.row), row)
+
+
+def _psd(rng: np.random.Generator) -> tuple[Any, list[Any]]:
+    return READOUT, [rng.uniform(0.0, 1.0, (100_003, 2)).astype(np.float32)]
+
+
+def _triangulation(rng: np.random.Generator) -> tuple[Any, list[Any]]:
+    matrix = ((1.0, 0.1, 0.2), (0.0, 1.2, 0.1), (0.0, 1e-3, 1.0))
+    operation = Triangulation(homography=matrix, region=((-1.0, 1.0), (-1.0, 1.0)))
+    return operation, [rng.uniform(-1.0, 1.0, 100_003).astype(np.float32) for _ in range(2)]
+
+
+def _points(rng: np.random.Generator) -> tuple[Any, list[Any]]:
+    points = rng.uniform(0.0, 640.0, (20_011, 2)).astype(np.float32)
+    return UndistortPoints(model=Lens(k1=-2e-7, centre=(320.0, 240.0))), [points]
+
+
+def _line(rng: np.random.Generator) -> tuple[Any, list[Any]]:
+    return LineReadout(threshold=200), [rng.integers(0, 255, (5, 97, 641), np.uint8)]
+
+
+def _rulers(rng: np.random.Generator) -> tuple[Any, list[Any]]:
+    image = rng.integers(0, 255, (203, 331), np.uint8)
+    rulers = np.stack([rng.uniform(40.0, 160.0, 61) for _ in range(3)] + [np.zeros(61)], -1).astype(np.float32)
+    return RulerEdges(threshold=20.0, length=31, count=61), [image, rulers]
+
+
+def _blobs(rng: np.random.Generator) -> tuple[Any, list[Any]]:
+    y, x = np.mgrid[:240, :320]
+    places = np.array([(40.0 + 60.0 * k, 50.0 + 60.0 * j, 12.0) for k in range(4) for j in range(3)], np.float32)
+    image = np.full(y.shape, 200.0)
+    for at_x, at_y, size in places + rng.uniform(-1.0, 1.0, places.shape) * (1.0, 1.0, 0.0):
+        image -= 150.0 / (1.0 + np.exp(2.0 * (np.hypot(x - at_x, y - at_y) - size)))
+    return FindBlobs(threshold=20.0, count=len(places)), [image.astype(np.uint8), places]
+
+
+@pytest.mark.vectors
+@pytest.mark.parametrize("make", [_psd, _triangulation, _points, _line, _rulers, _blobs])
+def test_shared_launches_give_the_same_bits(cpu: Device, rng: np.random.Generator, make: Any) -> None:
+    """Compared with launches in the queue. The outputs hold canaries before each launch."""
+    operation, inputs = make(rng)
+    bound = operation.bind(cpu, inputs[0].shape, inputs[0].dtype)
+    for array, values in zip(bound.inputs, inputs, strict=True):
+        array.set(values)
+    computed = {name: host_view(array) for name, array in bound.outputs._asdict().items() if array is not None}
+
+    def launched(launch: Any) -> dict[str, Any]:
+        for values in computed.values():
+            values.view(np.uint8)[...] = _CANARY
+        launch()
+        return {name: values.tobytes() for name, values in computed.items()}
+
+    expected = launched(lambda: bound._enqueue(bound._own).wait())
+    assert has_led(bound)
+    led = 0
+    for _ in range(50):
+        led += team_of(bound).has(bound._own)
+        assert launched(bound.run) == expected
+    assert led
+
+
+def test_new_inputs_are_read_and_results_seen(cpu: Device, rng: np.random.Generator) -> None:
+    bound = READOUT.bind(cpu, (50_000, 2), np.float32)
+    for _ in range(200):
+        left, right = rng.uniform(0.1, 1.0, 2).astype(np.float32)
+        host_view(bound.inputs[0])[...] = left, right
+        position = host_view(bound.run().position)
+        np.testing.assert_allclose(position[[0, 1, 24_999, -1]], (right - left) / (right + left), atol=5e-7)
+
+
+def test_workers_end_when_no_launch_comes(cpu: Device) -> None:
+    bound = READOUT.bind(cpu, (100_000, 2), np.float32)
+    assert has_led(bound)
+    assert until(lambda: not team_of(bound)._waits)
+    before = np.array(host_view(bound.outputs.position))
+    np.testing.assert_array_equal(host_view(bound.run().position), before)
+    assert has_led(bound)  # they begin to wait again
+
+
+def test_workers_do_not_wait_after_single_launches(cpu: Device) -> None:
+    bound = READOUT.bind(cpu, (100_000, 2), np.float32)
+    for _ in range(20):
+        bound.run()
+        time.sleep(0.002)
+    assert not team_of(bound)._is_started
+
+
+def test_another_launch_dismisses_the_workers(cpu: Device, rng: np.random.Generator) -> None:
+    bound, other = (READOUT.bind(cpu, (100_000, 2), np.float32) for _ in range(2))
+    frame = rng.uniform(0.1, 1.0, (100_000, 2)).astype(np.float32)
+    other.inputs[0].set(frame)
+    assert has_led(bound)
+    other._queue_site  # noqa: B018 - the kernel is compiled before the launch is looked at
+    other().wait()
+    assert cpu.shift.team is None
+    assert until(lambda: not team_of(bound)._waits, seconds=1.0)
+    left, right = frame.astype(np.float64).T
+    np.testing.assert_allclose(host_view(other.outputs.position), (right - left) / (right + left), atol=5e-7)
+
+
+def test_arrays_of_the_caller_do_not_meet_workers_that_wait_for_others(cpu: Device, rng: np.random.Generator) -> None:
+    bound = READOUT.bind(cpu, (100_000, 2), np.float32)
+    bound.inputs[0].set(np.ones((100_000, 2), np.float32))
+    assert has_led(bound)
+    out, frame = bound.allocate(), cpu.empty((100_000, 2), np.float32)
+    frame.set(np.full((100_000, 2), [1.0, 3.0], np.float32))
+    for _ in range(20):
+        host_view(out.position).fill(np.nan)
+        bound.run(frame, out=out)
+        assert np.all(host_view(out.position) == 0.5)
+        assert np.all(host_view(bound.outputs.position) == 0.0)
+
+
+def test_calls_that_follow_at_once_are_shared_on_pocl(cpu: Device) -> None:
+    """A call that does not wait runs in the queue after a pause, in which the caller does other work."""
+    if not cpu.call_gains_by_team:
+        pytest.skip("only workers of PoCL wake slowly")
+    bound = READOUT.bind(cpu, (400_000, 2), np.float32)
+    shared = []
+    for _ in range(_TRIES):
+        for _ in range(4):
+            event = bound()
+            shared.append(event.get_info(COMMAND_QUEUE) != cpu.queue)
+            assert not shared[-1] or event.command_execution_status == COMPLETE
+        bound.run()
+    assert any(shared)
+    time.sleep(0.001)
+    assert bound().get_info(COMMAND_QUEUE) == cpu.queue
+
+
+def test_launches_come_after_earlier_work_of_the_queue(cpu: Device) -> None:
+    first, bound = READOUT.bind(cpu, (1_000_000, 2), np.float32), READOUT.bind(cpu, (100_000, 2), np.float32)
+    host_view(first.inputs[0])[...] = 1.0, 3.0
+    copied = first.outputs.position[: 2 * 100_000].reshape(100_000, 2)
+    for _ in range(50):
+        assert has_led(bound)
+        host_view(first.outputs.position).fill(0.0)
+        first()
+        host_view(bound.run(copied).position)
+        assert np.all(host_view(bound.outputs.position) == 0.0)
+
+
+def test_a_dropped_instance_leaves_no_waiting_worker(cpu: Device) -> None:
+    for _ in range(20):
+        bound = READOUT.bind(cpu, (100_000, 2), np.float32)
+        has_led(bound)
+        events = team_of(bound)._events
+        del bound
+        gc.collect()
+        assert all(event.command_execution_status == COMPLETE for event in events)
+
+
+def test_no_team_for_traces_streams_of_a_few_bytes_and_queues_of_the_caller(cpu: Device, tmp_path: Path) -> None:
+    with Trace(tmp_path / "trace.json"):
+        assert READOUT.bind(cpu, (100_000, 2), np.float32)._team is None
+    assert READOUT.bind(cpu, (1000, 2), np.float32)._team is None
+    assert READOUT.bind(cpu, (100_000, 2), np.float32, queue=cpu.new_queue())._team is None
+    assert READOUT._bind(cpu, (100_000, 2), np.float32, None)._team is None  # of a single call
+
+
+_AT_EXIT = """
+import os, sys
+import numpy as np
+from gpuvision.host import Device
+from gpuvision.ranging.psd import PsdReadout
+bound = PsdReadout(strip_length=2.0).bind(Device.named(sys.argv[1]), (100_000, 2), np.float32)
+waits = 0
+while not waits:
+    bound.run()
+    waits = bound._team._waits
+if sys.argv[2] == "fork":
+    child = os.fork()
+    if child:
+        sys.exit(os.waitpid(child, 0)[1])
+"""
+
+
+@pytest.mark.parametrize("how", ["exit", "fork"])
+def test_a_process_ends_while_workers_wait(cpu: Device, how: str) -> None:
+    ran = subprocess.run(
+        [sys.executable, "-c", _AT_EXIT, cpu.label, how], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (ran.returncode, ran.stderr) == (0, "")

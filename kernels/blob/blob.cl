@@ -64,10 +64,11 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
     GROUP_SPACE blob_hidden hidden;
     GROUP_SPACE blob_match match;
 #endif
-    FOR_EACH_ITEM(item) {
 #ifdef VECTOR_VARIANT
+    FOR_EACH_ITEM(item) {
         const uint first = item.x * each, end = min(first + each, count);
 #else
+    {
         const uint first = get_group_id(0), end = first + 1;
 #endif
         uint n = first;

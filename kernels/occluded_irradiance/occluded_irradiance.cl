@@ -17,6 +17,7 @@
 
 // Number of receivers that share a list of picked segments.
 #define SELECTION_BLOCK 16
+#include "common/team.h"
 #ifdef VECTOR_VARIANT
 #include "occluded_irradiance/receiver_blocks.h"
 #else
@@ -40,57 +41,59 @@ AS_IT_IS kernel void occluded_irradiance(
     SEGMENT_LISTS global real *restrict irradiance, global real *restrict left, global real *restrict right,
     global uchar *restrict status, global const real *nodes, global const int *children, global const int *axes,
     global const real *leaves, global const int *triangles, PARTS constant place *middle, const real clearance,
-    const uint samples, const uint each, const uint segment_count, const uint pick_count, const uint strips
+    const uint samples, const uint each, const uint segment_count, const uint pick_count, const uint strips TEAM_ARGUMENTS
 ) {
     bvh_tree tree = {nodes, children, axes, leaves, triangles};
 #ifdef CONVEX_PARTS
     tree.parts = parts;
 #endif
-    const ulong group = get_group_id(0), groups = get_num_groups(0);
+    const ulong groups = ITEM_COLUMNS;
     const uint of_strip = (each + LANES - 1) / LANES; // blocks of a strip
-    // Strips group, group + groups, ...: neighbouring strips need about the same time, so all groups do. (PoCL gives half of
-    // the groups to the first of two workers at once: with contiguous strips, a scene with parts on one side took 1.65
-    // times as long.)
-    const ulong end_block = (strips - group + groups - 1) / groups * of_strip;
-    chunk lit;
-    block blocks[BATCH];
-    packet packed;
-    packed.count = 0;
-    pieces waiting;
-    waiting.count = 0;
-    place to_left = 0, to_right = 0;
-    int loaded = -1; // first segment of the chunk that is loaded
-    for (ulong begin = 0; begin < end_block; begin += BATCH) {
-        const uint count = (uint)min((ulong)BATCH, end_block - begin);
-        uchar flag = STATUS_OK;
-        for (uint n = 0; n < count; n++) {
-            const uint first = (begin + n) % of_strip * LANES;
-            const ulong row = ((begin + n) / of_strip * groups + group) * each + first;
-            const ulong present = (ulong)strips * each - row;
-            load_block(receivers + 6 * row, middle, min((uint)LANES, each - first), present, blocks + n);
-        }
+    FOR_EACH_ITEM(item) {
+        // Strips group, group + groups, ...: neighbouring strips need about the same time, so all groups do. (PoCL gives
+        // half of the groups to the first of two workers at once: with contiguous strips, a scene with parts on one side
+        // took 1.65 times as long.)
+        const ulong group = item.x, end_block = (strips - group + groups - 1) / groups * of_strip;
+        chunk lit;
+        block blocks[BATCH];
+        packet packed;
+        packed.count = 0;
+        pieces waiting;
+        waiting.count = 0;
+        place to_left = 0, to_right = 0;
+        int loaded = -1; // first segment of the chunk that is loaded
+        for (ulong begin = 0; begin < end_block; begin += BATCH) {
+            const uint count = (uint)min((ulong)BATCH, end_block - begin);
+            uchar flag = STATUS_OK;
+            for (uint n = 0; n < count; n++) {
+                const uint first = (begin + n) % of_strip * LANES;
+                const ulong row = ((begin + n) / of_strip * groups + group) * each + first;
+                const ulong present = (ulong)strips * each - row;
+                load_block(receivers + 6 * row, middle, min((uint)LANES, each - first), present, blocks + n);
+            }
 #ifdef SELECTED
-        const ulong list = (begin / of_strip * groups + group) * of_strip + begin % of_strip;
-        if (starts[list] < 0 || starts[list + 1] > (int)pick_count) flag |= STATUS_OUT_OF_RANGE;
-        const int end = min(starts[list + 1], (int)pick_count);
-        for (int next = max(starts[list], 0); next < end;) {
-            next = load_selected(segments, selected, next, end, segment_count, middle, &lit, &flag);
-            light_chunk(&tree, &lit, clearance, samples, blocks, count, &packed, &waiting, &flag);
-        }
+            const ulong list = (begin / of_strip * groups + group) * of_strip + begin % of_strip;
+            if (starts[list] < 0 || starts[list + 1] > (int)pick_count) flag |= STATUS_OUT_OF_RANGE;
+            const int end = min(starts[list + 1], (int)pick_count);
+            for (int next = max(starts[list], 0); next < end;) {
+                next = load_selected(segments, selected, next, end, segment_count, middle, &lit, &flag);
+                light_chunk(&tree, &lit, clearance, samples, blocks, count, &packed, &waiting, &flag);
+            }
 #else
-        for (int next = 0; next < (int)segment_count; next += SEGMENTS) {
-            if (loaded != next) load_from(segments, next, (int)segment_count, middle, &lit);
-            loaded = next;
-            light_chunk(&tree, &lit, clearance, samples, blocks, count, &packed, &waiting, &flag);
-        }
+            for (int next = 0; next < (int)segment_count; next += SEGMENTS) {
+                if (loaded != next) load_from(segments, next, (int)segment_count, middle, &lit);
+                loaded = next;
+                light_chunk(&tree, &lit, clearance, samples, blocks, count, &packed, &waiting, &flag);
+            }
 #endif
-        finish(&waiting);
-        for (uint n = 0; n < count; n++) {
-            const uint first = (begin + n) % of_strip * LANES;
-            const ulong strip = (begin + n) / of_strip * groups + group, row = strip * each + first;
-            if (first == 0) to_left = 0, to_right = 0;
-            store_block(blocks + n, flag, irradiance + row, status + row, weights + 2 * row, &to_left, &to_right);
-            if (first + LANES >= each) left[strip] = (real)to_left, right[strip] = (real)to_right;
+            finish(&waiting);
+            for (uint n = 0; n < count; n++) {
+                const uint first = (begin + n) % of_strip * LANES;
+                const ulong strip = (begin + n) / of_strip * groups + group, row = strip * each + first;
+                if (first == 0) to_left = 0, to_right = 0;
+                store_block(blocks + n, flag, irradiance + row, status + row, weights + 2 * row, &to_left, &to_right);
+                if (first + LANES >= each) left[strip] = (real)to_left, right[strip] = (real)to_right;
+            }
         }
     }
 }

@@ -206,6 +206,7 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
                 np.uint32(self.selected or 0),
                 np.uint32(strips),
             ],
+            by_team=True,
         )
 
 

@@ -15,7 +15,6 @@ import platform
 import time
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ import pyopencl as cl
 
 from gpuvision.host.arrays import DeviceArray, HostArray, host_view
 
+VARIABLE = "GPUVISION_TEAMS"
 # Places of the counters, in the order of Team in kernels/common/team.h.
 _ITEMS, _COLUMNS, _CORE, _MEMBERS, _TAKEN, _ENDED, _DISMISSED, _BEGUN = 0, 1, 2, 3, 16, 48, 49, 50
 _SIZE = 64
@@ -36,6 +36,11 @@ PAUSE_NS = 75_000
 BRIEF_PAUSE_NS = 20_000
 # The time of a look at the counters is measured in a trial of at least this duration: a launch takes 1 to 5 us.
 _TRIAL_NS, _MOST_LOOKS = 40_000, 1 << 22
+
+
+def allows_teams() -> bool:
+    """Return whether workers may wait for launches: not where the environment says ``GPUVISION_TEAMS=off``."""
+    return os.environ.get(VARIABLE) != "off"
 
 
 def new_counters(device: Any, size: tuple[int, ...]) -> DeviceArray:
@@ -60,14 +65,18 @@ def core_query() -> Callable[[], int] | None:
     return query
 
 
-@dataclass(slots=True)
 class Shift:
     """The team of a device whose workers wait, or begin to wait if its launch comes again soon.
 
     A device has one, because waiting workers do nothing else: a launch of another kind dismisses them.
+
+    Attributes
+    ----------
+    team : weakref.ref of Team, or None
     """
 
-    team: weakref.ref[Team] | None = None
+    def __init__(self) -> None:
+        self.team: weakref.ref[Team] | None = None
 
     def end(self) -> None:
         """Dismiss the waiting workers, so that they run other launches."""

@@ -14,7 +14,7 @@ from gpuvision.matching.features.line_fit import FitLines
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.field.distance_map import DistanceMap, DistanceMapBuilder
 from gpuvision.matching.field.field_pose import FieldPoseRefinement, FieldPoseSearch
-from gpuvision.matching.pose.board_pose import FitBoardLines, MeasureBoardEdges
+from gpuvision.matching.pose.board_pose import FitBoardLines, MeasureBoardEdges, SolveBoardLines
 from gpuvision.matching.pose.edge_search import CellMeans, EdgeCostMap, EdgeSearch
 from gpuvision.matching.pose.feature_pose import CameraFeatures, PlaceFeatures, SolveFeatures
 from gpuvision.matching.pose.pose import SolvePose
@@ -105,6 +105,7 @@ def _board_poses() -> Iterator[Example]:
     yield Example("fits", FitBoardLines(solver=SolvePose()), (12, 6, 2))
     biased = FitBoardLines(solver=SolvePose(loss="huber", etch_bias_sigma=1e-5, scale=None))
     yield Example("fits, etch bias, free scale", biased, (12, 6, 2))
+    yield Example("pose, two rows of a line", SolveBoardLines(solver=SolvePose(), lines=12), (24, 7))
 
 
 def _feature_poses() -> Iterator[Example]:

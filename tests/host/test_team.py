@@ -281,6 +281,14 @@ def test_no_team_for_traces_streams_of_a_few_bytes_and_queues_of_the_caller(cpu:
     assert READOUT._bind(cpu, (100_000, 2), np.float32, None)._team is None  # of a single call
 
 
+def test_the_environment_prevents_teams(cpu: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GPUVISION_TEAMS", "off")
+    bound = READOUT.bind(cpu, (100_000, 2), np.float32)
+    assert bound._team is None
+    for _ in range(5):
+        bound.run()
+
+
 _AT_EXIT = """
 import os, sys
 import numpy as np

@@ -24,6 +24,7 @@ from gpuvision.host.failure import launch_failure
 from gpuvision.host.huge_pages import advise_huge_pages
 from gpuvision.host.kept import clear_with
 from gpuvision.host.process import check_process
+from gpuvision.host.runtime import usable_cores
 from gpuvision.host.team import Shift, allows_teams
 from gpuvision.host.text import printable, size_in_words
 from gpuvision.host.trace import active_trace
@@ -292,8 +293,9 @@ class Device:
 
     @property
     def has_teams(self) -> bool:
-        """Whether the calling thread and waiting workers can share a launch: cores, shared memory, an inline queue."""
-        return self.compute_units > 1 and self.shares_memory and self.has_inline_queues and allows_teams()
+        """Whether the calling thread and waiting workers can share a launch, and each of them has a core."""
+        has_cores = 1 < self.compute_units <= usable_cores()
+        return has_cores and self.shares_memory and self.has_inline_queues and allows_teams()
 
     @property
     def call_gains_by_team(self) -> bool:

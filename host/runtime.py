@@ -30,6 +30,11 @@ _POCL_3 = re.compile(r"libpocl\.so\.2\.(9|10)\.")  # 3.0 and 3.1
 _SIBLINGS = ("libintlc.so.5", "libirng.so", "libimf.so", "libsvml.so")
 
 
+def usable_cores() -> int:
+    """Return the number of cores that the process may use; 0 where the system does not tell."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
+
+
 def pin_workers() -> None:
     """Make PoCL pin each worker thread to a core, where it has one worker for each core of the machine.
 
@@ -39,8 +44,7 @@ def pin_workers() -> None:
     have workers on other cores: the function does nothing there, and nothing where the user has set
     ``POCL_AFFINITY``. Must run before the first platform query.
     """
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
-    if usable == os.cpu_count() and set(_WORKER_COUNTS).isdisjoint(os.environ):
+    if usable_cores() == os.cpu_count() and set(_WORKER_COUNTS).isdisjoint(os.environ):
         os.environ.setdefault("POCL_AFFINITY", "1")
 
 

@@ -166,9 +166,10 @@ class Team:
     def start(self, given: tuple[Any, ...]) -> None:
         """Let workers wait for the next launch with the arrays that the kernels were given.
 
-        Does nothing while workers that were dismissed have not ended yet.
+        Does nothing while workers that were dismissed have not ended yet, nor for a real-time thread: if it came to the
+        core of a worker with a begun work-item, both would wait for each other.
         """
-        if self._waits:
+        if self._waits or _is_real_time():
             return
         self._given, self._shift.team = given, self._reference
         self._counters[_CORE] = _NO_CORE if self._core is None else self._core()
@@ -181,6 +182,11 @@ class Team:
     def dismiss(self) -> None:
         """Make waiting workers end."""
         self._counters[_DISMISSED] = 1
+
+
+def _is_real_time() -> bool:
+    """Return whether ordinary threads do not get the core of the calling thread while it runs."""
+    return hasattr(os, "sched_getscheduler") and os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR)
 
 
 def _dismiss(counters: DeviceArray, events: list[Any], process: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import subprocess
 import sys
 import time
@@ -287,6 +288,24 @@ def test_the_environment_prevents_teams(cpu: Device, monkeypatch: pytest.MonkeyP
     assert bound._team is None
     for _ in range(5):
         bound.run()
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="the system has no such policies")
+@pytest.mark.parametrize("policy", ["SCHED_FIFO", "SCHED_RR"])
+def test_workers_do_not_wait_for_a_real_time_thread(cpu: Device, monkeypatch: pytest.MonkeyPatch, policy: str) -> None:
+    bound = READOUT.bind(cpu, (100_000, 2), np.float32)
+    monkeypatch.setattr(os, "sched_getscheduler", lambda _: getattr(os, policy))
+    for _ in range(50):
+        bound.run()
+    assert not team_of(bound)._is_started
+    monkeypatch.undo()
+    assert has_led(bound)
+
+
+def test_no_team_where_a_worker_has_no_core(cpu: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With more workers than cores, waiting workers would take the cores of the others."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
+    assert READOUT.bind(cpu, (100_000, 2), np.float32)._team is None
 
 
 _AT_EXIT = """

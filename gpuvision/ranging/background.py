@@ -36,6 +36,8 @@ _STILL_LINE_REACH = 1 / 8
 # more than its width keeps all of it.
 _STILL_SHARE = 0.5
 _LARGEST_SAMPLE_BYTES = 1 << 28
+# Frames of which `FramesCopied` keeps copies, at most. Chosen: enough for the median of each pixel.
+_COPIED_FRAMES = 16
 _LARGEST_SAMPLE_VALUES = 1 << 22
 
 
@@ -265,6 +267,34 @@ def _groups(source: Source, group: int) -> Iterator[HostArray]:
         if held == group:
             yield frames
             held = 0
+
+
+class FramesCopied(_Subtracted):
+    """Frames of a source, unchanged; copies of 8 to 16 of them, spread over all frames read so far, are kept.
+
+    Attributes
+    ----------
+    copies : list of numpy.ndarray
+        The copies: fewer than 8 only of a shorter source.
+    """
+
+    def __init__(self, source: Source) -> None:
+        super().__init__(source)
+        self.copies: list[HostArray] = []
+        self._step = 1
+        self._read = 0
+
+    def read_into(self, out: HostArray, arrived: Arrivals) -> int:
+        """Read frames, and copy every n-th one; n doubles whenever there are more than 16 copies."""
+        count = self._source.read_into(out, arrived)
+        for k in range(-self._read % self._step, count, self._step):
+            # The step may have doubled within the batch.
+            if (self._read + k) % self._step == 0:
+                self.copies.append(out[k].copy())
+            if len(self.copies) > _COPIED_FRAMES:
+                self.copies, self._step = self.copies[::2], 2 * self._step
+        self._read += count
+        return count
 
 
 def median_background(frames: HostArray) -> HostArray:

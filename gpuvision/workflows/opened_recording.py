@@ -162,6 +162,21 @@ def sensor_with_threshold(sensor: Sensor, frames: Array, image: Array | None = N
     return dataclasses.replace(sensor, readout=dataclasses.replace(readout, threshold=level, minimum_peak=minimum_peak))
 
 
+def ambient_level(frames: Array, sensor: Sensor) -> float:
+    """Return the level [grey levels] that at most 3 % of the pixels beside the line exceed without the laser's light.
+
+    Parameters
+    ----------
+    frames : numpy.ndarray
+        Frames that are spread over the recording, (frames, rows, columns).
+    sensor : Sensor
+        Camera; its readout gives the direction of the line.
+    """
+    assert isinstance(sensor.readout, LineReadout)  # a camera
+    profiles = _profiles(median_background(frames), sensor.readout.along)
+    return unlit_level(profiles[beside_line(profiles)])
+
+
 def _threshold(frames: Array, background: Background | Path, image: Array | None, along: Along) -> float:
     """Return the threshold [grey levels] for frames after the subtraction of their background."""
     middle = median_background(frames[:, 0]) if image is None else image

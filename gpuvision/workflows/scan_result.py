@@ -124,6 +124,9 @@ class Scan:
     errors : ScanErrors, optional
         Predicted errors of the points; None if the sensor file gives no noise. The random error of the height map is
         ``heights.sigma``.
+    ambient : float, optional
+        Level of the frames beside the line [grey levels], see `gpuvision.workflows.opened_recording.ambient_level`;
+        None where a background is subtracted or the threshold is estimated, and for other sensors than cameras.
     """
 
     sensor: Sensor
@@ -138,6 +141,7 @@ class Scan:
     metadata: dict[str, Any]
     limits: ScanLimits = ScanLimits()
     errors: ScanErrors | None = None
+    ambient: float | None = None
 
     @property
     def valid_fraction(self) -> float:
@@ -151,8 +155,23 @@ class Scan:
         return {"OK": int(np.count_nonzero(status == 0))} | flags
 
     def advice(self) -> tuple[str, ...]:
-        """Return what to try where most samples have no point; empty for a good scan. See `scan_advice`."""
-        return scan_advice(to_numpy(self.points.status), self.sensor) if self.valid_fraction < 0.5 else ()
+        """Return what to try; empty for a good scan.
+
+        Where most samples have no point, see `scan_advice`. Ambient light that reaches the threshold shifts the line.
+        """
+        sentences = scan_advice(to_numpy(self.points.status), self.sensor) if self.valid_fraction < 0.5 else ()
+        if self.ambient is None:
+            return sentences
+        readout = self.sensor.readout
+        assert isinstance(readout, LineReadout)  # no other one has a level
+        if self.ambient < readout.threshold:
+            return sentences
+        return (
+            *sentences,
+            f"the frames have {self.ambient:g} grey levels beside the line, expected less than the threshold of "
+            f'{readout.threshold:g}; ambient light shifts the line: try [line] threshold = "auto", or subtract it with '
+            "[recording] background",
+        )
 
     def summary(self) -> str:
         """Return one line: frames, throughput, fraction of valid samples, size of the height map.
@@ -205,6 +224,7 @@ class Scan:
             "dropped": stream.pop("dropped"),
             "samples_per_frame": self.points.z.size if self.sensor.kind == "focus" else self.points.z.shape[1],
             "valid_fraction": self.valid_fraction,
+            "ambient_level": self.ambient,
             "status": self.counts(),
             "throughput": self.throughput,
             "latency": stream.pop("latency"),

@@ -20,6 +20,7 @@ from gpuvision.host import Device, Operation, Precision, to_numpy
 from gpuvision.host.pipeline import Pipeline, Policy
 from gpuvision.host.planning import Plan, plan_stream
 from gpuvision.host.sources import PacedSource, Source
+from gpuvision.ranging.background import FramesCopied
 from gpuvision.ranging.focus_stack import FocusStack
 from gpuvision.ranging.height_map import Grid, HeightMap
 from gpuvision.ranging.line import LineReadout
@@ -30,7 +31,7 @@ from gpuvision.ranging.sheet_motion import RotatingSheet, StraightTransport
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import SAMPLE_FLAGS, Status
 from gpuvision.workflows.focus_frames import read_focus_peak
-from gpuvision.workflows.opened_recording import open_for_scan
+from gpuvision.workflows.opened_recording import ambient_level, open_for_scan
 from gpuvision.workflows.scan_errors import ScanErrors, focus_errors, predict_errors, sigma_outputs
 from gpuvision.workflows.scan_result import Scan, ScanLimits, scan_advice
 
@@ -97,6 +98,10 @@ def scan(
         _check_plan(stream_plan, rate, device)
     opened = open_for_scan(recording, sensor)
     source, name, sensor = opened.source, opened.name, opened.sensor
+    # A background that is subtracted, or a threshold that is estimated, takes the ambient light into account.
+    is_checked = sensor.kind == "camera" and sensor.recording.background == "none" and not sensor.auto_threshold
+    copied = FramesCopied(source) if is_checked else None
+    source = source if copied is None else copied
     try:
         readout = range_readout(sensor, precision)
         device = Device.best() if device is None else device
@@ -127,6 +132,7 @@ def scan(
         metadata=_metadata(name, sensor, rate, paced),
         limits=limits,
         errors=errors,
+        ambient=None if copied is None else ambient_level(np.stack(copied.copies), sensor),
     )
 
 

@@ -13,6 +13,7 @@ from scipy.special import ndtri
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.sources import ArraySource, Source
 from gpuvision.ranging.background import (
+    FramesCopied,
     ImageSubtracted,
     PairsSubtracted,
     PreviousSubtracted,
@@ -286,3 +287,14 @@ def test_a_sample_of_a_large_recording_keeps_at_least_five_groups(monkeypatch: p
     for limit, group, least in ((6 * 2 * 8, 1, 8), (6 * 2 * 7, 1, 7), (6 * 2 * 6, 2, 5), (0, 1, 5), (10_000, 1, 16)):
         monkeypatch.setattr("gpuvision.ranging.background._LARGEST_SAMPLE_BYTES", limit)
         assert least <= len(sample_frames(ArraySource(frames), group=group).frames) < 2 * least
+
+
+@pytest.mark.parametrize("batch", [1, 3, 20, 200])
+@pytest.mark.parametrize("count", [1, 5, 16, 17, 33, 150])
+def test_copies_are_spread_over_all_frames(count: int, batch: int) -> None:
+    """Every n-th frame from the first one on, with the least power of two that gives at most 16."""
+    frames = frames_of(count, np.uint8)
+    source = FramesCopied(ArraySource(frames))
+    np.testing.assert_array_equal(read(source, batch), frames)
+    step = next(2**k for k in range(10) if -(-count // 2**k) <= 16)
+    np.testing.assert_array_equal(np.stack(source.copies), frames[::step])

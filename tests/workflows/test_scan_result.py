@@ -75,6 +75,7 @@ def test_report_of_a_scan() -> None:
         "dropped": 0,
         "samples_per_frame": 5,
         "valid_fraction": 0.4,
+        "ambient_level": None,
         "status": counts,
         "throughput": 2500.0,
         "latency": {"p50": 1.0},

@@ -43,6 +43,18 @@ FILES = {
 }
 
 
+@pytest.mark.parametrize("moves", [True, False])
+@pytest.mark.parametrize(("level", "is_named"), [(0, False), (15, False), (16, True), (40, True)])
+def test_ambient_light_that_reaches_the_threshold_is_named(level: int, is_named: bool, moves: bool) -> None:
+    """The threshold is 16 grey levels; the line covers more than 3 % of the frame, also if it stands still."""
+    rows = np.linspace(20.0, 44.0, 480)[None, :] + (0.8 if moves else 0.0) * np.arange(20)[:, None]
+    done = scan(line_frames(rows) + np.uint8(level), Sensor.load("camera_line"), device=Device.best())
+    assert done.report()["ambient_level"] == level
+    sentence = f"the frames have {level} grey levels beside the line, expected less than the threshold of 16; ambient"
+    assert any(each.startswith(sentence) for each in done.advice()) == is_named
+    assert len(done.advice()) == is_named
+
+
 # ---- output -------------------------------------------------------------------------------------------------
 
 

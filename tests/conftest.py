@@ -95,6 +95,7 @@ ALLOWED_SKIPS = (
     "`make docs` ran this example after the last change",
     "only PoCL 3 has such a device",
     "only Intel's runtime does so by the work's groups",
+    "only workers of PoCL wake slowly",
     "no Chromium here (Debian package chromium)",
     "only root mounts a small file system",
     "only root gives files away",

@@ -185,8 +185,9 @@ def _coarse_heights(z: Float64, grid: Grid, apertures: Sequence[Aperture]) -> tu
     size = math.sqrt(float(np.median([each.area for each in apertures])))
     cell = max(grid.cell_x, grid.cell_y)
     target = max(size / _CELLS_ACROSS, max(grid.columns * grid.cell_x, grid.rows * grid.cell_y) / _MOST_COARSE, cell)
-    factors = [max(round(target / each), 1) for each in (grid.cell_y, grid.cell_x)]
-    rows, columns = (max(count // factor, 1) for count, factor in zip(grid.shape, factors, strict=True))
+    cells = zip(grid.shape, (grid.cell_y, grid.cell_x), strict=True)
+    factors = [min(max(round(target / each), 1), count) for count, each in cells]
+    rows, columns = (count // factor for count, factor in zip(grid.shape, factors, strict=True))
     blocks = z[: rows * factors[0], : columns * factors[1]].reshape(rows, factors[0], columns, factors[1])
     known = np.isfinite(blocks)
     count = known.sum(axis=(1, 3))

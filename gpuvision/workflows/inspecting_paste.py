@@ -139,6 +139,10 @@ class PasteInspection:
     def warnings(self) -> tuple[str, ...]:
         """Return what may be wrong with the inspection, one sentence each."""
         found = []
+        if not np.isfinite(self.volume_ratio).any():
+            found.append(
+                "no deposit has a volume: check the pose of the board, and the unit and the cells of the height map"
+            )
         if self.alignment is not None and self.alignment.is_ambiguous:
             found.append(
                 "the paste pattern fits about as well at another place of the search range; give --initial-pose and a "
@@ -217,8 +221,8 @@ class PasteInspection:
         place = self.placement
         pose = f"{1e3 * place.x:.3f} mm, {1e3 * place.y:.3f} mm, {math.degrees(place.theta):.3f} deg"
         how = "given" if self.alignment is None else "fitted to the paste"
-        noise = f"noise {1e6 * self.deposits.noise:.2g} um"
-        return f"{len(verdicts)} deposits: {counts}{volumes}; board at {pose} ({how}); {noise}"
+        noise = f"; noise {1e6 * self.deposits.noise:.2g} um" if math.isfinite(self.deposits.noise) else ""
+        return f"{len(verdicts)} deposits: {counts}{volumes}; board at {pose} ({how}){noise}"
 
     def report(self) -> dict[str, Any]:
         """Return the content of ``report.json``; None for numbers that are not known."""

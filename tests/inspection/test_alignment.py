@@ -95,6 +95,16 @@ def test_a_map_without_paste_is_refused(rng):
         align_apertures(np.full(grid.shape, np.nan), grid, apertures, SETTINGS, initial=here, search_range=(1e-4, 0.0))
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 60), (60, 1)])
+def test_a_map_smaller_than_a_coarse_cell_is_refused(shape):
+    """Cells of 40 um and apertures of 0.4 mm: a coarse cell has several cells."""
+    grid = Grid(left=0.0, top=0.0, cell_x=40e-6, cell_y=40e-6, columns=shape[1], rows=shape[0])
+    apertures = [circle(str(k), (0.8e-3 * k, 0.0), 0.2e-3) for k in range(3)]
+    here = BoardPlacement(x=0.0, y=0.0, theta=0.0)
+    with pytest.raises(ValueError, match=r"shows no part of the paste pattern|the board was not found"):
+        align_apertures(np.full(shape, 5e-6), grid, apertures, SETTINGS, initial=here, search_range=(1e-3, 0.0))
+
+
 @pytest.mark.parametrize("count", [4, 12])
 def test_the_covariance_of_equal_residuals_has_a_closed_form(count):
     """Deposits on a circle have radial offsets of alternate signs, which no shift or rotation reduces."""

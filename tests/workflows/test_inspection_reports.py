@@ -171,6 +171,15 @@ def test_warnings_of_paste(changes: dict[str, Any], start: str) -> None:
     assert text.startswith(start)
 
 
+def test_a_board_outside_of_the_map_is_a_warning() -> None:
+    """At a wrong pose no deposit has a volume, and the noise is unknown."""
+    nothing = {"status": ("outside",) * len(STATUS), "volume": np.full(len(STATUS), np.nan)}
+    outside = paste(deposits={**nothing, "noise": math.nan, "board_scatter": math.nan})
+    (text,) = outside.warnings()
+    assert text.startswith("no deposit has a volume: check the pose of the board")
+    assert outside.summary().endswith("0.500 deg (given)")
+
+
 def test_no_warnings_within_the_limits() -> None:
     alignment = changed(correlation=0.31, second_correlation=0.29)
     settings = PasteSettings(stencil=1e-4, threshold=8.1e-6)

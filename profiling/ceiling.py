@@ -5,15 +5,16 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import pyopencl as cl
 
-from gpuvision.host import Define, Device, flags
+from gpuvision.host import Bound, Device, Launch, flags
 from gpuvision.host.arrays import memory_of
 from gpuvision.host.program import build
-from gpuvision.operation import KERNEL_FOLDER
+from gpuvision.operation import KERNEL_FOLDER, VisionOperation
 
 SIZES = (1 << 20, 8 << 20, 192 << 20)
 """Bytes that the copies of `bandwidths` move."""
@@ -26,64 +27,89 @@ _LAUNCH = 0.2  # a launch of the multiply-adds that takes longer gets no more wo
 _FLOPS_PER_STEP = 8 * 16 * 2  # 8 vectors of 16 floats, one multiplication and one addition each
 
 
+class Moved(NamedTuple):
+    """Result of `Move`: the vectors that it writes."""
+
+    to: Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class Move(VisionOperation[Moved]):
+    """Kernel that only reads and writes memory in sequence, in one of the forms that `mover` tries.
+
+    Parameters
+    ----------
+    writes : int
+        Vectors of 64 bytes that it writes; it reads its input once.
+    prefetches, past_caches : bool
+        Build options of ``ceiling.cl``. Default False.
+    """
+
+    Result: ClassVar[type[Any]] = Moved
+
+    writes: int
+    prefetches: bool = False
+    past_caches: bool = False
+
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for an input of one shape, as `Operation.launch` says."""
+        vectors = device.prefers_vectors
+        return Launch(
+            source="ceiling/ceiling.cl",
+            kernel="move" if vectors else "move_items",
+            inputs=[(shape, dtype)],
+            outputs={"to": ((max(self.writes, 1) * 16,), dtype)},
+            global_size=(device.compute_units * (_SHARES_PER_CORE if vectors else _ITEMS_PER_UNIT),),
+            local_size=(1,) if vectors else None,
+            defines=flags(PREFETCH=self.prefetches, PAST_CACHES=self.past_caches),
+            arguments=[np.int64(shape[0] // 16), np.int64(self.writes)],
+            by_team=vectors and not self.past_caches,
+        )
+
+
 def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[[], None]:
     """Return a function that reads and writes memory sequentially, `repeats` times back to back, and waits.
 
-    The arguments `read` and `written` are numbers of bytes. The copy is the fastest of the forms of `mover`. Its time
-    is a lower limit for a kernel with the same traffic in the same cache or memory; it includes the launch.
+    The arguments `read` and `written` are numbers of bytes. The copy is the fastest of the forms of `mover`. Waiting
+    workers share its launches as they do those of operations. Its time is a lower limit for a kernel with the same
+    traffic in the same cache or memory; it includes the launch.
     """
-    launch = mover(device, device.queue, read, written)
+    bound = mover(device, None, read, written)
 
     def run() -> None:
-        for _ in range(repeats):
-            event = launch()
-        device.wait(event)
+        for _ in range(repeats - 1):
+            bound()
+        bound.run()
 
     run()
     return run
 
 
-def mover(device: Device, queue: Any, read: int, written: int) -> Callable[[], Any]:
-    """Return a function that enqueues a kernel which reads and writes memory sequentially, and returns its event.
+def mover(device: Device, queue: Any, read: int, written: int) -> Bound[Moved]:
+    """Return the fastest form of a kernel that reads and writes memory sequentially, bound to a queue.
 
     Parameters
     ----------
     device : Device
-    queue : pyopencl.CommandQueue
+    queue : pyopencl.CommandQueue or None
+        As in `Operation.bind`.
     read, written : int
         Traffic [bytes].
     """
     reads, writes = max(read // _VECTOR, 1), written // _VECTOR
-    source = device.empty((reads * 16,), np.float32)
-    target = device.empty((max(writes, 1) * 16,), np.float32)
-    source.set(np.ones(source.shape, np.float32))
-    target.set(np.ones(target.shape, np.float32))  # maps the pages before the first timed run
-    arguments = memory_of(source), memory_of(target), np.int64(reads), np.int64(writes)
     is_large = device.is_cpu and read + written > device.cache_bytes
-
-    def form(name: str, defines: dict[str, Define], items: int, group: tuple[int] | None) -> Callable[[], Any]:
-        kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", defines), name)
-        kernel.set_args(*arguments)
-
-        def launch(kept: object = (source, target)) -> Any:
-            return cl.enqueue_nd_range_kernel(queue, kernel, (items,), group)
-
-        return launch
-
-    if not device.prefers_vectors:
-        return form("move_items", {}, device.compute_units * _ITEMS_PER_UNIT, None)
-    shares = device.compute_units * _SHARES_PER_CORE
     options = itertools.product((False, True), (False, True) if is_large else (False,))
-    forms = (form("move", flags(PREFETCH=ahead, PAST_CACHES=past), shares, (1,)) for ahead, past in options)
-    return min(forms, key=_least_time)
+    forms = [Move(writes=writes, prefetches=ahead, past_caches=past) for ahead, past in options]
+    bound = (form.bind(device, (16 * reads,), np.float32, queue=queue) for form in forms)
+    return min(bound, key=_least_time) if device.prefers_vectors else next(bound)
 
 
-def _least_time(launch: Callable[[], Any]) -> float:
+def _least_time(bound: Bound[Moved]) -> float:
     """Return the least time of a few launches, each of which is waited for [s]."""
     times = []
     for _ in range(_TRIALS):
         start = time.perf_counter()
-        launch().wait()
+        bound.run()
         times.append(time.perf_counter() - start)
     return min(times)
 

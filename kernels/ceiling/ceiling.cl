@@ -1,4 +1,5 @@
 // Peak performance of a device: kernels that only move bytes, and a kernel that only computes.
+#include "common/team.h"
 
 typedef float16 vector_at __attribute__((aligned(4)));
 
@@ -24,21 +25,23 @@ static inline float16 read_vector(global const float *from) {
 // before it writes takes 1.1 to 1.2 times as long.
 // Build options: PAST_CACHES; PREFETCH (reads are prefetched 2 KiB ahead, which some compilers and sizes gain by).
 #define TURN 16
-kernel void move(global const float *from, global float *to, long reads, long writes) {
-    const long item = get_global_id(0), items = get_global_size(0);
-    const long first = reads * item / items, end = reads * (item + 1) / items;
-    const long first_write = writes * item / items, end_write = writes * (item + 1) / items;
-    long write = first_write;
-    float16 sum = 0;
-    for (long begin = first; begin < end; begin += TURN) {
-        const long stop = min(begin + TURN, end);
-        for (long i = begin; i < stop; i++) sum += read_vector(from + 16 * i);
-        const long until = first_write + (end_write - first_write) * (stop - first) / (end - first);
-        for (; write < until; write++) write_vector(sum, to + 16 * write);
+kernel void move(global const float *from, global float *to, long reads, long writes TEAM_ARGUMENTS) {
+    const long items = ITEM_COLUMNS;
+    FOR_EACH_ITEM(item) {
+        const long share = item.x, first = reads * share / items, end = reads * (share + 1) / items;
+        const long first_write = writes * share / items, end_write = writes * (share + 1) / items;
+        long write = first_write;
+        float16 sum = 0;
+        for (long begin = first; begin < end; begin += TURN) {
+            const long stop = min(begin + TURN, end);
+            for (long i = begin; i < stop; i++) sum += read_vector(from + 16 * i);
+            const long until = first_write + (end_write - first_write) * (stop - first) / (end - first);
+            for (; write < until; write++) write_vector(sum, to + 16 * write);
+        }
+        for (; write < end_write; write++) write_vector(sum, to + 16 * write);  // of a work-item that reads nothing
+        // A work-item without writes must still use its sum, or the compiler would remove the reads.
+        if (first_write == end_write && sum.s0 == 1.0e30f) to[0] = sum.s1;
     }
-    for (; write < end_write; write++) write_vector(sum, to + 16 * write);  // of a work-item that reads nothing
-    // A work-item without writes must still use its sum, or the compiler would remove the reads.
-    if (first_write == end_write && sum.s0 == 1.0e30f) to[0] = sum.s1;
 }
 
 // The same for devices where neighbouring work-items should touch neighbouring words.

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from gpuvision.host import Device
 from gpuvision.host.errors import ReadError, RecordingError
-from gpuvision.host.files import atomic_write
+from gpuvision.host.files import atomic_write, check_writable_folder
 from gpuvision.host.reading import check_archive, reading
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor.sensor import Sensor
@@ -212,6 +212,8 @@ def compute_missing_blocks(
         A worker has other sources of gpuvision than this machine.
     """
     task, missing = store.task, store.missing()
+    if missing:
+        check_writable_folder(store.folder)  # before minutes of work
     blocks = task.blocks()
     done = len(task.transports) - sum(len(blocks[number]) for number in missing)
     progress(done, len(task.transports))

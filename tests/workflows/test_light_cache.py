@@ -103,6 +103,20 @@ def test_only_missing_and_damaged_blocks_are_computed(
     assert compute_missing_blocks(store) == 0
 
 
+@pytest.mark.parametrize("place", ["light", "light/abc"])
+def test_a_file_in_the_place_of_the_light_is_refused_before_the_work(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    (tmp_path / place).write_text("a user's")
+    monkeypatch.setattr(light_cache, "compute_block", lambda *_: pytest.fail("computed"))
+    with pytest.raises(
+        NotADirectoryError, match=rf"cannot write into .*: {tmp_path / place} is a file, expected a fol"
+    ):
+        compute_missing_blocks(LightStore(tmp_path, task_of(4)))
+    assert (tmp_path / place).read_text() == "a user's"
+
+
 def test_a_block_stacks_its_profiles(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator, tmp_path: Path) -> None:
     """The second block of 18 profiles has the transports 8.0 and 8.5."""
     asked: list[np.ndarray] = []

@@ -35,7 +35,7 @@ from gpuvision.validation import check_keys, finite, numbers
 _LANES, _GROUP = 16, 64
 # Points of a strip in the vector variant. Long strips keep the hardware prefetchers running; several strips per core
 # balance the load.
-_SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
+_SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 65536, 8
 _KEYS = ("homography", "region", "model", "along", "lens", "camera", "polynomial", "covariance", "sigma", "horizon")
 
 
@@ -101,7 +101,7 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
 
     Result: ClassVar[type[Any]] = SheetPoints
     # Not the variant: the variants round differently.
-    tunable: ClassVar[Tunable | None] = Tunable(strips=(512, 1024, 2048, 4096, 8192, 16384), groups=(32, 64, 128, 256))
+    tunable: ClassVar[Tunable | None] = Tunable(strips=(512, 1024, 2048, 4096, 8192, 16384, 65536), groups=(32, 64, 128, 256))
 
     precision: Precision = None
     variant: Variant = "auto"

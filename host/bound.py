@@ -284,6 +284,9 @@ class Bound(Generic[R]):
         return event
 
     def _start_team(self, given: tuple[Any, ...], team: Team) -> None:
+        """Let workers wait for the next launch, unless some still do: their arrays differ."""
+        if not team.may_start():
+            return
         self._set_arrays(self._leader, given)
         self._set_arrays(self._member, given)
         team.start(given)
@@ -550,7 +553,7 @@ def _refuse_calls() -> None:
     def refuse(*_: object, **__: object) -> None:
         check_process()
 
-    for name in ("_enqueue", "on_host"):
+    for name in ("_enqueue", "_run_team", "_call_team", "on_host"):
         setattr(Bound, name, refuse)
 
 

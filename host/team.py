@@ -163,14 +163,16 @@ class Team:
         self._shift.team = self._reference
         self._idle_since = time.perf_counter_ns()
 
-    def start(self, given: tuple[Any, ...]) -> None:
-        """Let workers wait for the next launch with the arrays that the kernels were given.
+    def may_start(self) -> bool:
+        """Return whether workers may begin to wait, and the arrays of the kernels may change.
 
-        Does nothing while workers that were dismissed have not ended yet, nor for a real-time thread: if it came to the
-        core of a worker with a begun work-item, both would wait for each other.
+        Not while workers wait or, dismissed, have not ended yet. Nor for a real-time thread: if it came to the core of
+        a worker with a begun work-item, both would wait for each other.
         """
-        if self._waits or _is_real_time():
-            return
+        return not (self._waits or _is_real_time())
+
+    def start(self, given: tuple[Any, ...]) -> None:
+        """Let workers wait for the next launch with the arrays that the kernels were given, if they `may_start`."""
         self._given, self._shift.team = given, self._reference
         self._counters[_CORE] = _NO_CORE if self._core is None else self._core()
         self._counters[_ENDED] = self._counters[_DISMISSED] = self._counters[_BEGUN] = 0

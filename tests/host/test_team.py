@@ -237,6 +237,24 @@ def test_arrays_of_the_caller_do_not_meet_workers_that_wait_for_others(cpu: Devi
         assert np.all(host_view(bound.outputs.position) == 0.0)
 
 
+@pytest.mark.parametrize("pairs", [20_000, 50_000])
+def test_alternating_arrays_do_not_meet(cpu: Device, pairs: int) -> None:
+    """Workers may still wait for the arrays of the instance after a launch with arrays of the caller."""
+    bound = READOUT.bind(cpu, (pairs, 2), np.float32)
+    out, frame = bound.allocate(), cpu.empty((pairs, 2), np.float32)
+    host_view(bound.inputs[0])[...] = 1.0, 3.0
+    host_view(frame)[...] = 3.0, 1.0
+    own, of_caller = host_view(bound.outputs.position), host_view(out.position)
+    for repetition in range(_TRIES):
+        for _ in range(1 + repetition % 5):
+            own.fill(np.nan)
+            bound.run()
+            assert np.all(own == 0.5)
+        of_caller.fill(np.nan)
+        bound.run(frame, out=out)
+        assert np.all(of_caller == -0.5)
+
+
 def test_calls_that_follow_at_once_are_shared_on_pocl(cpu: Device) -> None:
     """A call that does not wait runs in the queue after a pause, in which the caller does other work."""
     if not cpu.call_gains_by_team:
@@ -323,7 +341,7 @@ while not waits:
 if sys.argv[2] == "fork":
     child = os.fork()
     if child:
-        sys.exit(os.waitpid(child, 0)[1])
+        sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
 
 
@@ -331,5 +349,37 @@ if sys.argv[2] == "fork":
 def test_a_process_ends_while_workers_wait(cpu: Device, how: str) -> None:
     ran = subprocess.run(
         [sys.executable, "-c", _AT_EXIT, cpu.label, how], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (ran.returncode, ran.stderr) == (0, "")
+
+
+_IN_CHILD = """
+import os, sys
+import numpy as np
+from gpuvision.host import Device, DeviceUnusableError
+from gpuvision.host.team import _ENDED
+from gpuvision.ranging.psd import PsdReadout
+bound = PsdReadout(strip_length=2.0).bind(Device.named(sys.argv[1]), (100_000, 2), np.float32)
+while not bound._team.has(bound._own):
+    bound.run()
+child = os.fork()
+if child:
+    sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+bound._team._counters[_ENDED] = 0
+for launch in bound.run, bound:
+    try:
+        launch()
+    except DeviceUnusableError:
+        continue
+    os._exit(1)
+os._exit(0)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
+def test_a_forked_process_raises_where_its_parent_has_waiting_workers(cpu: Device) -> None:
+    """Without workers a launch would hang. The child has a copy of the counters, as of the moment of the fork."""
+    ran = subprocess.run(
+        [sys.executable, "-c", _IN_CHILD, cpu.label], capture_output=True, text=True, timeout=30, check=False
     )
     assert (ran.returncode, ran.stderr) == (0, "")

@@ -338,6 +338,7 @@ class Bound(Generic[R]):
         if site.inline:
             cl.wait_for_events(wait_for)
             return cl.enqueue_nd_range_kernel(*site.arguments)
+        self._shift.end()
         event = cl.enqueue_nd_range_kernel(*site.arguments, wait_for=wait_for)
         if given is not self._own:
             self._hold(event, given)
@@ -374,6 +375,7 @@ class Bound(Generic[R]):
     def _run_shared(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> Any:
         """Run in shared memory, wait, and return the event of the kernel: large arrays in place, others copied."""
         site, count = self._run_site, len(frames)
+        self._shift.end()
         self.queue.finish()  # an earlier call may still read the inputs
         if site.given is not self._own:
             self._set_arrays(site, self._own)

@@ -34,6 +34,9 @@ PAUSE_NS = 75_000
 # The same for launches that the caller does not wait for. In longer pauses the caller does other work, beside which the
 # workers should run. Chosen: the time that waking them takes.
 BRIEF_PAUSE_NS = 20_000
+# Launches of one team are shared for this time; then the workers end, so that kernels of other threads get their turn.
+# Chosen: a hundred launches or more, beside which the two launches until they wait again take little.
+_TENURE_NS = 10_000_000
 # The time of a look at the counters is measured in a trial of at least this duration: a launch takes 1 to 5 us.
 _TRIAL_NS, _MOST_LOOKS = 40_000, 1 << 22
 
@@ -118,7 +121,7 @@ class Team:
         self._counters = host_view(counters)
         self._reference = weakref.ref(self)
         self._is_started = False
-        self._idle_since = 0
+        self._idle_since = self._ends = 0
         self._events: list[Any] = []
         self._given: tuple[Any, ...] | None = None
         self._size = self._counters[_MEMBERS] = member[2][0]
@@ -145,8 +148,8 @@ class Team:
         return self._is_started and bool(self._counters[_ENDED] < self._size)
 
     def has(self, given: tuple[Any, ...]) -> bool:
-        """Return whether workers wait for a launch with these arrays."""
-        return given is self._given and self._waits
+        """Return whether workers wait for a launch with these arrays, and may still do so."""
+        return given is self._given and self._idle_since < self._ends and self._waits
 
     def lead(self) -> Any:
         """Launch, together with the waiting workers; return the event of the launch, which is complete."""
@@ -180,6 +183,7 @@ class Team:
         self._member[0].flush()
         self._is_started = True
         self._idle_since = time.perf_counter_ns()
+        self._ends = self._idle_since + _TENURE_NS
 
     def dismiss(self) -> None:
         """Make waiting workers end."""

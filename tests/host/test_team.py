@@ -224,6 +224,40 @@ def test_another_launch_dismisses_the_workers(cpu: Device, rng: np.random.Genera
     np.testing.assert_allclose(host_view(other.outputs.position), (right - left) / (right + left), atol=5e-7)
 
 
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that wait for seconds, unless something dismisses them; on PoCL one is free."""
+    monkeypatch.setattr(Team, "_looks", lambda *_: np.iinfo(np.uint32).max)
+
+
+@pytest.mark.usefixtures("patient")
+@pytest.mark.parametrize("how", ["after_event", "on_host"])
+def test_launches_of_all_kinds_dismiss_the_workers(cpu: Device, how: str) -> None:
+    bound, other = READOUT.bind(cpu, (100_000, 2), np.float32), READOUT.bind(cpu, (1_000_000, 2), np.float32)
+    assert has_led(bound)
+    start = time.monotonic()
+    if how == "on_host":
+        other.on_host([np.ones((1_000_000, 2), np.float32)])
+    else:
+        other(wait_for=[cl.enqueue_marker(cpu.queue)]).wait()
+    assert time.monotonic() - start < 0.5
+
+
+@pytest.mark.usefixtures("patient")
+def test_kernels_of_other_threads_get_their_turn(cpu: Device) -> None:
+    """A kernel that gpuvision does not know of, in another queue, while a loop launches without a pause."""
+    bound, other = READOUT.bind(cpu, (100_000, 2), np.float32), READOUT.bind(cpu, (1_000_000, 2), np.float32)
+    queue = cpu.new_queue()
+    arguments = other._queue_site.arguments[1:]
+    assert has_led(bound)
+    event = cl.enqueue_nd_range_kernel(queue, *arguments)
+    queue.flush()
+    end = time.monotonic() + 0.5
+    while event.command_execution_status > COMPLETE and time.monotonic() < end:
+        bound.run()
+    assert event.command_execution_status == COMPLETE
+
+
 def test_arrays_of_the_caller_do_not_meet_workers_that_wait_for_others(cpu: Device, rng: np.random.Generator) -> None:
     bound = READOUT.bind(cpu, (100_000, 2), np.float32)
     bound.inputs[0].set(np.ones((100_000, 2), np.float32))

@@ -236,8 +236,8 @@ class Bound(Generic[R]):
         """
         given = self._own if not frames and out is None else self._given(frames, out)
         try:
-            if self._called_team is not None and not wait_for:
-                return self._call_team(given, self._called_team)
+            if self._called_team is not None and given is self._own and not wait_for:
+                return self._call_team(self._called_team)
             return self._enqueue(given, wait_for)
         except cl.Error as error:
             self._raise(error)
@@ -246,10 +246,10 @@ class Bound(Generic[R]):
         """Launch, wait with the least delay, and return the written arrays: `out` or `outputs`."""
         given = self._own if not frames and out is None else self._given(frames, out)
         try:
-            if self._team is None:
+            if self._team is None or given is not self._own:
                 self._run_alone(given)
             else:
-                self._run_team(given, self._team)
+                self._run_team(self._team)
         except cl.Error as error:
             self._raise(error)
         return self.outputs if out is None else out
@@ -260,36 +260,28 @@ class Bound(Generic[R]):
         if self._empty or not self._run_site.inline:
             self._wait(event)
 
-    def _run_team(self, given: tuple[Any, ...], team: Team) -> None:
+    def _run_team(self, team: Team) -> None:
         """Launch and wait, with the waiting workers if there are any; else they begin to wait if this gains."""
-        if team.has(given):
+        if team.waits:
             self._finish_queue()
             team.lead()
             return
         gains = team.gains(PAUSE_NS)
-        self._run_alone(given)
+        self._run_alone(self._own)
         team.rest()
         if gains:
-            self._start_team(given, team)
+            team.start()
 
-    def _call_team(self, given: tuple[Any, ...], team: Team) -> Any:
+    def _call_team(self, team: Team) -> Any:
         """Launch with the waiting workers if the caller does nothing else between launches; return the event."""
         gains = team.gains(BRIEF_PAUSE_NS)
-        if gains and team.has(given):
+        if gains and team.waits:
             self._finish_queue()
             return team.lead()
-        event = self._enqueue(given)
+        event = self._enqueue(self._own)
         if gains:
-            self._start_team(given, team)
+            team.start()
         return event
-
-    def _start_team(self, given: tuple[Any, ...], team: Team) -> None:
-        """Let workers wait for the next launch, unless some still do: their arrays differ."""
-        if not team.may_start():
-            return
-        self._set_arrays(self._leader, given)
-        self._set_arrays(self._member, given)
-        team.start(given)
 
     def _raise(self, error: cl.Error) -> NoReturn:
         """Raise the exception of gpuvision for an error of the runtime."""
@@ -491,12 +483,12 @@ class Bound(Generic[R]):
             arguments=(*launch.arguments, memory_of(counters), np.uint32(0)),
         )
         waiting = replace(leading, global_size=(device.compute_units - (core is None),))
-        self._leader = self._site_on(device.inline_queue(self.queue), leading)
-        self._member = self._site_on(device.new_queue(), waiting)
-        for site in (self._leader, self._member):
+        leader = self._site_on(device.inline_queue(self.queue), leading)
+        member = self._site_on(device.new_queue(), waiting)
+        for site in (leader, member):
             self._set_arrays(site, self._own)
         patience = len(launch.inputs) + len(launch.outputs) + len(launch.arguments) + 1
-        return Team(self._shift, counters, self._leader.arguments, self._member.arguments, patience, core)
+        return Team(self._shift, counters, leader.arguments, member.arguments, patience, core)
 
     def _clear(self, array: DeviceArray) -> None:
         if self.device.shares_memory:

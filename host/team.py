@@ -21,6 +21,7 @@ import numpy as np
 import pyopencl as cl
 
 from gpuvision.host.arrays import DeviceArray, HostArray, host_view
+from gpuvision.host.process import before_fork, is_forked
 
 VARIABLE = "GPUVISION_TEAMS"
 # Places of the counters, in the order of Team in kernels/common/team.h.
@@ -118,17 +119,17 @@ class Team:
         core: Callable[[], int] | None,
     ) -> None:
         self._shift, self._leader, self._member, self._core = shift, leader, member, core
-        self._counters = host_view(counters)
+        self._array, self._counters = counters, host_view(counters)
         self._reference = weakref.ref(self)
         self._is_started = False
         self._idle_since = self._ends = 0
         self._events: list[Any] = []
-        self._given: tuple[Any, ...] | None = None
         self._size = self._counters[_MEMBERS] = member[2][0]
         self._counters[_CORE] = _NO_CORE
         member[1].set_arg(patience, np.uint32(self._looks(patience)))
         leader[1].set_arg(patience, np.uint32(0))
-        weakref.finalize(self, _dismiss, counters, self._events, os.getpid())
+        weakref.finalize(self, _end, counters, self._events)
+        _teams.add(self)
 
     def _looks(self, patience: int) -> int:
         """Return the looks at the counters that take `_PATIENCE_NS`, from trials in the calling thread."""
@@ -143,13 +144,13 @@ class Team:
         return looks * _PATIENCE_NS // taken
 
     @property
-    def _waits(self) -> bool:
-        """Whether workers wait for the next launch, or will soon."""
-        return self._is_started and bool(self._counters[_ENDED] < self._size)
+    def waits(self) -> bool:
+        """Whether workers wait for the next launch, or will soon, and may still do so."""
+        return self._idle_since < self._ends and self._has_members
 
-    def has(self, given: tuple[Any, ...]) -> bool:
-        """Return whether workers wait for a launch with these arrays, and may still do so."""
-        return given is self._given and self._idle_since < self._ends and self._waits
+    @property
+    def _has_members(self) -> bool:
+        return self._is_started and bool(self._counters[_ENDED] < self._size)
 
     def lead(self) -> Any:
         """Launch, together with the waiting workers; return the event of the launch, which is complete."""
@@ -163,20 +164,24 @@ class Team:
 
     def rest(self) -> None:
         """Note that a launch without the workers has ended."""
-        self._shift.team = self._reference
+        self._take_shift()
         self._idle_since = time.perf_counter_ns()
 
-    def may_start(self) -> bool:
-        """Return whether workers may begin to wait, and the arrays of the kernels may change.
+    def _take_shift(self) -> None:
+        if self._shift.team is not self._reference:
+            self._shift.end()
+            self._shift.team = self._reference
 
-        Not while workers wait or, dismissed, have not ended yet. Nor for a real-time thread: if it came to the core of
-        a worker with a begun work-item, both would wait for each other.
+    def start(self) -> None:
+        """Let workers wait for the next launch.
+
+        Does nothing while workers wait or, dismissed, have not ended yet; nor for a real-time thread: if it came to the
+        core of a worker with a begun work-item, both would wait for each other.
         """
-        return not (self._waits or _is_real_time())
-
-    def start(self, given: tuple[Any, ...]) -> None:
-        """Let workers wait for the next launch with the arrays that the kernels were given, if they `may_start`."""
-        self._given, self._shift.team = given, self._reference
+        if self._has_members or _is_real_time():
+            return
+        self._is_started = False  # until the workers are enqueued: this may fail
+        self._take_shift()
         self._counters[_CORE] = _NO_CORE if self._core is None else self._core()
         self._counters[_ENDED] = self._counters[_DISMISSED] = self._counters[_BEGUN] = 0
         self._events[:] = [cl.enqueue_nd_range_kernel(*self._member)]
@@ -189,16 +194,32 @@ class Team:
         """Make waiting workers end."""
         self._counters[_DISMISSED] = 1
 
+    def end(self) -> None:
+        """Dismiss waiting workers, and wait until they have ended."""
+        _end(self._array, self._events)
+
 
 def _is_real_time() -> bool:
     """Return whether ordinary threads do not get the core of the calling thread while it runs."""
     return hasattr(os, "sched_getscheduler") and os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR)
 
 
-def _dismiss(counters: DeviceArray, events: list[Any], process: int) -> None:
+def _end(counters: DeviceArray, events: list[Any]) -> None:
     """Dismiss the members and wait for their end: they look at the counters, which must stay as long."""
-    if os.getpid() == process:  # a forked process has no workers
+    if not is_forked():  # a forked process has no workers
         values: HostArray = host_view(counters)
         values[_DISMISSED] = 1
         for event in events:
             event.wait()
+
+
+_teams: weakref.WeakSet[Team] = weakref.WeakSet()
+
+
+def _end_all() -> None:
+    """Let no worker end during a fork: it could hold a lock of its runtime, which would stay closed in the child."""
+    for team in _teams:
+        team.end()
+
+
+before_fork(_end_all)

@@ -101,7 +101,9 @@ class Triangulation(TriangulationTable, VisionOperation[SheetPoints]):
 
     Result: ClassVar[type[Any]] = SheetPoints
     # Not the variant: the variants round differently.
-    tunable: ClassVar[Tunable | None] = Tunable(strips=(512, 1024, 2048, 4096, 8192, 16384, 65536), groups=(32, 64, 128, 256))
+    tunable: ClassVar[Tunable | None] = Tunable(
+        strips=(512, 1024, 2048, 4096, 8192, 16384, 65536), groups=(32, 64, 128, 256)
+    )
 
     precision: Precision = None
     variant: Variant = "auto"

@@ -27,6 +27,8 @@ from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.ranging.triangulation import Triangulation
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance
 
 READOUT = PsdReadout(strip_length=2.0)
 _TRIES = 2000  # pairs of launches, one after the other: another process may take the core between two of them
@@ -54,7 +56,7 @@ def has_led(bound: Bound[Any]) -> bool:
     """Launch until a launch was shared with waiting workers; return whether one was."""
     team = team_of(bound)
     for _ in range(_TRIES):
-        if team.has(bound._own):
+        if team.waits:
             bound.run()
             return True
         bound.run()
@@ -117,7 +119,7 @@ def test_each_item_runs_once_in_each_launch(cpu: Device, counting: type[CountIte
     at_start = host_view(bound.outputs.count).copy()
     led = 0
     for launch in range(1, 2001):
-        led += team_of(bound).has(bound._own)
+        led += team_of(bound).waits
         bound.run()
         assert np.array_equal(host_view(bound.outputs.count), at_start + launch)
     assert led
@@ -147,7 +149,9 @@ def _line(rng: np.random.Generator) -> tuple[Any, list[Any]]:
 
 def _rulers(rng: np.random.Generator) -> tuple[Any, list[Any]]:
     image = rng.integers(0, 255, (203, 331), np.uint8)
-    rulers = np.stack([rng.uniform(40.0, 160.0, 61) for _ in range(3)] + [np.zeros(61)], -1).astype(np.float32)
+    angle = rng.uniform(0.0, np.pi, 61)
+    places = [rng.uniform(40.0, 160.0, 61), rng.uniform(40.0, 160.0, 61), np.cos(angle), np.sin(angle)]
+    rulers = np.stack(places, -1).astype(np.float32)
     return RulerEdges(threshold=20.0, length=31, count=61), [image, rulers]
 
 
@@ -157,32 +161,50 @@ def _blobs(rng: np.random.Generator) -> tuple[Any, list[Any]]:
     image = np.full(y.shape, 200.0)
     for at_x, at_y, size in places + rng.uniform(-1.0, 1.0, places.shape) * (1.0, 1.0, 0.0):
         image -= 150.0 / (1.0 + np.exp(2.0 * (np.hypot(x - at_x, y - at_y) - size)))
-    return FindBlobs(threshold=20.0, count=len(places)), [image.astype(np.uint8), places]
+    return FindBlobs(threshold=20.0, polarity="dark", count=len(places)), [image.astype(np.uint8), places]
+
+
+def _irradiance(rng: np.random.Generator) -> tuple[Any, list[Any]]:
+    """Inputs of which the kernel reads the segments again for each work-item."""
+    segments = np.zeros((7, 10), np.float32)
+    segments[:, :6] = rng.uniform(-1.0, 1.0, (7, 6))
+    segments[:, 6:9] = np.cross(segments[:, 3:6] - segments[:, :3], rng.normal(size=(7, 3)))
+    segments[:, 6:9] /= np.linalg.norm(segments[:, 6:9], axis=1, keepdims=True)
+    segments[:, 9] = rng.uniform(0.5, 2.0, 7)
+    points = rng.uniform(-1.0, 1.0, (40, 21, 3))
+    receivers = np.concatenate([points, rng.normal(size=points.shape)], axis=-1).astype(np.float32)
+    scene = Scene(np.random.default_rng(3).uniform(-1.0, 1.0, (12, 3, 3)))
+    return OccludedIrradiance(scene=scene, segments=7), [receivers, np.ones((40, 21, 2), np.float32), segments]
 
 
 @pytest.mark.vectors
-@pytest.mark.parametrize("make", [_psd, _triangulation, _points, _line, _rulers, _blobs])
+@pytest.mark.parametrize("make", [_psd, _triangulation, _points, _line, _rulers, _blobs, _irradiance])
 def test_shared_launches_give_the_same_bits(cpu: Device, rng: np.random.Generator, make: Any) -> None:
-    """Compared with launches in the queue. The outputs hold canaries before each launch."""
+    """Compared with launches in the queue, for two sets of inputs in turn; outputs hold canaries before each launch."""
     operation, inputs = make(rng)
+    others = make(rng)[1]
     bound = operation.bind(cpu, inputs[0].shape, inputs[0].dtype)
-    for array, values in zip(bound.inputs, inputs, strict=True):
-        array.set(values)
     computed = {name: host_view(array) for name, array in bound.outputs._asdict().items() if array is not None}
 
-    def launched(launch: Any) -> dict[str, Any]:
+    def launched(given: list[Any], launch: Any) -> dict[str, Any]:
+        for array, values in zip(bound.inputs, given, strict=True):
+            host_view(array)[...] = values
         for values in computed.values():
             values.view(np.uint8)[...] = _CANARY
         launch()
         return {name: values.tobytes() for name, values in computed.items()}
 
-    expected = launched(lambda: bound._enqueue(bound._own).wait())
-    assert has_led(bound)
-    led = 0
-    for _ in range(50):
-        led += team_of(bound).has(bound._own)
-        assert launched(bound.run) == expected
-    assert led
+    expected = [launched(given, lambda: bound._enqueue(bound._own).wait()) for given in (inputs, others)]
+    assert expected[0] != expected[1]
+    led = [0, 0]
+    for turn in range(_TRIES):
+        which = turn % 2
+        has_led(bound)
+        led[which] += team_of(bound).waits
+        assert launched((inputs, others)[which], bound.run) == expected[which]
+        if min(led) >= 10:
+            break
+    assert min(led)
 
 
 def test_new_inputs_are_read_and_results_seen(cpu: Device, rng: np.random.Generator) -> None:
@@ -197,7 +219,7 @@ def test_new_inputs_are_read_and_results_seen(cpu: Device, rng: np.random.Genera
 def test_workers_end_when_no_launch_comes(cpu: Device) -> None:
     bound = READOUT.bind(cpu, (100_000, 2), np.float32)
     assert has_led(bound)
-    assert until(lambda: not team_of(bound)._waits)
+    assert until(lambda: not team_of(bound)._has_members)
     before = np.array(host_view(bound.outputs.position))
     np.testing.assert_array_equal(host_view(bound.run().position), before)
     assert has_led(bound)  # they begin to wait again
@@ -219,7 +241,7 @@ def test_another_launch_dismisses_the_workers(cpu: Device, rng: np.random.Genera
     other._queue_site  # noqa: B018 - the kernel is compiled before the launch is looked at
     other().wait()
     assert cpu.shift.team is None
-    assert until(lambda: not team_of(bound)._waits, seconds=1.0)
+    assert until(lambda: not team_of(bound)._has_members, seconds=1.0)
     left, right = frame.astype(np.float64).T
     np.testing.assert_allclose(host_view(other.outputs.position), (right - left) / (right + left), atol=5e-7)
 
@@ -371,7 +393,7 @@ bound = PsdReadout(strip_length=2.0).bind(Device.named(sys.argv[1]), (100_000, 2
 waits = 0
 while not waits:
     bound.run()
-    waits = bound._team._waits
+    waits = bound._team.waits
 if sys.argv[2] == "fork":
     child = os.fork()
     if child:
@@ -394,7 +416,7 @@ from gpuvision.host import Device, DeviceUnusableError
 from gpuvision.host.team import _ENDED
 from gpuvision.ranging.psd import PsdReadout
 bound = PsdReadout(strip_length=2.0).bind(Device.named(sys.argv[1]), (100_000, 2), np.float32)
-while not bound._team.has(bound._own):
+while not bound._team.waits:
     bound.run()
 child = os.fork()
 if child:

@@ -29,7 +29,7 @@ from gpuvision.profiling.time_plan import TimePlan
 
 # Benchmarked operations: name in the rows, and module of this package that measures it. Some modules also yield cases
 # of related operations. The names stay stable when modules are renamed, because results are compared over time.
-# Servo first: PoCL 3 keeps 128 kernels. In a process that has used more, a launch of a feature pose takes 200 us longer.
+# Servo first: PoCL 3 keeps 128 kernels. Where a process has used more, a launch of a feature pose takes 200 us longer.
 OPERATIONS = {
     "servo": "servo",
     "psd": "psd",

@@ -304,7 +304,7 @@ class Bound(Generic[R]):
             self._finish_queue()
         if given is not site.given:
             self._set_arrays(site, given)
-        if self._shift.team is not None and not site.inline:
+        if self._shift.team is not None:
             self._shift.end()
         event = cl.enqueue_nd_range_kernel(*site.arguments)
         if given is not self._own and not site.inline:

@@ -280,6 +280,15 @@ def test_kernels_of_other_threads_get_their_turn(cpu: Device) -> None:
     assert event.command_execution_status == COMPLETE
 
 
+def test_a_short_launch_in_the_calling_thread_dismisses_the_workers(cpu: Device) -> None:
+    """With Intel's runtime it takes three times as long while a worker waits."""
+    bound, short = READOUT.bind(cpu, (100_000, 2), np.float32), READOUT.bind(cpu, (1000, 2), np.float32)
+    assert has_led(bound)
+    short.run()
+    assert cpu.shift.team is None
+    assert until(lambda: not team_of(bound)._has_members, seconds=1.0)
+
+
 def test_arrays_of_the_caller_do_not_meet_workers_that_wait_for_others(cpu: Device, rng: np.random.Generator) -> None:
     bound = READOUT.bind(cpu, (100_000, 2), np.float32)
     bound.inputs[0].set(np.ones((100_000, 2), np.float32))

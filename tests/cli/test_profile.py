@@ -146,7 +146,7 @@ def test_an_operation_that_fails_is_named_and_the_rows_of_the_others_are_written
 @pytest.mark.parametrize(
     ("args", "kind", "message"),
     [
-        (["psd", "abacus"], ValueError, "no operation 'abacus' to profile; expected some of psd, line"),
+        (["psd", "abacus"], ValueError, "no operation 'abacus' to profile; expected some of servo, psd"),
         (["psd", "--device", "abacus"], NoDeviceError, "no device matches 'abacus'"),
     ],
 )

@@ -100,7 +100,7 @@ class Bound(Generic[R]):
         # total.
         self._wait: Callable[[Any], object] = device.wait if device.kind == "pocl" else cl.Event.wait
         self._empty = not all(launch.global_size)
-        self._shift = device.shift
+        self._team_slot = device.team_slot
         self.inputs = tuple(inputs) or self._new_inputs(launch.inputs)
         self.outputs = self.allocate()
         self._in_flight: collections.deque[tuple[Any, Any]] = collections.deque()
@@ -172,7 +172,8 @@ class Bound(Generic[R]):
             return
         try:
             self._team = self._new_team()
-            self._called_team = self._team if device.call_gains_by_team else None
+            # Intel's workers wake quickly: launches in the queue take no longer there.
+            self._called_team = self._team if device.inline_device is not None else None
         except cl.Error as error:
             self._raise(error)
 
@@ -261,25 +262,25 @@ class Bound(Generic[R]):
             self._wait(event)
 
     def _run_team(self, team: Team) -> None:
-        """Launch and wait, with the waiting workers if there are any; else they begin to wait if this gains."""
+        """Launch and wait, with the waiting workers if there are any; after two quick launches they begin to wait."""
         if team.waits:
             self._finish_queue()
             team.lead()
             return
-        gains = team.gains(PAUSE_NS)
+        follows = team.follows(PAUSE_NS)
         self._run_alone(self._own)
-        team.rest()
-        if gains:
+        team.note_launch()
+        if follows:
             team.start()
 
     def _call_team(self, team: Team) -> Any:
         """Launch with the waiting workers if the caller does nothing else between launches; return the event."""
-        gains = team.gains(BRIEF_PAUSE_NS)
-        if gains and team.waits:
+        follows = team.follows(BRIEF_PAUSE_NS)
+        if follows and team.waits:
             self._finish_queue()
             return team.lead()
         event = self._enqueue(self._own)
-        if gains:
+        if follows:
             team.start()
         return event
 
@@ -304,8 +305,8 @@ class Bound(Generic[R]):
             self._finish_queue()
         if given is not site.given:
             self._set_arrays(site, given)
-        if self._shift.team is not None:
-            self._shift.end()
+        if self._team_slot.team is not None:
+            self._team_slot.clear()
         event = cl.enqueue_nd_range_kernel(*site.arguments)
         if given is not self._own and not site.inline:
             self._hold(event, given)
@@ -330,7 +331,7 @@ class Bound(Generic[R]):
         if site.inline:
             cl.wait_for_events(wait_for)
             return cl.enqueue_nd_range_kernel(*site.arguments)
-        self._shift.end()
+        self._team_slot.clear()
         event = cl.enqueue_nd_range_kernel(*site.arguments, wait_for=wait_for)
         if given is not self._own:
             self._hold(event, given)
@@ -367,7 +368,7 @@ class Bound(Generic[R]):
     def _run_shared(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> Any:
         """Run in shared memory, wait, and return the event of the kernel: large arrays in place, others copied."""
         site, count = self._run_site, len(frames)
-        self._shift.end()
+        self._team_slot.clear()
         self.queue.finish()  # an earlier call may still read the inputs
         if site.given is not self._own:
             self._set_arrays(site, self._own)
@@ -487,8 +488,8 @@ class Bound(Generic[R]):
         member = self._site_on(device.new_queue(), waiting)
         for site in (leader, member):
             self._set_arrays(site, self._own)
-        patience = len(launch.inputs) + len(launch.outputs) + len(launch.arguments) + 1
-        return Team(self._shift, counters, leader.arguments, member.arguments, patience, core)
+        poll_limit = len(launch.inputs) + len(launch.outputs) + len(launch.arguments) + 1
+        return Team(self._team_slot, counters, leader.arguments, member.arguments, poll_limit, core)
 
     def _clear(self, array: DeviceArray) -> None:
         if self.device.shares_memory:

@@ -25,7 +25,7 @@ from gpuvision.host.huge_pages import advise_huge_pages
 from gpuvision.host.kept import clear_with
 from gpuvision.host.process import check_process
 from gpuvision.host.runtime import usable_cores
-from gpuvision.host.team import Shift, allows_teams
+from gpuvision.host.team import TeamSlot, allows_teams
 from gpuvision.host.text import printable, size_in_words
 from gpuvision.host.trace import active_trace
 
@@ -49,7 +49,7 @@ class _Connection:
 
     def __init__(self, context: Any, queue: Any, *, may_reopen: bool) -> None:
         self.context, self.queue = context, queue
-        self.shift = Shift()
+        self.team_slot = TeamSlot()
         self.may_reopen = may_reopen
 
 
@@ -287,20 +287,15 @@ class Device:
         _check_order(queue)
 
     @property
-    def shift(self) -> Shift:
-        """The team of workers that wait for a launch; see `gpuvision.host.team`."""
-        return self._connection.shift
+    def team_slot(self) -> TeamSlot:
+        """Slot for the team of workers that wait for a launch; see `gpuvision.host.team`."""
+        return self._connection.team_slot
 
     @property
     def has_teams(self) -> bool:
         """Whether the calling thread and waiting workers can share a launch, and each of them has a core."""
         has_cores = 1 < self.compute_units <= usable_cores()
         return has_cores and self.shares_memory and self.has_inline_queues and allows_teams()
-
-    @property
-    def call_gains_by_team(self) -> bool:
-        """Whether a launch by a team takes less time than one of some launches in the queue: on PoCL."""
-        return self.has_teams and self.inline_device is not None
 
     @property
     def pins_workers(self) -> bool:

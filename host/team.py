@@ -29,17 +29,17 @@ _ITEMS, _COLUMNS, _CORE, _MEMBERS, _TAKEN, _ENDED, _DISMISSED, _BEGUN = 0, 1, 2,
 _SIZE = 64
 _NO_CORE = 0xFFFFFFFF
 # Time for which workers wait for the next launch. Chosen: some times the time that waking a thread takes.
-_PATIENCE_NS = 150_000
+_WAITING_NS = 150_000
 # Workers begin to wait after two launches with a shorter pause between them: they would wait in vain otherwise.
 PAUSE_NS = 75_000
 # The same for launches that the caller does not wait for. In longer pauses the caller does other work, beside which the
 # workers should run. Chosen: the time that waking them takes.
 BRIEF_PAUSE_NS = 20_000
 # Launches of one team are shared for this time; then the workers end, so that kernels of other threads get their turn.
-# Chosen: a hundred launches or more, beside which the two launches until they wait again take little.
-_TENURE_NS = 10_000_000
-# The time of a look at the counters is measured in a trial of at least this duration: a launch takes 1 to 5 us.
-_TRIAL_NS, _MOST_LOOKS = 40_000, 1 << 22
+# Chosen: a hundred launches or more, beside which the launch or two until they wait again take little.
+_SHARING_NS = 10_000_000
+# The time of a poll of the counters is measured in a trial of at least this duration: a launch takes 1 to 5 us.
+_TRIAL_NS, _MOST_POLLS = 40_000, 1 << 22
 
 
 def allows_teams() -> bool:
@@ -69,10 +69,10 @@ def core_query() -> Callable[[], int] | None:
     return query
 
 
-class Shift:
-    """The team of a device whose workers wait, or begin to wait if its launch comes again soon.
+class TeamSlot:
+    """Slot of a device for the one team whose workers wait, or begin to wait if its launch comes again soon.
 
-    A device has one, because waiting workers do nothing else: a launch of another kind dismisses them.
+    A device has one slot, because waiting workers do nothing else: any other launch dismisses them.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Shift:
     def __init__(self) -> None:
         self.team: weakref.ref[Team] | None = None
 
-    def end(self) -> None:
+    def clear(self) -> None:
         """Dismiss the waiting workers, so that they run other launches."""
         team = None if self.team is None else self.team()
         self.team = None
@@ -95,14 +95,14 @@ class Team:
 
     Parameters
     ----------
-    shift : Shift
+    slot : TeamSlot
         Of the device.
     counters : pyopencl.array.Array
         As `new_counters` makes them.
     leader, member : tuple
         Arguments of `pyopencl.enqueue_nd_range_kernel` in the calling thread, and for the workers. The last argument of
-        the kernels is the patience.
-    patience : int
+        the kernels is their limit of polls.
+    poll_limit : int
         Index of this argument.
     core : callable, optional
         Function that returns the core of the calling thread, where the workers stay on their cores: the worker on the
@@ -111,14 +111,14 @@ class Team:
 
     def __init__(
         self,
-        shift: Shift,
+        slot: TeamSlot,
         counters: DeviceArray,
         leader: tuple[Any, ...],
         member: tuple[Any, ...],
-        patience: int,
+        poll_limit: int,
         core: Callable[[], int] | None,
     ) -> None:
-        self._shift, self._leader, self._member, self._core = shift, leader, member, core
+        self._slot, self._leader, self._member, self._core = slot, leader, member, core
         self._array, self._counters = counters, host_view(counters)
         self._reference = weakref.ref(self)
         self._is_started = False
@@ -126,22 +126,25 @@ class Team:
         self._events: list[Any] = []
         self._size = self._counters[_MEMBERS] = member[2][0]
         self._counters[_CORE] = _NO_CORE
-        member[1].set_arg(patience, np.uint32(self._looks(patience)))
-        leader[1].set_arg(patience, np.uint32(0))
+        member[1].set_arg(poll_limit, np.uint32(self._polls(poll_limit)))
+        leader[1].set_arg(poll_limit, np.uint32(0))
         weakref.finalize(self, _end, counters, self._events)
         _teams.add(self)
 
-    def _looks(self, patience: int) -> int:
-        """Return the looks at the counters that take `_PATIENCE_NS`, from trials in the calling thread."""
-        looks, taken, is_first = 1, 0, True
-        while is_first or (taken < _TRIAL_NS and looks < _MOST_LOOKS):
-            is_first = looks == 1  # a first launch takes longer
-            looks *= 4
-            self._leader[1].set_arg(patience, np.uint32(looks))
+    def _polls(self, poll_limit: int) -> int:
+        """Return the polls of the counters that take `_WAITING_NS`, from trials in the calling thread."""
+
+        def duration(polls: int) -> int:
+            self._leader[1].set_arg(poll_limit, np.uint32(polls))
             start = time.perf_counter_ns()
             cl.enqueue_nd_range_kernel(*self._leader).wait()
-            taken = time.perf_counter_ns() - start
-        return looks * _PATIENCE_NS // taken
+            return time.perf_counter_ns() - start
+
+        duration(1)  # a first launch takes longer
+        polls = 16
+        while (taken := duration(polls)) < _TRIAL_NS and polls < _MOST_POLLS:
+            polls *= 4
+        return polls * _WAITING_NS // taken
 
     @property
     def waits(self) -> bool:
@@ -158,19 +161,19 @@ class Team:
         self._idle_since = time.perf_counter_ns()
         return event
 
-    def gains(self, pause: int) -> bool:
+    def follows(self, pause: int) -> bool:
         """Return whether the last launch of the device was of this team, and ended less than `pause` ago [ns]."""
-        return self._shift.team is self._reference and time.perf_counter_ns() - self._idle_since < pause
+        return self._slot.team is self._reference and time.perf_counter_ns() - self._idle_since < pause
 
-    def rest(self) -> None:
+    def note_launch(self) -> None:
         """Note that a launch without the workers has ended."""
-        self._take_shift()
+        self._take_slot()
         self._idle_since = time.perf_counter_ns()
 
-    def _take_shift(self) -> None:
-        if self._shift.team is not self._reference:
-            self._shift.end()
-            self._shift.team = self._reference
+    def _take_slot(self) -> None:
+        if self._slot.team is not self._reference:
+            self._slot.clear()
+            self._slot.team = self._reference
 
     def start(self) -> None:
         """Let workers wait for the next launch.
@@ -181,14 +184,14 @@ class Team:
         if self._has_members or _is_real_time():
             return
         self._is_started = False  # until the workers are enqueued: this may fail
-        self._take_shift()
+        self._take_slot()
         self._counters[_CORE] = _NO_CORE if self._core is None else self._core()
         self._counters[_ENDED] = self._counters[_DISMISSED] = self._counters[_BEGUN] = 0
         self._events[:] = [cl.enqueue_nd_range_kernel(*self._member)]
         self._member[0].flush()
         self._is_started = True
         self._idle_since = time.perf_counter_ns()
-        self._ends = self._idle_since + _TENURE_NS
+        self._ends = self._idle_since + _SHARING_NS
 
     def dismiss(self) -> None:
         """Make waiting workers end."""
@@ -205,7 +208,7 @@ def _is_real_time() -> bool:
 
 
 def _end(counters: DeviceArray, events: list[Any]) -> None:
-    """Dismiss the members and wait for their end: they look at the counters, which must stay as long."""
+    """Dismiss the members and wait for their end: they poll the counters, which must stay as long."""
     if not is_forked():  # a forked process has no workers
         values: HostArray = host_view(counters)
         values[_DISMISSED] = 1

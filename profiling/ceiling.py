@@ -70,9 +70,9 @@ class Move(VisionOperation[Moved]):
 def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[[], None]:
     """Return a function that reads and writes memory sequentially, `repeats` times back to back, and waits.
 
-    The arguments `read` and `written` are numbers of bytes. The copy is the fastest of the forms of `mover`. Waiting
-    workers share its launches as they do those of operations. Its time is a lower limit for a kernel with the same
-    traffic in the same cache or memory; it includes the launch.
+    The arguments `read` and `written` are numbers of bytes. The copy is the fastest of the forms of `mover`. Its time
+    is a lower limit for a kernel with the same traffic in the same cache or memory. It includes the launch, which
+    waiting workers share (`gpuvision.host.team`), as launches of operations.
     """
     bound = mover(device, None, read, written)
 

@@ -3,7 +3,7 @@
 // Waking a worker thread takes longer than a short launch. In a launch by a team, workers have been started before it and
 // wait in the kernel: they are its members. The calling thread runs the kernel as the leader. All take work-items from one
 // counter until none is left. The leader then waits until all are done; members wait for the next launch, and end when
-// none comes while they look `patience` times, or when the host dismisses them. A leader without members does all work.
+// none comes in `poll_limit` polls, or when the host dismisses them. A leader without members does all work.
 //
 // Kernels that a team can run have TEAM_ARGUMENTS as their last arguments, and their work in FOR_EACH_ITEM(item) { ... },
 // which without TEAM runs once, for this work-item. `item` has the places of the work-item in two dimensions (uint2).
@@ -12,7 +12,7 @@
 #define TEAM_H
 
 #ifdef TEAM
-// Each counter that threads change is in a cache line of its own. In the order of Team in host/team.py.
+// Each counter that several threads change has its own cache line (64 bytes). host/team.py has the same offsets.
 typedef struct {
     uint items, columns;  // work-items of the launch; of them in the first dimension
     uint core, members;  // core of the calling thread (NO_CORE: not known) when the members were started; their number
@@ -27,13 +27,13 @@ typedef struct {
     uint rest[13];
 } Team;
 
-#define TEAM_ARGUMENTS , global Team *team, const uint patience
+#define TEAM_ARGUMENTS , global Team *team, const uint poll_limit
 #define ITEM_COLUMNS team->columns
 #define FOR_EACH_ITEM(item) \
-    for (uint2 item = first_item(team, patience); item.y != NO_ITEM; item = next_item(team, patience))
+    for (uint2 item = first_item(team, poll_limit); item.y != NO_ITEM; item = next_item(team, poll_limit))
 #define NO_ITEM 0xffffffffu
 #define NO_CORE 0xffffffffu
-#define LEADER 0  // `patience` of the calling thread
+#define LEADER 0  // `poll_limit` of the calling thread
 
 // Tell the processor that this thread waits in a loop: a thread on the same core gets more of it.
 #if __has_builtin(__builtin_ia32_pause)
@@ -42,7 +42,7 @@ typedef struct {
 #define PAUSE()
 #endif
 
-static inline uint look_at(global uint *counter) { return __atomic_load_n(counter, __ATOMIC_ACQUIRE); }
+static inline uint load_counter(global uint *counter) { return __atomic_load_n(counter, __ATOMIC_ACQUIRE); }
 
 // Take the next work-item; without one the result has y = NO_ITEM.
 static inline uint2 take_item(global Team *team) {
@@ -63,17 +63,17 @@ static inline uint core_number(void) {
 
 // Begin as a member. A member on the core of the calling thread would be in its way: return false for it, after all others
 // have begun, because a worker that ends takes the next work-item, and so the place of another worker.
-static inline int joins(global Team *team, uint patience) {
+static inline int joins(global Team *team, uint poll_limit) {
     __atomic_fetch_add(&team->begun, 1, __ATOMIC_ACQ_REL);
     if (team->core == NO_CORE || core_number() != team->core) return 1;
-    for (uint look = 0; look < patience && look_at(&team->begun) < team->members; look++) PAUSE();
+    for (uint poll = 0; poll < poll_limit && load_counter(&team->begun) < team->members; poll++) PAUSE();
     return 0;
 }
 
 // Wait as a member for a work-item of this launch or of the next one.
-static inline uint2 wait_for_item(global Team *team, uint patience) {
-    for (uint look = 0; look < patience && !look_at(&team->dismissed); look++) {
-        if (look_at(&team->taken) < team->items) {
+static inline uint2 wait_for_item(global Team *team, uint poll_limit) {
+    for (uint poll = 0; poll < poll_limit && !load_counter(&team->dismissed); poll++) {
+        if (load_counter(&team->taken) < team->items) {
             const uint2 item = take_item(team);
             if (item.y != NO_ITEM) return item;
         }
@@ -83,18 +83,18 @@ static inline uint2 wait_for_item(global Team *team, uint patience) {
     return (uint2)NO_ITEM;
 }
 
-static inline uint2 first_item(global Team *team, uint patience) {
-    if (patience != LEADER) return wait_for_item(team, joins(team, patience) ? patience : 0);
+static inline uint2 first_item(global Team *team, uint poll_limit) {
+    if (poll_limit != LEADER) return wait_for_item(team, joins(team, poll_limit) ? poll_limit : 0);
     __atomic_store_n(&team->done, 0, __ATOMIC_RELAXED);
     __atomic_store_n(&team->taken, 0, __ATOMIC_RELEASE);  // from here on members take work-items
     return take_item(team);
 }
 
-static inline uint2 next_item(global Team *team, uint patience) {
+static inline uint2 next_item(global Team *team, uint poll_limit) {
     __atomic_fetch_add(&team->done, 1, __ATOMIC_ACQ_REL);
-    if (patience != LEADER) return wait_for_item(team, patience);
+    if (poll_limit != LEADER) return wait_for_item(team, poll_limit);
     const uint2 item = take_item(team);
-    while (item.y == NO_ITEM && look_at(&team->done) < team->items) PAUSE();
+    while (item.y == NO_ITEM && load_counter(&team->done) < team->items) PAUSE();
     return item;
 }
 #else

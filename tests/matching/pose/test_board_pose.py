@@ -254,7 +254,7 @@ def test_two_rows_of_a_line_do_not_check_each_other(device: Device, variant: Any
     refused = fix(image, *placed, device=device)
     assert refused.status == Status.AMBIGUOUS
     assert np.isnan(refused.pose).all()
-    # No other limit refuses the pose: each row has two other rows that check it, but one of them is of its own line.
+    # Without the limit of leverage the pose is accepted. Two rows check each row, but one of them is of the same line.
     lenient = operation(variant, max_trials=256, max_leverage=1.0)
     found = lenient(image, *placed, device=device)
     assert found.status == Status.OK

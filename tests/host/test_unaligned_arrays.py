@@ -29,8 +29,8 @@ OPERATIONS = (
         "OccludedIrradiance",
     ),
     *("PatchLight", "PlaceFeatures", "PsdReadout", "RangeImage", "Reflectance", "RenderBoard", "RulerEdges"),
-    *("SolveFeatures", "SolvePose", "Triangulation", "UndistortImage", "UndistortPoints", "VisibleIntervals"),
-    *("_AlongProfiles", "_AlongSamples", "_SelectLights"),
+    *("SolveBoardLines", "SolveFeatures", "SolvePose", "Triangulation"),
+    *("UndistortImage", "UndistortPoints", "VisibleIntervals", "_AlongProfiles", "_AlongSamples", "_SelectLights"),
 )
 # Alignment of the memory of aligned and of unaligned arrays [bytes]: more than a vector of 16 doubles.
 _ALIGNMENT = 256

@@ -13,8 +13,9 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array
 
+from gpuvision.host.argument_table import ArgumentTable, NoAddressError, address_of, have_addresses
 from gpuvision.host.array_checks import check_apart, check_on_device, same_memory
-from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
+from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, launch_memory, memory_of
 from gpuvision.host.build_notice import building
 from gpuvision.host.constant_memory import fitting_defines
 from gpuvision.host.device import Device
@@ -23,7 +24,7 @@ from gpuvision.host.failure import launch_failure
 from gpuvision.host.launch import Launch, Launchable, Spec, describe_launch
 from gpuvision.host.limits import fit_work
 from gpuvision.host.process import after_fork, check_process
-from gpuvision.host.program import build
+from gpuvision.host.program import build, can_read_table
 from gpuvision.host.team import BRIEF_PAUSE_NS, PAUSE_NS, Team, core_query, new_counters
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -61,6 +62,8 @@ class _Site:
         Arguments of the last launch.
     inline : bool
         Whether kernels run in the calling thread and are complete when enqueued.
+    table : ArgumentTable or None
+        Table from which the kernel reads its arguments; None: they are arguments of the kernel.
     """
 
     queue: Any
@@ -68,6 +71,14 @@ class _Site:
     arguments: tuple[Any, Any, tuple[int, ...], tuple[int, ...] | None]
     given: tuple[Any, ...]
     inline: bool
+    table: ArgumentTable | None
+
+    def set_array(self, place: int, array: Any) -> None:
+        """Set an argument of the kernel: a memory object; for a table, an address."""
+        if self.table is None:
+            self.kernel.set_arg(place, array)
+        else:
+            self.table.addresses[place] = array
 
 
 class Bound(Generic[R]):
@@ -113,6 +124,7 @@ class Bound(Generic[R]):
         self._copied_bytes = 0 if inputs else sys.maxsize if device.kind == "intel" else _COPIED_BYTES
         self._array_specs = (*launch.inputs, *self._computed_specs.values())
         self._inline_site: _Site | None = None
+        self._site_beside_queue: _Site | None = None  # the inline site, where the queue is not inline itself
         self._team: Team | None = None  # of launches that the caller waits for
         self._called_team: Team | None = None  # of others
         self._calls_inline = False  # whether a call that does not wait uses the inline site
@@ -135,13 +147,14 @@ class Bound(Generic[R]):
     def _connect(self, launch: Launch) -> None:
         """Upload the tables, and build the kernel for calls that run inline."""
         device = self.device
+        self._has_tables = self._can_use_tables(launch)
         self._tables = [self._upload(each) for each in launch.arguments if isinstance(each, np.ndarray)]
-        # Intel's runtime searches for the allocation of an SVM pointer at every launch, but not for the allocation of a
-        # buffer.
-        known = self._own if device.kind == "intel" and device.shares_memory else ()
-        self._known = {id(each): _buffer_over(device.context, each) for each in known}
+        known = self._own if device.kind == "intel" else ()
+        self._known = {id(each): launch_memory(device, each) for each in known}
         self._queue_is_inline = device.is_inline(self.queue)
         self._finish_queue = self.queue.finish
+        if self._queue_is_inline and self._has_tables:
+            self._inline_site, self._calls_inline = self._site_on(self.queue, in_table=True), True
         if self._queue_is_inline or not launch.passes_once or launch.inline is False:
             return
         is_short = launch.nbytes <= (_SHORT_BYTES if launch.inline is None else MAX_INLINE_BYTES)
@@ -149,7 +162,17 @@ class Bound(Generic[R]):
         self._calls_inline = is_short and call_gains and device.has_inline_queues
         if self._calls_inline or (launch.streams and launch.nbytes <= _SHORT_RUN_BYTES):
             inline_queue = device.inline_queue(self.queue)
-            self._inline_site = None if inline_queue is None else self._site_on(inline_queue)
+            self._inline_site = None if inline_queue is None else self._site_on(inline_queue, in_table=self._has_tables)
+            self._site_beside_queue = self._inline_site
+
+    def _can_use_tables(self, launch: Launch) -> bool:
+        """Return whether kernels in the calling thread read their arguments from a table."""
+        operation, device = self.operation, self.device
+        if operation.kernel_folder is None or not device.shares_memory or "VECTOR_VARIANT" not in launch.defines:
+            return False
+        folders = tuple(operation.include_folders)
+        is_plain = can_read_table(operation.kernel_folder, launch.source, folders, launch.kernel)
+        return is_plain and have_addresses(self._own)
 
     @functools.cached_property
     def _queue_site(self) -> _Site:
@@ -158,7 +181,7 @@ class Bound(Generic[R]):
 
     def prepare_queue(self) -> None:
         """Build the kernel for the queue and launch it once, so that no later call compiles."""
-        if self._inline_site is not None and not self._empty:
+        if self._site_beside_queue is not None and not self._empty:
             try:
                 self._set_arrays(self._queue_site, self._own)
                 cl.enqueue_nd_range_kernel(*self._queue_site.arguments).wait()
@@ -301,15 +324,17 @@ class Bound(Generic[R]):
         if wait_for or self._empty:
             return self._enqueue_after(given, wait_for or ())
         site = self._run_site if waits else self._call_site
-        if site is self._inline_site:
+        if site is self._site_beside_queue:
             self._finish_queue()
         if given is not site.given:
-            self._set_arrays(site, given)
+            site = self._site_with(given, site)
         if self._team_slot.team is not None:
             self._team_slot.clear()
         event = cl.enqueue_nd_range_kernel(*site.arguments)
         if given is not self._own and not site.inline:
             self._hold(event, given)
+            if waits:
+                self._wait(event)
         return event
 
     def _enqueue_after(self, given: tuple[Any, ...], wait_for: Sequence[Any]) -> Any:
@@ -319,12 +344,12 @@ class Bound(Generic[R]):
         event of the other.
         """
         site = self._call_site
-        if site is self._inline_site and are_complete(wait_for):
+        if site is self._site_beside_queue and are_complete(wait_for):
             self._finish_queue()
-        elif site is self._inline_site:
+        elif site is self._site_beside_queue:
             site = self._queue_site
         if given is not site.given:
-            self._set_arrays(site, given)
+            site = self._site_with(given, site)
         flush_queues(wait_for, self.queue)
         if self._empty:
             return cl.enqueue_marker(self.queue, wait_for=wait_for)
@@ -375,28 +400,37 @@ class Bound(Generic[R]):
         for own, frame in zip(self.inputs, frames, strict=True):
             if 0 < frame.nbytes <= self._copied_bytes:
                 host_view(own)[...] = frame
-        memory = {
-            number: self._buffer_in_place(array, is_input=number < count)
-            for number, array in enumerate((*frames, *targets))
-            if array.nbytes > self._copied_bytes
+        in_place = {
+            number: array for number, array in enumerate((*frames, *targets)) if array.nbytes > self._copied_bytes
         }
-        site.given = tuple([None if number in memory else array for number, array in enumerate(self._own)])
-        for number, buffer in memory.items():
-            site.kernel.set_arg(self._places[number], buffer)
-        event = cl.enqueue_nd_range_kernel(*site.arguments)
-        for number, array in enumerate(targets, count):
-            if number in memory:
-                # Mapping makes the kernel's writes visible to the host; the address stays the same.
-                mapped, _ = cl.enqueue_map_buffer(
-                    site.queue, memory[number], cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=False
-                )
-                mapped.base.release(site.queue)
+        site.given = tuple([None if number in in_place else array for number, array in enumerate(self._own)])
+        if site.table is not None:
+            for number, array in in_place.items():
+                site.set_array(self._places[number], address_of(array))
+            event = cl.enqueue_nd_range_kernel(*site.arguments)
+        else:
+            event = self._launch_in_buffers(site, in_place, count)
         site.queue.finish()
         # Replace the temporary buffers before they are freed: kernel arguments must never dangle.
         self._set_arrays(site, self._own)
         for own, target in zip(self._own_outputs, targets, strict=True):
             if 0 < target.nbytes <= self._copied_bytes:
                 target[...] = host_view(own)
+        return event
+
+    def _launch_in_buffers(self, site: _Site, in_place: Mapping[int, HostArray], inputs: int) -> Any:
+        """Launch with temporary buffers over NumPy arrays, by their number among all arrays; return the event."""
+        buffers = {number: self._buffer_in_place(array, is_input=number < inputs) for number, array in in_place.items()}
+        for number, buffer in buffers.items():
+            site.set_array(self._places[number], buffer)
+        event = cl.enqueue_nd_range_kernel(*site.arguments)
+        for number, array in in_place.items():
+            if number >= inputs:
+                # Mapping makes the kernel's writes visible to the host; the address stays the same.
+                mapped, _ = cl.enqueue_map_buffer(
+                    site.queue, buffers[number], cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=False
+                )
+                mapped.base.release(site.queue)
         return event
 
     def _buffer_in_place(self, array: HostArray, *, is_input: bool) -> Any:
@@ -439,12 +473,21 @@ class Bound(Generic[R]):
         result: R = self.operation.Result(**{name: arrays.get(name) for name in self.operation.Result._fields})
         return result
 
+    def _site_with(self, given: tuple[Any, ...], site: _Site) -> _Site:
+        """Set the arrays of a launch at a site and return it; the queue's site, where an array has no known address."""
+        try:
+            self._set_arrays(site, given)
+        except NoAddressError:
+            site = self._queue_site
+            self._set_arrays(site, given)
+        return site
+
     def _set_arrays(self, site: _Site, given: tuple[Any, ...]) -> None:
         """Set the arrays that the last launch at a site did not have as arguments of its kernel, after all checks."""
         if len(given) != len(self._array_specs):
             raise self._wrong_count(len(given) - len(self._array_specs) + len(self.inputs))
-        context, known = self.device.context, self._known
-        changed = []
+        context, known, in_table = self.device.context, self._known, site.table is not None
+        changed: list[tuple[int, Any]] = []
         for array, before, place, (shape, dtype) in zip(
             given, site.given, self._places, self._array_specs, strict=True
         ):
@@ -453,14 +496,14 @@ class Bound(Generic[R]):
                 is_array = isinstance(array, cl.array.Array)
                 if not is_array or array.dtype != dtype or array.shape != shape or array.context != context:
                     check_on_device(array, shape, dtype, self.device)
-                changed.append((place, known.get(id(array)) or memory_of(array)))
+                changed.append((place, address_of(array) if in_table else known.get(id(array)) or memory_of(array)))
         # A memory object is repeated for three reasons: the same input twice and empty arrays are allowed, an output
         # that shares memory with another array is refused. Without a repetition the comparison of arrays is skipped.
         if changed and len({id(array.base_data) for array in given}) < len(given):
             inputs = len(self.inputs)
             check_apart(given[:inputs], given[inputs:], same_memory)
         for place, memory in changed:
-            site.kernel.set_arg(place, memory)
+            site.set_array(place, memory)
         site.given = given
 
     def _wrong_count(self, given: int) -> TypeError:
@@ -474,22 +517,21 @@ class Bound(Generic[R]):
 
     def _new_team(self) -> Team:
         launch, device = self._launch, self.device
-        counters = new_counters(device, launch.global_size)
+        counters = new_counters(device, launch.global_size, device.compute_units)
         core = core_query() if device.pins_workers else None
         leading = replace(
             launch,
             global_size=(1,),
             local_size=(1,),
             defines={**launch.defines, "TEAM": None},
-            arguments=(*launch.arguments, memory_of(counters), np.uint32(0)),
         )
         waiting = replace(leading, global_size=(device.compute_units - (core is None),))
-        leader = self._site_on(device.inline_queue(self.queue), leading)
-        member = self._site_on(device.new_queue(), waiting)
+        leader = self._site_on(device.inline_queue(self.queue), leading, in_table=self._has_tables)
+        member = self._site_on(device.new_queue(), waiting, in_table=self._has_tables)
         for site in (leader, member):
             self._set_arrays(site, self._own)
-        poll_limit = len(launch.inputs) + len(launch.outputs) + len(launch.arguments) + 1
-        return Team(self._team_slot, counters, leader.arguments, member.arguments, poll_limit, core)
+        used = (leader, member, self._own)
+        return Team(self._team_slot, counters, leader.arguments, member.arguments, used, core)
 
     def _clear(self, array: DeviceArray) -> None:
         if self.device.shares_memory:
@@ -497,7 +539,7 @@ class Bound(Generic[R]):
         elif array.nbytes:
             cl.enqueue_fill_buffer(self.queue, memory_of(array), np.zeros(1, np.uint8), 0, array.nbytes)
 
-    def _site_on(self, queue: Any, launch: Launch | None = None) -> _Site:
+    def _site_on(self, queue: Any, launch: Launch | None = None, *, in_table: bool = False) -> _Site:
         """Build the kernel for the device of a queue and set the arguments that calls do not change."""
         launch, operation = launch or self._launch, self.operation
         if operation.kernel_folder is None:
@@ -510,21 +552,31 @@ class Bound(Generic[R]):
                 fitting_defines(launch, queue.device, operation.kernel_folder, operation.include_folders),
                 include_folders=operation.include_folders,
                 handle=queue.device,
+                in_table=launch.kernel if in_table else None,
             )
             kernel = cl.Kernel(program, launch.kernel)
         name = type(operation).__name__
         size = fit_work(kernel, queue.device, launch, name=name, label=self.device.label)
-        after_inputs = len(launch.inputs)
-        after_outputs = after_inputs + len(launch.outputs)
-        for place, spec in enumerate(launch.outputs.values(), after_inputs):
-            if spec is None:
-                kernel.set_arg(place, None)
         tables = iter(self._tables)
-        for place, value in enumerate(launch.arguments, after_outputs):
-            kernel.set_arg(place, next(tables) if isinstance(value, np.ndarray) else value)
-        return _Site(queue, kernel, (queue, kernel, *size), (None,) * len(self._own), self.device.is_inline(queue))
+        others = [next(tables) if isinstance(value, np.ndarray) else value for value in launch.arguments]
+        count = len(launch.inputs) + len(launch.outputs)
+        table = ArgumentTable(self.device, count, others) if in_table else None
+        if table is not None:
+            kernel.set_arg(0, table.memory)
+        else:
+            for place, spec in enumerate(launch.outputs.values(), len(launch.inputs)):
+                if spec is None:
+                    kernel.set_arg(place, None)
+            for place, value in enumerate(others, count):
+                kernel.set_arg(place, memory_of(value) if isinstance(value, cl.array.Array) else value)
+        arguments, nothing = (queue, kernel, *size), (None,) * len(self._own)
+        return _Site(queue, kernel, arguments, nothing, self.device.is_inline(queue), table)
 
     def _upload(self, table: HostArray) -> Any:
+        if self._has_tables:
+            array = self.device.empty(table.shape, table.dtype)
+            host_view(array)[...] = table
+            return array
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
         return cl.Buffer(self.device.context, flags, hostbuf=np.ascontiguousarray(table))
 
@@ -534,12 +586,6 @@ class Bound(Generic[R]):
         while flight and flight[0][0].command_execution_status <= COMPLETE:
             flight.popleft()
         flight.append((event, given))
-
-
-def _buffer_over(context: Any, array: DeviceArray) -> Any:
-    """Return a buffer over the shared memory of an array."""
-    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
-    return cl.Buffer(context, flags, hostbuf=host_view(array)) if array.nbytes else None
 
 
 def _refuse_calls() -> None:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gpuvision.host.argument_table import with_argument_table
 from gpuvision.host.arrays import DeviceArray, HostArray, to_numpy
 
 VARIABLE = "GPUVISION_DEBUG"
@@ -137,7 +138,14 @@ class _Flattener:
 
 
 def dump_program(
-    handle: Any, folder: Path, source: str, options: Sequence[str], include_folders: Sequence[Path], log: str
+    handle: Any,
+    folder: Path,
+    source: str,
+    options: Sequence[str],
+    include_folders: Sequence[Path],
+    log: str,
+    *,
+    in_table: str | None = None,
 ) -> Path | None:
     """Write a program as one file that compiles alone, and return its path; None where no debug folder is set.
 
@@ -151,10 +159,15 @@ def dump_program(
         Build options, macros (``-DNAME`` or ``-DNAME=VALUE``) among them.
     log : str
         Build log.
+    in_table : str, optional
+        Name of a kernel that reads its arguments from a table, see `gpuvision.host.argument_table`.
     """
     target = debug_folder()
     if target is None:
         return None
+    program = flatten_includes(folder, source, include_folders)
+    if in_table is not None:
+        program = with_argument_table(program, in_table)
     macros = [option.removeprefix("-D").partition("=") for option in options if option.startswith("-D")]
     text = "".join(
         [
@@ -163,7 +176,7 @@ def dump_program(
             f"// build options: {' '.join(options)}\n",
             # A compiler defines a macro without a value as 1.
             *(f"#define {name} {value if has_value else 1}\n" for name, has_value, value in macros),
-            flatten_includes(folder, source, include_folders),
+            program,
         ]
     )
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]

@@ -13,6 +13,7 @@ from typing import Any
 
 import pyopencl as cl
 
+from gpuvision.host.argument_table import takes_table, with_argument_table
 from gpuvision.host.debug import debug_folder, dump_program, flatten_includes
 from gpuvision.host.device import Device
 from gpuvision.host.errors import BuildError
@@ -42,6 +43,7 @@ def build(
     *,
     include_folders: Sequence[Path] = (),
     handle: Any = None,
+    in_table: str | None = None,
 ) -> Any:
     """Return the program of a kernel file for a device; build it on the first call.
 
@@ -58,6 +60,8 @@ def build(
         More folders that are searched for headers, after `folder`.
     handle : pyopencl.Device, optional
         Device of the context to build for; ``device.handle`` by default.
+    in_table : str, optional
+        Name of a kernel that reads its arguments from a table, see `gpuvision.host.argument_table`.
 
     Returns
     -------
@@ -74,7 +78,7 @@ def build(
     `gpuvision.host.debug`.
     """
     handle = device.handle if handle is None else handle
-    return _build(device.context, handle, folder, source, tuple(options(defines)), tuple(include_folders))
+    return _build(device.context, handle, folder, source, tuple(options(defines)), tuple(include_folders), in_table)
 
 
 @functools.cache
@@ -90,19 +94,38 @@ def sources_digest(folder: Path) -> str:
     return digest.hexdigest()[:16]
 
 
+@functools.cache
+def can_read_table(folder: Path, source: str, include_folders: tuple[Path, ...], kernel: str) -> bool:
+    """Return whether a kernel can be built to read its arguments from a table (`in_table` of `build`)."""
+    return takes_table(_text(folder, source, include_folders), kernel)
+
+
+def _text(folder: Path, source: str, include_folders: tuple[Path, ...]) -> str:
+    """Return a kernel file with its headers, without comments."""
+    return _COMMENT.sub("", flatten_includes(folder, source, include_folders))
+
+
 @functools.lru_cache(maxsize=256)
 def _build(
-    context: Any, handle: Any, folder: Path, source: str, words: tuple[str, ...], include_folders: tuple[Path, ...]
+    context: Any,
+    handle: Any,
+    folder: Path,
+    source: str,
+    words: tuple[str, ...],
+    include_folders: tuple[Path, ...],
+    in_table: str | None,
 ) -> Any:
     # The compilers' caches know a program by its text and options. With the headers in the text, no comments in it and
     # no path in the options, all copies of the kernels (checkouts, an installed package) share the cached programs, and
     # a changed comment needs no compilation. The #include line of a header that is not in these folders stays in the
     # text: the compiler searches its include path for the header, and reports an error if it finds none.
-    text = _COMMENT.sub("", flatten_includes(folder, source, include_folders))
+    text = _text(folder, source, include_folders)
+    if in_table is not None:
+        text = with_argument_table(text, in_table)
     folders = (folder, *include_folders) if "#include" in text else ()
     includes = [word for each in folders for word in ("-I", os.fspath(each))]
     program = cl.Program(context, text)
-    dump = functools.partial(dump_program, handle, folder, source, words, include_folders)
+    dump = functools.partial(dump_program, handle, folder, source, words, include_folders, in_table=in_table)
     try:
         with warnings.catch_warnings():
             # The CPU runtimes report success ("Device ... successfully vectorised") as compiler output.
@@ -120,5 +143,6 @@ def _build(
     return built
 
 
+clear_with(can_read_table.cache_clear)
 clear_with(_build.cache_clear)
 clear_with(sources_digest.cache_clear)

@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from gpuvision.host.arrays import DeviceArray, HostArray, host_view
+from gpuvision.host.arrays import DeviceArray, HostArray, host_view, memory_of
 from gpuvision.host.process import before_fork, is_forked
 
 VARIABLE = "GPUVISION_TEAMS"
 # Places of the counters, in the order of Team in kernels/common/team.h.
-_ITEMS, _COLUMNS, _CORE, _MEMBERS, _TAKEN, _ENDED, _DISMISSED, _BEGUN = 0, 1, 2, 3, 16, 48, 49, 50
-_SIZE = 64
+_COLUMNS, _SHARES, _ITEMS, _CORE, _MEMBERS, _ENDED, _DISMISSED, _BEGUN, _JOINED = 0, 1, 2, 3, 4, 32, 33, 34, 35
+_HEAD, _SHARE = 48, 16  # words of Team without its shares, and of a share
 _NO_CORE = 0xFFFFFFFF
 # Time for which workers wait for the next launch. Chosen: some times the time that waking a thread takes.
 _WAITING_NS = 150_000
@@ -47,13 +47,15 @@ def allows_teams() -> bool:
     return os.environ.get(VARIABLE) != "off"
 
 
-def new_counters(device: Any, size: tuple[int, ...]) -> DeviceArray:
-    """Return the counters of a team for a launch of a global size in one or two dimensions."""
-    counters: DeviceArray = device.empty((_SIZE,), np.uint32)
+def new_counters(device: Any, size: tuple[int, ...], threads: int) -> DeviceArray:
+    """Return the counters of a team of some threads for a launch of a global size in one or two dimensions."""
+    counters: DeviceArray = device.empty((_HEAD + threads * _SHARE,), np.uint32)
     values = host_view(counters)
     values[:] = 0
-    values[_ITEMS] = values[_TAKEN] = math.prod(size)
-    values[_COLUMNS] = size[0]
+    values[[_COLUMNS, _SHARES, _ITEMS]] = size[0], threads, math.prod(size)
+    begin = np.arange(threads + 1) * math.prod(size) // threads
+    shares = values[_HEAD:].reshape(threads, _SHARE)
+    shares[:, 0], shares[:, 1], shares[:, 2] = begin[1:], begin[:-1], begin[1:]
     return counters
 
 
@@ -100,10 +102,10 @@ class Team:
     counters : pyopencl.array.Array
         As `new_counters` makes them.
     leader, member : tuple
-        Arguments of `pyopencl.enqueue_nd_range_kernel` in the calling thread, and for the workers. The last argument of
-        the kernels is their limit of polls.
-    poll_limit : int
-        Index of this argument.
+        Arguments of `pyopencl.enqueue_nd_range_kernel` in the calling thread, and for the workers. The last two
+        arguments of the kernels are the counters and the limit of polls.
+    used : object
+        Memory that the kernels use: it is referenced until the workers have ended.
     core : callable, optional
         Function that returns the core of the calling thread, where the workers stay on their cores: the worker on the
         core of the caller ends at once. ``None``: the operating system finds free cores for all workers.
@@ -115,7 +117,7 @@ class Team:
         counters: DeviceArray,
         leader: tuple[Any, ...],
         member: tuple[Any, ...],
-        poll_limit: int,
+        used: object,
         core: Callable[[], int] | None,
     ) -> None:
         self._slot, self._leader, self._member, self._core = slot, leader, member, core
@@ -126,16 +128,18 @@ class Team:
         self._events: list[Any] = []
         self._size = self._counters[_MEMBERS] = member[2][0]
         self._counters[_CORE] = _NO_CORE
-        member[1].set_arg(poll_limit, np.uint32(self._polls(poll_limit)))
-        leader[1].set_arg(poll_limit, np.uint32(0))
-        weakref.finalize(self, _end, counters, self._events)
+        for kernel in (leader[1], member[1]):
+            kernel.set_arg(kernel.num_args - 2, memory_of(counters))
+        _set_poll_limit(member[1], self._polls())
+        _set_poll_limit(leader[1], 0)
+        weakref.finalize(self, _end, counters, self._events, used)
         _teams.add(self)
 
-    def _polls(self, poll_limit: int) -> int:
+    def _polls(self) -> int:
         """Return the polls of the counters that take `_WAITING_NS`, from trials in the calling thread."""
 
         def duration(polls: int) -> int:
-            self._leader[1].set_arg(poll_limit, np.uint32(polls))
+            _set_poll_limit(self._leader[1], polls)
             start = time.perf_counter_ns()
             cl.enqueue_nd_range_kernel(*self._leader).wait()
             return time.perf_counter_ns() - start
@@ -186,7 +190,7 @@ class Team:
         self._is_started = False  # until the workers are enqueued: this may fail
         self._take_slot()
         self._counters[_CORE] = _NO_CORE if self._core is None else self._core()
-        self._counters[_ENDED] = self._counters[_DISMISSED] = self._counters[_BEGUN] = 0
+        self._counters[_ENDED] = self._counters[_DISMISSED] = self._counters[_BEGUN] = self._counters[_JOINED] = 0
         self._events[:] = [cl.enqueue_nd_range_kernel(*self._member)]
         self._member[0].flush()
         self._is_started = True
@@ -202,12 +206,16 @@ class Team:
         _end(self._array, self._events)
 
 
+def _set_poll_limit(kernel: Any, polls: int) -> None:
+    kernel.set_arg(kernel.num_args - 1, np.uint32(polls))
+
+
 def _is_real_time() -> bool:
     """Return whether ordinary threads do not get the core of the calling thread while it runs."""
     return hasattr(os, "sched_getscheduler") and os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR)
 
 
-def _end(counters: DeviceArray, events: list[Any]) -> None:
+def _end(counters: DeviceArray, events: list[Any], _used: object = None) -> None:
     """Dismiss the members and wait for their end: they poll the counters, which must stay as long."""
     if not is_forked():  # a forked process has no workers
         values: HostArray = host_view(counters)

@@ -36,7 +36,9 @@ def cases(device: Device) -> Iterator[Case]:
         dict(enumerate(memory_of(array) for array in (frame, *result) if isinstance(array, cl.array.Array)))
         for frame, result in zip(frames, results, strict=True)
     ]
-    queue, kernel, *sizes = bound.enqueue_arguments
+    site = bound._site_on(bound.enqueue_arguments[0])  # where arrays and numbers are arguments of the kernel
+    bound._set_arrays(site, bound._own)
+    queue, kernel, *sizes = site.arguments
     calls: dict[str, tuple[Callable[[int], object], list[dict[int, Any]]]] = {
         "bound": (lambda _: bound(), [{}, {}]),
         "given": (lambda number: bound(frames[number]), inputs),

@@ -24,24 +24,19 @@
 #include "occluded_irradiance/lit_pairs.h"
 #endif
 
-#ifdef SELECTED
-#define SEGMENT_LISTS global const int *restrict starts, global const int *restrict selected,
-#else
-#define SEGMENT_LISTS
-#endif
-#ifdef CONVEX_PARTS
-#define PARTS global const real *restrict parts,
-#else
-#define PARTS
-#endif
-
 #ifdef VECTOR_VARIANT
 AS_IT_IS kernel void occluded_irradiance(
     global const INPUT *restrict receivers, global const INPUT *restrict weights, global const INPUT *restrict segments,
-    SEGMENT_LISTS global real *restrict irradiance, global real *restrict left, global real *restrict right,
+#ifdef SELECTED
+    global const int *restrict starts, global const int *restrict selected,
+#endif
+    global real *restrict irradiance, global real *restrict left, global real *restrict right,
     global uchar *restrict status, global const real *nodes, global const int *children, global const int *axes,
-    global const real *leaves, global const int *triangles, PARTS constant place *middle, const real clearance,
-    const uint samples, const uint each, const uint segment_count, const uint pick_count, const uint strips TEAM_ARGUMENTS
+    global const real *leaves, global const int *triangles,
+#ifdef CONVEX_PARTS
+    global const real *restrict parts,
+#endif
+    constant place *middle, const real clearance, const uint samples, const uint each, const uint segment_count, const uint pick_count, const uint strips TEAM_ARGUMENTS
 ) {
     bvh_tree tree = {nodes, children, axes, leaves, triangles};
 #ifdef CONVEX_PARTS
@@ -100,7 +95,10 @@ AS_IT_IS kernel void occluded_irradiance(
 #else
 kernel void occluded_irradiance(
     global const INPUT *restrict receivers, global const INPUT *restrict weights, global const INPUT *restrict segments,
-    SEGMENT_LISTS global real *restrict irradiance, global real *restrict left, global real *restrict right,
+#ifdef SELECTED
+    global const int *restrict starts, global const int *restrict selected,
+#endif
+    global real *restrict irradiance, global real *restrict left, global real *restrict right,
     global uchar *restrict status, global const real *nodes, global const int *children, global const int *axes,
     global const real *leaves, global const int *triangles, constant place *middle, const real clearance,
     const uint samples, const uint each, const uint segment_count, const uint pick_count, const uint strips

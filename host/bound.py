@@ -6,25 +6,22 @@ import collections
 import functools
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Generic, NoReturn, TypeVar
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.array
 
-from gpuvision.host.argument_table import ArgumentTable, NoAddressError, address_of, have_addresses
+from gpuvision.host.argument_table import NoAddressError, address_of
 from gpuvision.host.array_checks import check_apart, check_on_device, same_memory
 from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, launch_memory, memory_of
-from gpuvision.host.build_notice import building
-from gpuvision.host.constant_memory import fitting_defines
 from gpuvision.host.device import Device
 from gpuvision.host.events import COMPLETE, are_complete, flush_queues
 from gpuvision.host.failure import launch_failure
 from gpuvision.host.launch import Launch, Launchable, Spec, describe_launch
-from gpuvision.host.limits import fit_work
 from gpuvision.host.process import after_fork, check_process
-from gpuvision.host.program import build, can_read_table
+from gpuvision.host.site import Site, can_use_table, new_site, upload_tables
 from gpuvision.host.team import BRIEF_PAUSE_NS, PAUSE_NS, Team, core_query, new_counters
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -44,41 +41,6 @@ _COPIED_BYTES = 64 << 10
 # Limit for launches whose tuned settings ask for the calling thread (`Launch.inline`). Chosen: half the bytes of the
 # default batch of a stream, because the host work of a stream should overlap with the kernels.
 MAX_INLINE_BYTES = 2 << 20
-
-
-@dataclass(slots=True, eq=False)
-class _Site:
-    """Queue and kernel of a bound operation, with the arrays that are set as the kernel's arguments.
-
-    The arrays stay referenced, because a runtime may abort the process when a kernel uses a freed buffer.
-
-    Attributes
-    ----------
-    queue : pyopencl.CommandQueue
-    kernel : pyopencl.Kernel
-    arguments : tuple
-        Arguments of `pyopencl.enqueue_nd_range_kernel`: queue, kernel, global size, local size.
-    given : tuple of arrays
-        Arguments of the last launch.
-    inline : bool
-        Whether kernels run in the calling thread and are complete when enqueued.
-    table : ArgumentTable or None
-        Table from which the kernel reads its arguments; None: they are arguments of the kernel.
-    """
-
-    queue: Any
-    kernel: Any
-    arguments: tuple[Any, Any, tuple[int, ...], tuple[int, ...] | None]
-    given: tuple[Any, ...]
-    inline: bool
-    table: ArgumentTable | None
-
-    def set_array(self, place: int, array: Any) -> None:
-        """Set an argument of the kernel: a memory object; for a table, an address."""
-        if self.table is None:
-            self.kernel.set_arg(place, array)
-        else:
-            self.table.addresses[place] = array
 
 
 class Bound(Generic[R]):
@@ -123,8 +85,8 @@ class Bound(Generic[R]):
         # Largest NumPy array that calls copy [bytes]; none, where `inputs` are arrays of the caller.
         self._copied_bytes = 0 if inputs else sys.maxsize if device.kind == "intel" else _COPIED_BYTES
         self._array_specs = (*launch.inputs, *self._computed_specs.values())
-        self._inline_site: _Site | None = None
-        self._site_beside_queue: _Site | None = None  # the inline site, where the queue is not inline itself
+        self._inline_site: Site | None = None
+        self._site_beside_queue: Site | None = None  # the inline site, where the queue is not inline itself
         self._team: Team | None = None  # of launches that the caller waits for
         self._called_team: Team | None = None  # of others
         self._calls_inline = False  # whether a call that does not wait uses the inline site
@@ -147,8 +109,8 @@ class Bound(Generic[R]):
     def _connect(self, launch: Launch) -> None:
         """Upload the tables, and build the kernel for calls that run inline."""
         device = self.device
-        self._has_tables = self._can_use_tables(launch)
-        self._tables = [self._upload(each) for each in launch.arguments if isinstance(each, np.ndarray)]
+        self._has_tables = can_use_table(device, self.operation, launch, self._own)
+        self._tables = upload_tables(device, launch, shared=self._has_tables)
         known = self._own if device.kind == "intel" else ()
         self._known = {id(each): launch_memory(device, each) for each in known}
         self._queue_is_inline = device.is_inline(self.queue)
@@ -165,17 +127,8 @@ class Bound(Generic[R]):
             self._inline_site = None if inline_queue is None else self._site_on(inline_queue, in_table=self._has_tables)
             self._site_beside_queue = self._inline_site
 
-    def _can_use_tables(self, launch: Launch) -> bool:
-        """Return whether kernels in the calling thread read their arguments from a table."""
-        operation, device = self.operation, self.device
-        if operation.kernel_folder is None or not device.shares_memory or "VECTOR_VARIANT" not in launch.defines:
-            return False
-        folders = tuple(operation.include_folders)
-        is_plain = can_read_table(operation.kernel_folder, launch.source, folders, launch.kernel)
-        return is_plain and have_addresses(self._own)
-
     @functools.cached_property
-    def _queue_site(self) -> _Site:
+    def _queue_site(self) -> Site:
         """Site of launches in the queue; with an inline site only launches that wait for an event need it."""
         return self._site_on(self.queue)
 
@@ -418,7 +371,7 @@ class Bound(Generic[R]):
                 target[...] = host_view(own)
         return event
 
-    def _launch_in_buffers(self, site: _Site, in_place: Mapping[int, HostArray], inputs: int) -> Any:
+    def _launch_in_buffers(self, site: Site, in_place: Mapping[int, HostArray], inputs: int) -> Any:
         """Launch with temporary buffers over NumPy arrays, by their number among all arrays; return the event."""
         buffers = {number: self._buffer_in_place(array, is_input=number < inputs) for number, array in in_place.items()}
         for number, buffer in buffers.items():
@@ -473,7 +426,7 @@ class Bound(Generic[R]):
         result: R = self.operation.Result(**{name: arrays.get(name) for name in self.operation.Result._fields})
         return result
 
-    def _site_with(self, given: tuple[Any, ...], site: _Site) -> _Site:
+    def _site_with(self, given: tuple[Any, ...], site: Site) -> Site:
         """Set the arrays of a launch at a site and return it; the queue's site, where an array has no known address."""
         try:
             self._set_arrays(site, given)
@@ -482,7 +435,7 @@ class Bound(Generic[R]):
             self._set_arrays(site, given)
         return site
 
-    def _set_arrays(self, site: _Site, given: tuple[Any, ...]) -> None:
+    def _set_arrays(self, site: Site, given: tuple[Any, ...]) -> None:
         """Set the arrays that the last launch at a site did not have as arguments of its kernel, after all checks."""
         if len(given) != len(self._array_specs):
             raise self._wrong_count(len(given) - len(self._array_specs) + len(self.inputs))
@@ -539,46 +492,9 @@ class Bound(Generic[R]):
         elif array.nbytes:
             cl.enqueue_fill_buffer(self.queue, memory_of(array), np.zeros(1, np.uint8), 0, array.nbytes)
 
-    def _site_on(self, queue: Any, launch: Launch | None = None, *, in_table: bool = False) -> _Site:
+    def _site_on(self, queue: Any, launch: Launch | None = None, *, in_table: bool = False) -> Site:
         """Build the kernel for the device of a queue and set the arguments that calls do not change."""
-        launch, operation = launch or self._launch, self.operation
-        if operation.kernel_folder is None:
-            raise ValueError(f"{type(operation).__name__} has no kernel_folder; set it to the folder of its .cl files")
-        with building(launch.source):
-            program = build(
-                self.device,
-                operation.kernel_folder,
-                launch.source,
-                fitting_defines(launch, queue.device, operation.kernel_folder, operation.include_folders),
-                include_folders=operation.include_folders,
-                handle=queue.device,
-                in_table=launch.kernel if in_table else None,
-            )
-            kernel = cl.Kernel(program, launch.kernel)
-        name = type(operation).__name__
-        size = fit_work(kernel, queue.device, launch, name=name, label=self.device.label)
-        tables = iter(self._tables)
-        others = [next(tables) if isinstance(value, np.ndarray) else value for value in launch.arguments]
-        count = len(launch.inputs) + len(launch.outputs)
-        table = ArgumentTable(self.device, count, others) if in_table else None
-        if table is not None:
-            kernel.set_arg(0, table.memory)
-        else:
-            for place, spec in enumerate(launch.outputs.values(), len(launch.inputs)):
-                if spec is None:
-                    kernel.set_arg(place, None)
-            for place, value in enumerate(others, count):
-                kernel.set_arg(place, memory_of(value) if isinstance(value, cl.array.Array) else value)
-        arguments, nothing = (queue, kernel, *size), (None,) * len(self._own)
-        return _Site(queue, kernel, arguments, nothing, self.device.is_inline(queue), table)
-
-    def _upload(self, table: HostArray) -> Any:
-        if self._has_tables:
-            array = self.device.empty(table.shape, table.dtype)
-            host_view(array)[...] = table
-            return array
-        flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
-        return cl.Buffer(self.device.context, flags, hostbuf=np.ascontiguousarray(table))
+        return new_site(self.device, self.operation, launch or self._launch, queue, self._tables, in_table=in_table)
 
     def _hold(self, event: Any, given: tuple[Any, ...]) -> None:
         """Keep references to arrays of the caller until the kernel has run."""

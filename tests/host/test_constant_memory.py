@@ -13,7 +13,7 @@ import pyopencl as cl
 import pytest
 
 from example_inputs import assert_has_numbers, inputs_with_numbers
-from gpuvision.host import Device, Launch, bound
+from gpuvision.host import Device, Launch, site
 from gpuvision.host.constant_memory import constant_sizes, fitting_defines
 from gpuvision.host.debug import flatten_includes
 from gpuvision.host.program import build
@@ -116,7 +116,7 @@ def moved(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         files.extend([source] if "constant" in defines else [])
         return build(device, folder, source, defines, **options)
 
-    monkeypatch.setattr(bound, "build", recorded)
+    monkeypatch.setattr(site, "build", recorded)
     return files
 
 

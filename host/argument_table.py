@@ -22,12 +22,14 @@ _FUNCTION = r"\bvoid\s+{name}\s*\("
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 _NOT_SPACE = re.compile(r"\S")
 _DIRECTIVE = re.compile(r"^[ \t]*#.*$", re.MULTILINE)
-_MACRO = re.compile(r"\s*[A-Z][A-Z_0-9]*\b")
+_MACRO = re.compile(r"[A-Z][A-Z_0-9]*")
 _TEAM = "TEAM_ARGUMENTS"  # of kernels/common/team.h: these arguments stay apart
+SIZE_MACRO = "ARGUMENT_TABLE_BYTES"  # of the build: size of the table
 # The kernel gets its parameters as a function; the parameters are also the members of a structure.
 _WRAPPER = """\
 static inline __attribute__((always_inline)) void {name}_work({parameters} {team});
 typedef struct {{{members};}} {name}_table;
+_Static_assert(sizeof({name}_table) == {size}, "the arguments of the launch and the parameters of the kernel differ");
 {attributes} kernel {more} void {name}(global const uchar *bytes {team}) {{
     global const {name}_table *table = (global const {name}_table *)bytes;
     {name}_work({values}
@@ -38,12 +40,25 @@ _TEAM_VALUES = "#ifdef TEAM\n        , team, poll_limit\n#endif\n"
 
 
 def takes_table(text: str, kernel: str) -> bool:
-    """Return whether `with_argument_table` can change a kernel: each variant declares its parameters without macros."""
-    name = re.escape(kernel)
+    """Return whether `with_argument_table` can change a kernel.
+
+    Each variant must declare its parameters without macros and parentheses, and none in local memory.
+    """
     found = list(_declarations(text, kernel))
-    parameters = [each for declaration in found for each in declaration.parameters]
-    is_plain = not any(_MACRO.match(_DIRECTIVE.sub("", each)) for each in parameters)
-    return 0 < len(found) == len(re.findall(_FUNCTION.format(name=name), text)) and is_plain
+    variants = len(re.findall(_FUNCTION.format(name=re.escape(kernel)), text))
+    return 0 < len(found) == variants and all(
+        _is_plain(each) for declaration in found for each in declaration.parameters
+    )
+
+
+def _is_plain(parameter: str) -> bool:
+    """Return whether a parameter is a number or a pointer that can be a member of a structure."""
+    declaration = _DIRECTIVE.sub("", parameter)
+    words = declaration.replace("*", " ").split()
+    if "(" in parameter or len(words) < 2 or not re.fullmatch(r"[\w\s*]+", declaration):
+        return False
+    is_macro = any(map(_MACRO.fullmatch, (words[0], words[-1])))
+    return not is_macro and not any(word in ("local", "__local") or word.startswith("image") for word in words[:-1])
 
 
 def with_argument_table(text: str, kernel: str) -> str:
@@ -76,6 +91,7 @@ class _Declaration(NamedTuple):
         """Return a kernel that calls a function with the parameters, and the head of this function."""
         return _WRAPPER.format(
             name=name,
+            size=SIZE_MACRO,
             attributes=self.attributes[0],
             more=self.attributes[1],
             parameters=",".join(self.parameters),
@@ -114,6 +130,8 @@ class ArgumentTable:
     ----------
     device : Device
         CPU that shares the memory of the host.
+    layout : numpy.dtype
+        As `table_layout` returns it.
     arrays : int
         Number of the arrays, which are the first arguments. At first they are null pointers.
     others : sequence of numpy scalar, pyopencl.array.Array or None
@@ -128,18 +146,29 @@ class ArgumentTable:
         Memory object of the table: the argument of the kernel.
     """
 
-    def __init__(self, device: Any, arrays: int, others: Sequence[Any]) -> None:
-        words = [np.uint64(0)] * arrays
-        for each in others:
-            is_number, is_empty = isinstance(each, np.generic), each is None or not each.size
-            words.append(each if is_number else np.uint64(0 if is_empty else address_of(each)))
-        # C aligns the members of a structure as NumPy does.
-        layout = np.dtype([(f"argument{number}", word.dtype) for number, word in enumerate(words)], align=True)
+    def __init__(self, device: Any, layout: np.dtype[Any], arrays: int, others: Sequence[Any]) -> None:
         array: DeviceArray = device.empty((layout.itemsize,), np.uint8)
-        host_view(array).view(layout)[0] = tuple(words)
+        host_view(array).view(layout)[0] = (*[0] * arrays, *map(_word, others))
         self.addresses: memoryview = host_view(array)[: 8 * arrays].data.cast("Q")
         self.memory = launch_memory(device, array)
         self._array, self._others = array, others  # referenced as long as the kernel may read them
+
+
+def table_layout(arrays: int, others: Iterable[Any]) -> np.dtype[Any]:
+    """Return the type of a table: addresses of some arrays, then numbers and addresses.
+
+    C aligns the members of a structure as NumPy does.
+    """
+    words: list[np.dtype[Any]] = [np.dtype(np.uint64)] * arrays
+    words += [each.dtype if isinstance(each, np.generic) else np.dtype(np.uint64) for each in others]
+    return np.dtype([(f"argument{number}", word) for number, word in enumerate(words)], align=True)
+
+
+def _word(argument: Any) -> Any:
+    """Return a number, or the address of an array: 0 for None and for an array without elements."""
+    if isinstance(argument, np.generic):
+        return argument
+    return 0 if argument is None or not argument.size else address_of(argument)
 
 
 def address_of(array: DeviceArray | HostArray) -> int:
@@ -162,4 +191,4 @@ def address_of(array: DeviceArray | HostArray) -> int:
 
 def have_addresses(arrays: Iterable[DeviceArray]) -> bool:
     """Return whether the host knows the addresses of all arrays."""
-    return all(isinstance(array.base_data, cl.SVMPointer) for array in arrays)
+    return all(isinstance(getattr(array, "base_data", None), cl.SVMPointer) for array in arrays)

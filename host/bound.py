@@ -111,7 +111,7 @@ class Bound(Generic[R]):
         device = self.device
         self._has_tables = can_use_table(device, self.operation, launch, self._own)
         self._tables = upload_tables(device, launch, shared=self._has_tables)
-        known = self._own if device.kind == "intel" else ()
+        known = [each for each in self._own if device.kind == "intel" and isinstance(each, cl.array.Array)]
         self._known = {id(each): launch_memory(device, each) for each in known}
         self._queue_is_inline = device.is_inline(self.queue)
         self._finish_queue = self.queue.finish
@@ -165,15 +165,20 @@ class Bound(Generic[R]):
 
     @property
     def inline(self) -> bool:
-        """Whether a call runs the kernel in the calling thread, unless it must wait for an event.
+        """Whether a call runs the kernel in the calling thread.
 
-        On Intel's runtime `run` and calls with NumPy arrays run more kernels there, see `_SHORT_RUN_BYTES`.
+        A call that must wait for an event runs in the queue. So does a call with an array in an OpenCL buffer where the
+        kernel reads its arguments from a table (`gpuvision.host.argument_table`). On Intel's runtime `run` and calls
+        with NumPy arrays run more kernels there, see `_SHORT_RUN_BYTES`.
         """
         return self._queue_is_inline or self._calls_inline
 
     @property
     def enqueue_arguments(self) -> tuple[Any, Any, tuple[int, ...], tuple[int, ...] | None]:
-        """Arguments of `pyopencl.enqueue_nd_range_kernel` for a launch: queue, kernel, global size, local size."""
+        """Arguments of `pyopencl.enqueue_nd_range_kernel` for a launch: queue, kernel, global size, local size.
+
+        The arguments of the kernel are set. It may have one argument, a table of all: `gpuvision.host.argument_table`.
+        """
         return self._call_site.arguments
 
     @functools.cached_property
@@ -286,7 +291,7 @@ class Bound(Generic[R]):
         event = cl.enqueue_nd_range_kernel(*site.arguments)
         if given is not self._own and not site.inline:
             self._hold(event, given)
-            if waits:
+            if waits and site is not self._run_site:
                 self._wait(event)
         return event
 
@@ -364,7 +369,7 @@ class Bound(Generic[R]):
         else:
             event = self._launch_in_buffers(site, in_place, count)
         site.queue.finish()
-        # Replace the temporary buffers before they are freed: kernel arguments must never dangle.
+        # Replace the arguments before their arrays are freed: they must never dangle.
         self._set_arrays(site, self._own)
         for own, target in zip(self._own_outputs, targets, strict=True):
             if 0 < target.nbytes <= self._copied_bytes:

@@ -10,7 +10,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array
 
-from gpuvision.host.argument_table import ArgumentTable, have_addresses
+from gpuvision.host.argument_table import SIZE_MACRO, ArgumentTable, have_addresses, table_layout
 from gpuvision.host.arrays import DeviceArray, host_view, memory_of
 from gpuvision.host.build_notice import building
 from gpuvision.host.constant_memory import fitting_defines
@@ -57,7 +57,8 @@ class Site:
 
 def can_use_table(device: Device, operation: Launchable, launch: Launch, arrays: Iterable[DeviceArray]) -> bool:
     """Return whether kernels in the calling thread read their arguments from a table, with these arrays at first."""
-    if operation.kernel_folder is None or not device.shares_memory or "VECTOR_VARIANT" not in launch.defines:
+    is_cpu = device.shares_memory and device.has_inline_queues
+    if operation.kernel_folder is None or not is_cpu or "VECTOR_VARIANT" not in launch.defines:
         return False
     folders = tuple(operation.include_folders)
     return can_read_table(operation.kernel_folder, launch.source, folders, launch.kernel) and have_addresses(arrays)
@@ -99,12 +100,13 @@ def new_site(
     in_table : bool
         Whether the kernel reads its arguments from a table: `can_use_table`.
     """
-    kernel = _build(device, operation, launch, queue.device, in_table)
+    arrays = len(launch.inputs) + len(launch.outputs)
+    layout = table_layout(arrays, launch.arguments) if in_table else None
+    kernel = _build(device, operation, launch, queue.device, layout)
     size = fit_work(kernel, queue.device, launch, name=type(operation).__name__, label=device.label)
     uploaded = iter(tables)
     others = [next(uploaded) if isinstance(value, np.ndarray) else value for value in launch.arguments]
-    arrays = len(launch.inputs) + len(launch.outputs)
-    table = ArgumentTable(device, arrays, others) if in_table else None
+    table = None if layout is None else ArgumentTable(device, layout, arrays, others)
     if table is not None:
         kernel.set_arg(0, table.memory)
     else:
@@ -118,18 +120,22 @@ def new_site(
     return Site(queue, kernel, (queue, kernel, *size), nothing, device.is_inline(queue), table)
 
 
-def _build(device: Device, operation: Launchable, launch: Launch, handle: Any, in_table: bool) -> Any:
+def _build(device: Device, operation: Launchable, launch: Launch, handle: Any, layout: np.dtype[Any] | None) -> Any:
+    """Return the kernel for a device; with a layout it reads its arguments from a table."""
     folder, name = operation.kernel_folder, type(operation).__name__
     if folder is None:
         raise ValueError(f"{name} has no kernel_folder; set it to the folder of its .cl files")
     with building(launch.source):
+        defines = fitting_defines(launch, handle, folder, operation.include_folders)
+        if layout is not None:
+            defines[SIZE_MACRO] = layout.itemsize
         program = build(
             device,
             folder,
             launch.source,
-            fitting_defines(launch, handle, folder, operation.include_folders),
+            defines,
             include_folders=operation.include_folders,
             handle=handle,
-            in_table=launch.kernel if in_table else None,
+            in_table=None if layout is None else launch.kernel,
         )
         return cl.Kernel(program, launch.kernel)

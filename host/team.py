@@ -53,7 +53,7 @@ def new_counters(device: Any, size: tuple[int, ...], threads: int) -> DeviceArra
     values = host_view(counters)
     values[:] = 0
     values[[_COLUMNS, _SHARES, _ITEMS]] = size[0], threads, math.prod(size)
-    begin = np.arange(threads + 1) * math.prod(size) // threads
+    begin = -(-np.arange(threads + 1) * math.prod(size) // threads)  # rounded up: the first share is never empty
     shares = values[_HEAD:].reshape(threads, _SHARE)
     shares[:, 0], shares[:, 1], shares[:, 2] = begin[1:], begin[:-1], begin[1:]
     return counters

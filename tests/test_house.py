@@ -299,7 +299,7 @@ def test_no_module_imports_private_names_of_another() -> None:
 
 
 # Objects with a state: a batch on its way through the stream, and the queue and kernel of a bound operation.
-MUTABLE_DATACLASSES = {"Batch", "_Site"}
+MUTABLE_DATACLASSES = {"Batch", "Site"}
 
 
 def test_dataclasses_are_frozen() -> None:

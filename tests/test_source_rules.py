@@ -24,7 +24,7 @@ POSITIONAL_DATACLASSES = {
     *("ExchangedAxes", "PixelMap", "Packer", "SmoothResiduals", "PackedLines", "Evaluation", "Minimum", "FitState"),
     *("CorrelatedErrors", "_Task", "_Candidate", "TransformedAperture", "Shape", "DrawnObject", "_ModelProblem"),
     *("LightCut", "LightTree", "Bvh", "Defects", "Scene", "LitSegments", "ProjectedLines", "MirrorSurfaces", "Patches"),
-    *("SheetIndex", "_Job", "Batch", "_Site", "ListedDevice", "ProbedDevice", "Launch", "Trial", "Plan", "FileLimit"),
+    *("SheetIndex", "_Job", "Batch", "Site", "ListedDevice", "ProbedDevice", "Launch", "Trial", "Plan", "FileLimit"),
     *("DurationStatistics", "Step", "WorkSize", "Specs", "Stage", "Layout", "ConvexParts"),
 }
 # Dataclasses that are compared by identity. They hold arrays, whose comparison has no single truth value, or they are
@@ -35,7 +35,7 @@ COMPARED_BY_IDENTITY = {
     *("ErrorAttribution", "StripErrorModel", "LightPaths", "Bvh", "Scene", "CameraSimulator", "Mask", "PsdSimulator"),
     *("SensorView", "ViewRays", "DirectLight", "LitSegments", "LensVisibility", "ProjectedLines", "MirrorFacets"),
     *("MirrorPoints", "MirrorSurfaces", "Mirrors", "Patches", "Radiosity", "SheetIndex", "SpecularInterreflection"),
-    *("SurfaceReflection", "SheetLighting", "SheetDivision", "SimulationTask", "_Site", "ConvexParts"),
+    *("SurfaceReflection", "SheetLighting", "SheetDivision", "SimulationTask", "Site", "ConvexParts"),
 }
 # Calls of zip that end with the shorter sequence, and why.
 UNEQUAL_LENGTHS = {

@@ -13,8 +13,8 @@
 #define TEAM_H
 
 #ifdef TEAM
-// Share of a thread: the work-items begin <= number < end, in sequence. So it reads neighbouring memory, and the same memory
-// in each launch.
+// Share of a thread: the work-items begin <= number < end, in sequence. So it reads neighbouring memory, the same in each
+// launch until the members end.
 typedef struct {
     uint next;  // work-item that is begun next; not below `end` between launches
     uint begin, end;
@@ -114,21 +114,27 @@ static inline uint4 wait_for_item(global Team *team, uint own, uint poll_limit) 
     return (uint4)NO_ITEM;
 }
 
+// Take a work-item as the leader; without one, wait until all are done.
+static inline uint4 lead_item(global Team *team) {
+    const uint4 item = take_item(team, 0);
+    while (item.z == NO_ITEM && load_counter(&team->done) < team->items) PAUSE();
+    return item;
+}
+
 static inline uint4 first_item(global Team *team, uint poll_limit) {
     if (poll_limit != LEADER) return wait_for_item(team, join(team, poll_limit), poll_limit);
     __atomic_store_n(&team->done, 0, __ATOMIC_RELAXED);
     for (uint i = team->shares; i-- > 0;) {  // from here on members take work-items
         __atomic_store_n(&team->share[i].next, team->share[i].begin, __ATOMIC_RELEASE);
     }
-    return take_item(team, 0);
+    return lead_item(team);
 }
 
 static inline uint4 next_item(global Team *team, uint poll_limit, uint own) {
     __atomic_fetch_add(&team->done, 1, __ATOMIC_ACQ_REL);
+    if (poll_limit == LEADER) return lead_item(team);
     const uint4 item = take_item(team, own);
-    if (poll_limit != LEADER) return item.z == NO_ITEM ? wait_for_item(team, own, poll_limit) : item;
-    while (item.z == NO_ITEM && load_counter(&team->done) < team->items) PAUSE();
-    return item;
+    return item.z == NO_ITEM ? wait_for_item(team, own, poll_limit) : item;
 }
 #else
 #define TEAM_ARGUMENTS

@@ -19,7 +19,7 @@ from gpuvision.camera.lens import Lens
 from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.host import Device, Launch, Operation, host_view
 from gpuvision.host.bound import Bound
-from gpuvision.host.team import Team
+from gpuvision.host.team import _HEAD, _SHARE, Team, new_counters
 from gpuvision.host.trace import Trace
 from gpuvision.matching.features.blob import FindBlobs
 from gpuvision.matching.features.ruler import RulerEdges
@@ -126,6 +126,26 @@ def test_each_item_runs_once_in_each_launch(cpu: Device, counting: type[CountIte
     row, column = np.divmod(np.arange(columns * rows), columns)
     np.testing.assert_array_equal(host_view(bound.outputs.column), column)
     np.testing.assert_array_equal(host_view(bound.outputs.row), row)
+
+
+def test_the_calling_thread_waits_for_a_work_item_of_a_member(cpu: Device, counting: type[CountItems]) -> None:
+    """Where members take all work-items, the calling thread has none of its own to wait for."""
+    bound = counting(columns=1).bind(cpu, (1,), np.int32)
+    bound._team = bound._new_team()
+    at_start, led = int(host_view(bound.outputs.count)[0]), 0
+    for launch in range(1, 20_001):
+        led += bound._team.waits
+        bound.run()
+        assert host_view(bound.outputs.count)[0] == at_start + launch
+    assert led
+
+
+@pytest.mark.parametrize(("items", "threads"), [(1, 2), (2, 4), (7, 3), (64, 64), (5, 64)])
+def test_shares_hold_each_work_item_once(cpu: Device, items: int, threads: int) -> None:
+    shares = host_view(new_counters(cpu, (items,), threads))[_HEAD:].reshape(threads, _SHARE)
+    begun = [number for begin, end in shares[:, 1:3] for number in range(begin, end)]
+    assert begun == list(range(items))
+    assert shares[0, 1] < shares[0, 2]
 
 
 def _psd(rng: np.random.Generator) -> tuple[Any, list[Any]]:

@@ -84,14 +84,14 @@ class CountItems(Operation[Counts]):
     kernel_folder: ClassVar[Path | None] = None
     include_folders: ClassVar[tuple[Path, ...]] = (KERNEL_FOLDER,)
     columns: int = 37
+    turns: int = 0  # of a loop that does nothing, in each work-item
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         size = (self.columns, shape[0] // self.columns)
         word = (shape, np.dtype(np.int32))
         outputs = {"count": word, "column": word, "row": word}
-        return Launch(
-            "count.cl", "count_items", [(shape, dtype)], outputs, size, (1, 1), passes_once=False, by_team=True
-        )
+        given, defines = [(shape, dtype)], {"TURNS": self.turns}
+        return Launch("count.cl", "count_items", given, outputs, size, (1, 1), defines=defines, by_team=True)
 
 
 SOURCE = """
@@ -99,6 +99,7 @@ SOURCE = """
 kernel void count_items(global int *seen, global int *count, global int *column, global int *row TEAM_ARGUMENTS) {
     FOR_EACH_ITEM(item) {
         const uint at = item.y * ITEM_COLUMNS + item.x;
+        for (volatile int turn = 0; turn < TURNS; turn++) {}
         count[at] = seen[at] += 1;
         column[at] = item.x;
         row[at] = item.y;
@@ -129,11 +130,13 @@ def test_each_item_runs_once_in_each_launch(cpu: Device, counting: type[CountIte
 
 
 def test_the_calling_thread_waits_for_a_work_item_of_a_member(cpu: Device, counting: type[CountItems]) -> None:
-    """Where members take all work-items, the calling thread has none of its own to wait for."""
-    bound = counting(columns=1).bind(cpu, (1,), np.int32)
+    """Where members take all work-items, the calling thread has none of its own to wait for: here they own all."""
+    bound = counting(columns=1, turns=20_000).bind(cpu, (1,), np.int32)
     bound._team = bound._new_team()
+    shares = bound._team._counters[_HEAD:].reshape(-1, _SHARE)
+    shares[:-1, :3], shares[-1, :3] = 0, (1, 0, 1)
     at_start, led = int(host_view(bound.outputs.count)[0]), 0
-    for launch in range(1, 20_001):
+    for launch in range(1, 2001):
         led += bound._team.waits
         bound.run()
         assert host_view(bound.outputs.count)[0] == at_start + launch

@@ -2,9 +2,9 @@
 //
 // Waking a worker thread takes longer than a short launch. In a launch by a team, workers have been started before it and
 // wait in the kernel: they are its members. The calling thread runs the kernel as the leader. Each thread takes the
-// work-items of its share, then those that others have left. The leader waits until all are done; members wait for the next
-// launch, and end when none comes in `poll_limit` polls, or when the host dismisses them. A leader without members does all
-// work.
+// work-items of its share, at the end also work-items of other shares. The leader waits until all are done. Members wait
+// for the next launch. They end when none comes in `poll_limit` polls, or when the host dismisses them. A leader without
+// members does all work.
 //
 // Kernels that a team can run have TEAM_ARGUMENTS as their last arguments, and their work in FOR_EACH_ITEM(item) { ... },
 // which without TEAM runs once, for this work-item. `item.x` and `item.y` are its places in two dimensions.

@@ -130,7 +130,7 @@ def test_each_item_runs_once_in_each_launch(cpu: Device, counting: type[CountIte
 
 
 def test_the_calling_thread_waits_for_a_work_item_of_a_member(cpu: Device, counting: type[CountItems]) -> None:
-    """Where members take all work-items, the calling thread has none of its own to wait for: here they own all."""
+    """Here the share of the calling thread is empty: it computes nothing, and must still wait."""
     bound = counting(columns=1, turns=20_000).bind(cpu, (1,), np.int32)
     bound._team = bound._new_team()
     shares = bound._team._counters[_HEAD:].reshape(-1, _SHARE)

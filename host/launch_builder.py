@@ -258,8 +258,8 @@ class LaunchBuilder:
             As in `Launch`. The vector variant of such a kernel writes past the caches of a CPU (macro ``PAST_CACHES``)
             when the launch moves more bytes than the last cache holds. Default False.
         by_team : bool
-            As in `Launch`, for the vector variant. Streams of fewer than 256 KiB, and those that write past the caches,
-            are not shared. Default False.
+            As in `Launch`, for the vector variant. A kernel that streams shares no launch of fewer than 256 KiB, and
+            none that writes past the caches. Default False.
 
         Raises
         ------

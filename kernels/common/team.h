@@ -21,7 +21,7 @@ typedef struct {
     uint apart[13];
 } Share;
 
-// Each counter that several threads change has its own cache line (64 bytes). host/team.py has the same offsets.
+// Counters that change with each work-item are in cache lines (64 bytes) of their own. host/team.py has the same offsets.
 typedef struct {
     uint columns;  // work-items in the first dimension
     uint shares;   // number of shares: of the calling thread and of the members
